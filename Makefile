@@ -1,0 +1,67 @@
+# GridSim. `make help` (or plain `make`) lists what there is.
+#
+# Each target sets up its own needs: .venv is created if there is none, and installed into
+# again only when pyproject.toml has changed.
+
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+# What .venv is made with: PYTHON if given, else the first of these that is 3.11 or newer and can make one.
+PYTHON ?=
+PYTHONS := python3 python3.11 python3.12 python3.13 /usr/bin/python3
+# Passed on to the command: make evolve ARGS="--scenario seamless --seed 3"
+ARGS   ?=
+PORT   ?= 5000
+
+.DEFAULT_GOAL := help
+.PHONY: help install evolve test ui bench lint format
+
+help: ## This list
+	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo; echo "  PYTHON=/path/to/python  makes .venv with that one (3.11 or newer);  PORT=5000  is make ui's"
+
+install: $(STAMP) ## Create .venv and install into it (the others do so by themselves)
+
+evolve: $(STAMP) ## Evolve a driver; ARGS="--workers 2 --seed 3" are passed on, ARGS=--help lists them
+	@$(BIN)/gridsim-evolve $(ARGS)
+
+test: $(STAMP) ## Run all tests; ARGS='-m "not e2e"' leaves out those with real Ray workers
+	$(BIN)/python -m pytest $(ARGS)
+
+ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
+	@echo "MLflow's UI on http://127.0.0.1:$(PORT); Ctrl-C ends it"
+	@PYTHONWARNINGS=ignore MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
+	  --backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port $(PORT) --workers 2 \
+	  --uvicorn-opts "--log-level warning"
+
+bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
+	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/scaling.py
+
+lint: $(STAMP) ## Check style, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP) ## Rewrite the code in the project's format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# The stamp comes last, so that an install cut short is done again.
+$(STAMP): pyproject.toml
+	@if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  for python in $(or $(PYTHON),$(PYTHONS)); do \
+	    if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+	      echo "creating $(VENV) with $$python (the first time takes some minutes)"; \
+	      $(BIN)/python -c '' 2>/dev/null || clear=--clear; \
+	      "$$python" -m venv $$clear $(VENV) || exit 1; break; \
+	    fi; \
+	  done; \
+	  if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	    echo "make: needs Python 3.11 or newer with its venv module (on Debian and Ubuntu: apt install python3-venv);" >&2; \
+	    echo "make: name one that is not found by itself with make PYTHON=/path/to/python" >&2; exit 1; \
+	  fi; \
+	fi
+	$(BIN)/python -m pip install --disable-pip-version-check --editable ".[dev]"
+	@touch $@

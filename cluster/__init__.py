@@ -1,0 +1,1 @@
+"""GridSim's service: workers, the loop of a run, checkpoints, tracking and the commands."""

@@ -1,0 +1,109 @@
+"""Champions: what is written of them, and what a person does with one: load it, drive it, evaluate it.
+
+    champion = load_champion("runs/NAME/champion.npz")
+    env = champion.make_env()
+    print(evaluate(champion, "seamless", episodes=64))
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from cluster import checkpoint
+from cluster.checkpoint import CheckpointError
+from cluster.coordinator import Maps, summarise
+from evolution.curriculum import HELD_OUT_MAPS, spread_starts
+from evolution.policy import PolicySpec, act_on
+from evolution.rollout import Limits
+from evolution.rollout import evaluate as roll_out
+from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, VehicleConfig
+from gridsim.scenarios import HELD_OUT_SEED, REGISTRY
+
+
+@dataclass(frozen=True)
+class Champion:
+    """A genome and what is needed to run it.
+
+    Attributes:
+        genome: float32 [genes].
+        policy: its network, as in `mlp:6,7`.
+        scenario: where it learned.
+        sim: the simulator's numbers it learned with.
+    """
+
+    genome: np.ndarray
+    policy: str
+    scenario: str
+    sim: SimConfig
+
+    @property
+    def sha256(self) -> str:
+        """Of the genome's bytes."""
+        return hashlib.sha256(self.genome.tobytes()).hexdigest()
+
+    def act(self, observation: np.ndarray) -> int | np.ndarray:
+        """The action for an observation [32] of the environment, or actions [n] for [n, 32]."""
+        return act_on(PolicySpec.parse(self.policy), self.genome, observation, self.sim.sensors.range, self.sim.vehicle.speed_limit)
+
+    def make_env(self, scenario: str | None = None, **options: Any) -> Any:
+        """A Gymnasium environment on the champion's scenario, or another."""
+        from gridsim.env import GridSimEnv
+
+        return GridSimEnv(scenario or self.scenario, config=self.sim, **options)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write champion.npz. Raises CheckpointError if that cannot be done."""
+        meta = {"policy": self.policy, "scenario": self.scenario, "sim": dataclasses.asdict(self.sim)}
+        checkpoint.save(path, {"genome": self.genome}, meta)
+
+
+def load_champion(path: str | os.PathLike[str]) -> Champion:
+    """Read champion.npz.
+
+    Raises: CheckpointError with one line for a file that is missing, damaged, hostile or no champion.
+    """
+    arrays, meta = checkpoint.load(path)
+    try:
+        genome, sim = arrays["genome"], meta["sim"]
+        spec = PolicySpec.parse(meta["policy"])
+        if genome.dtype != np.float32 or genome.shape != (spec.size,):
+            raise ValueError(f"its genome does not fit {spec}")
+        config = SimConfig(
+            VehicleConfig(**sim["vehicle"]), SensorConfig(**sim["sensors"]), EpisodeConfig(**sim["episode"])
+        )
+        return Champion(genome, str(spec), str(meta["scenario"]), config)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: no champion: {error}") from error
+
+
+def evaluate(champion: Champion, scenario: str | None = None, episodes: int = 64, seed: int = HELD_OUT_SEED) -> dict[str, float]:
+    """Drive a champion through episodes on maps it never saw, in this process.
+
+    Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed.
+    Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means). With the defaults these are the
+    held-out figures of summary.json.
+    Raises: ValueError for an unknown scenario or fewer than one episode.
+    """
+    name = scenario or champion.scenario
+    if name not in REGISTRY:
+        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    if episodes < 1:
+        raise ValueError(f"episodes must be 1 or more, not {episodes}")
+    maps = Maps(name, champion.sim)
+    try:
+        seeds, starts = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes)
+        episode = champion.sim.episode
+        limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
+        scenarios = [maps.get(s) for s in seeds]
+        results, _ = roll_out(
+            PolicySpec.parse(champion.policy), champion.genome[None], scenarios, starts, limits, champion.sim
+        )
+        return summarise(results[0], episode.control_period)
+    finally:
+        maps.close()

@@ -1,0 +1,431 @@
+"""The commands: parse, build, run. Wrong use ends with one clear line and 2, Ctrl-C with a clean save and 130."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import os
+import re
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn, TypeVar
+
+import tyro
+from rich.console import Console
+
+from cluster.settings import EvolveSettings, SettingsError
+
+if TYPE_CHECKING:
+    from cluster.pool import WorkerPool
+    from cluster.run import RunFolder, Session
+
+T = TypeVar("T")
+FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
+MAX_WORKERS = 10_000
+
+
+class UsageError(Exception):
+    """Wrong use; the message is shown in one line."""
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class EvolveFlags(EvolveSettings):
+    """Evolve a driver: a genetic algorithm over neural networks, its population evaluated in parallel.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
+    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+    workers: int = field(default_factory=cores)
+    """Worker processes; 0 evaluates in this process."""
+    output: str = "runs"
+    """Folder in which the run's folder is made."""
+    name: str = ""
+    """Name of the run; by default made of scenario, algorithm, seed and time."""
+    resume: str = ""
+    """Folder of a run to continue, exactly where its checkpoint stands."""
+    config: str = ""
+    """A run's config.json: repeat that run; flags beside it change it."""
+    init: str = ""
+    """A champion.npz to start from, in place of random networks."""
+    address: str = ""
+    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
+    tracking_uri: str = ""
+    """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
+    experiment: str = "gridsim"
+    """MLflow's experiment."""
+
+    def settings(self) -> EvolveSettings:
+        """What decides the champion."""
+        return EvolveSettings(**{f.name: getattr(self, f.name) for f in dataclasses.fields(EvolveSettings)})
+
+
+@dataclass(frozen=True)
+class EvaluateFlags:
+    """Drive a champion through episodes on maps it never saw, and say how good it is."""
+
+    champion: tyro.conf.Positional[str]
+    """A champion.npz, or a run's folder."""
+    scenario: str = ""
+    """Road to drive on; by default the one it learned on."""
+    episodes: int = 64
+    """How many; the default 64 are the held-out episodes of every run."""
+    seed: int = 2_000_000
+    """Seed of the first map; those of held-out maps begin at 2,000,000."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+
+def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:
+    """Read the command line. Ends the process: 0 after --help, 2 with a clear line for wrong use."""
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            if default is None:
+                return tyro.cli(kind, prog=prog, args=arguments)
+            return tyro.cli(kind, prog=prog, args=arguments, default=default)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    # tyro draws a box; its first paragraph says what is wrong.
+    lines = [re.sub(r"[│╭╮╰╯]", "", line).strip() for line in errors.getvalue().splitlines()]
+    lines = [line for line in lines if not line.startswith("─ ") or "─────" not in line]
+    text: list[str] = []
+    for line in lines:
+        if set(line) <= {"─"} and text:
+            break
+        if line and not set(line) <= {"─"}:
+            text.append(line)
+    fail(prog, " ".join(text) or "cannot read these flags", f"see {prog} --help")
+
+
+def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
+    """End with one clear line, and perhaps a second one that says what to do."""
+    line = " ".join(message.split())
+    print(f"{prog}: error: {line}", *([hint] if hint else []), sep="\n", file=sys.stderr, flush=True)
+    raise SystemExit(code)
+
+
+def process_age_s() -> float:
+    """Seconds since this process was started (0 where the system does not tell)."""
+    try:
+        with open("/proc/self/stat", encoding="ascii") as file:
+            ticks = float(file.read().rsplit(")", 1)[1].split()[19])
+        with open("/proc/uptime", encoding="ascii") as file:
+            return max(0.0, float(file.read().split()[0]) - ticks / os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+class Stopped(BaseException):
+    """SIGTERM."""
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """SIGTERM raises Stopped in the main thread, as Ctrl-C raises KeyboardInterrupt."""
+
+    def stop(*_: object) -> None:
+        raise Stopped
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """No signal may cut short the saving and closing."""
+    before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+# ------------------------------------------------------------------------------------------------------------ evolve
+
+
+def evolve_main() -> None:
+    """Entry point of `gridsim-evolve`."""
+    started = time.perf_counter() - process_age_s()
+    try:
+        with _stoppable():
+            sys.exit(_evolve(sys.argv[1:], started))
+    except KeyboardInterrupt:  # before there was anything to save
+        print("gridsim-evolve: stopped", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except Stopped:
+        sys.exit(143)
+
+
+def _given(arguments: Sequence[str], flag: str) -> str:
+    """A flag's value, looked up before the real parsing (whose defaults depend on it)."""
+    value = ""
+    for k, argument in enumerate(arguments):
+        if argument == flag and k + 1 < len(arguments):
+            value = arguments[k + 1]
+        elif argument.startswith(flag + "="):
+            value = argument[len(flag) + 1 :]
+    return value
+
+
+def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
+    """Flags and the run's folder, checked; nothing is written yet. Raises UsageError."""
+    from cluster import run as runs
+    from cluster.champion import load_champion
+    from cluster.checkpoint import CheckpointError
+
+    prog = "gridsim-evolve"
+    resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
+    if {"-h", "--help"} & set(arguments) or not (resume or config):
+        flags = parse(EvolveFlags, prog, arguments)
+    elif resume and config:
+        raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
+    else:
+        try:
+            if resume:
+                run = runs.open_run(Path(resume))
+                settings, init = run.settings, run.init
+            else:
+                settings, init = runs.read_config(Path(config))
+        except runs.RunError as error:
+            raise UsageError(str(error)) from error
+        base = EvolveFlags(**dataclasses.asdict(settings), init=init)
+        if resume:
+            base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
+        flags = parse(EvolveFlags, prog, arguments, base)
+    if not 0 <= flags.workers <= MAX_WORKERS:
+        raise UsageError(f"--workers must be 0 to {MAX_WORKERS:,}, not {flags.workers}")
+    if flags.workers == 0 and flags.address:
+        raise UsageError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
+    if resume:
+        for f in dataclasses.fields(EvolveFlags):
+            if f.name in ("workers", "address", "tracking_uri", "experiment", "generations"):
+                continue
+            now, then = getattr(flags, f.name), getattr(base, f.name)
+            if f.name == "output":
+                now, then = Path(now).resolve(), Path(then).resolve()
+            if now != then:
+                raise UsageError(
+                    f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
+                )
+        if flags.generations < run.settings.generations and flags.generations < int(run.saved[1]["generation"]):  # type: ignore[index]
+            raise UsageError(f"--generations {flags.generations} is less than the run has already done")
+        run.settings = flags.settings()
+        run.settings.check()
+        return flags, run
+    settings = flags.settings()
+    settings.check()
+    digest = ""
+    if flags.init:
+        try:
+            champion = load_champion(flags.init)
+        except CheckpointError as error:
+            raise UsageError(f"--init {error}") from error
+        if champion.policy != settings.policy:
+            raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
+        digest = champion.sha256
+    try:
+        return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
+    except runs.RunError as error:
+        raise UsageError(str(error)) from error
+
+
+def _evolve(arguments: Sequence[str], started: float) -> int:
+    prog = "gridsim-evolve"
+    console = Console()
+    try:
+        flags, run = _prepare(arguments)
+        from cluster import tracking
+        from cluster.coordinator import Maps
+        from cluster.pool import PoolError, SerialPool
+        from cluster.run import is_finished, make_tracker
+        from gridsim.config import SimConfig
+
+        if is_finished(run):
+            console.print(f"{run.path} is finished: {run.saved[1]['generation']} generations; nothing to do.")  # type: ignore[index]
+            return 0
+        saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
+        uri = tracking.check_uri(flags.tracking_uri or saved or None)
+    except UsageError as error:
+        fail(prog, str(error))
+    except SettingsError as error:
+        fail(prog, str(error))
+    except tracking.TrackingError as error:
+        fail(prog, str(error))
+
+    maps = Maps(run.settings.scenario, SimConfig())
+    pool: WorkerPool
+    try:
+        if flags.workers == 0:
+            pool = SerialPool(maps.build)
+        else:
+            from cluster.ray_pool import RayPool
+
+            pool = RayPool(flags.workers, maps.build, flags.address or os.environ.get("RAY_ADDRESS") or None)
+    except PoolError as error:
+        maps.close()
+        fail(prog, str(error))
+
+    tracker = make_tracker(run, uri, flags.experiment)
+    status: tracking.Status = "FAILED"
+    code = FAILED
+    message = ""
+    try:
+        message = _run(console, run, pool, maps, tracker, flags, started)
+        status, code = "FINISHED", 0
+    except KeyboardInterrupt:
+        status, code = "KILLED", INTERRUPTED
+    except Stopped:
+        status, code = "KILLED", 143
+    except Exception as error:
+        from cluster.checkpoint import CheckpointError
+
+        if not isinstance(error, PoolError | CheckpointError | MemoryError | OSError):
+            raise
+        message = str(error) or type(error).__name__
+    finally:
+        with _undisturbed():
+            if status == "KILLED":
+                Console(stderr=True).print("stopping; a moment ...", style="dim")
+            pool.close()
+            maps.close()
+            lost = tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
+    if lost:
+        print(f"{prog}: warning: {lost}", file=sys.stderr)
+    resumable = (run.path / "checkpoint.npz").is_file()
+    if status == "KILLED":
+        where = f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "no generation was done yet"
+        print(f"{prog}: stopped; {where}", file=sys.stderr)
+        if not resumable:
+            _discard(run)
+    elif status == "FAILED":
+        fail(prog, message, f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "", FAILED)
+    else:
+        console.print(message)
+    return code
+
+
+def _run(
+    console: Console, run: RunFolder, pool: WorkerPool, maps: object, tracker: object, flags: EvolveFlags, started: float
+) -> str:  # fmt: skip
+    """Evolve and finish. Returns the closing words."""
+    from cluster import progress, report
+    from cluster.champion import load_champion
+    from cluster.coordinator import Maps
+    from cluster.run import Session
+    from cluster.tracking import Tracker, TrackingError
+
+    assert isinstance(maps, Maps)
+    assert isinstance(tracker, Tracker)
+    initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
+    session = Session(run, pool, maps, tracker, started, initial)
+    maps.ahead(session.evolution.curriculum.map_seeds[:3])
+    compile_kernels(session)  # here, before the workers need them: so they are compiled once, and cached
+    run.path.mkdir(parents=True, exist_ok=True)
+    run.write_config()
+    with progress.Progress(console, session, _shown(run.path)) as shown:
+        session.on_row = shown.row
+        session.evolution.on_progress = shown.members
+        session.evolve()
+        shown.note("measuring the champion on held-out roads")
+        summary = session.finish(flags.workers)
+        shown.note("logging to MLflow")
+        if not summary["mlflow_run_id"]:
+            with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
+                summary["mlflow_run_id"] = tracker.wait_ready(30.0)
+        session.write_summary(summary)
+        tracker.log_artifacts(run.path)
+    console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))
+    found = "solved" if summary["solved"] else "the best so far"
+    return (
+        f"{found} after {summary['generations']} generations, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
+        f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
+        f"look at it: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
+    )
+
+
+def compile_kernels(session: Session) -> None:
+    """Compile, or load from the cache, all that a generation needs."""
+    import numpy as np
+
+    from cluster.worker import Task, Worker
+    from evolution.breeding import FRESH, RECIPE, Mutation
+    from evolution.rollout import Limits
+
+    evolution = session.evolution
+    maps, episodes = evolution.curriculum.episodes(0)
+    recipes = np.zeros(2, dtype=RECIPE)
+    recipes["a"] = recipes["b"] = FRESH
+    recipes["seed"] = 1
+    task = Task(
+        policy=session.run.settings.policy,
+        parents=np.zeros((1, evolution.spec.size), dtype=np.float32),
+        key=1,
+        mutation=Mutation(),
+        episodes=episodes[:1],
+        maps=tuple((session.run.settings.scenario, seed) for seed in maps),
+        limits=Limits(1.0, 1),
+        config=evolution.sim,
+        rewind=1,
+    )
+    Worker().evaluate(task, [session.maps.get(seed) for seed in maps], recipes)
+
+
+def _discard(run: RunFolder) -> None:
+    """Remove a folder in which nothing was done."""
+    with contextlib.suppress(OSError):
+        (run.path / "config.json").unlink()
+        run.path.rmdir()
+
+
+def _shown(path: Path) -> str:
+    """A path as the user would type it."""
+    with contextlib.suppress(ValueError):
+        return str(path.resolve().relative_to(Path.cwd()))
+    return str(path)
+
+
+# ---------------------------------------------------------------------------------------------------------- evaluate
+
+
+def evaluate_main() -> None:
+    """Entry point of `gridsim-evaluate`."""
+    prog = "gridsim-evaluate"
+    try:
+        flags = parse(EvaluateFlags, prog, sys.argv[1:])
+        from cluster.champion import evaluate, load_champion
+        from cluster.checkpoint import CheckpointError
+
+        path = Path(flags.champion)
+        try:
+            champion = load_champion(path / "champion.npz" if path.is_dir() else path)
+            figures = evaluate(champion, flags.scenario or None, flags.episodes, flags.seed)
+        except (CheckpointError, ValueError) as error:
+            fail(prog, str(error))
+        if flags.json:
+            import json
+
+            print(json.dumps(figures))
+        else:
+            from cluster.report import held_out_table
+
+            title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
+            Console().print(held_out_table(title, figures))
+    except KeyboardInterrupt:
+        print(f"{prog}: stopped", file=sys.stderr)
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,385 @@
+"""The generation loop of the genetic algorithm: ask, evaluate, race, validate, tell, save.
+
+The coordinator alone builds maps, selects, saves and logs. Everything it decides follows from the seed and from what the
+workers return; nothing follows from the clock or from who returned it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cluster.checkpoint import CheckpointError
+from cluster.pool import Outcome, WorkerPool
+from cluster.settings import EvolveSettings
+from cluster.worker import Task
+from evolution import fitness
+from evolution.breeding import RECIPE, Mutation
+from evolution.curriculum import HELD_OUT_EPISODES, HELD_OUT_MAPS, Curriculum, spread_starts, success_rate
+from evolution.genetic import Genetic, GeneticConfig
+from evolution.policy import PolicySpec
+from evolution.rollout import EPISODE, Limits
+from gridsim.config import SimConfig
+from gridsim.scenarios import HELD_OUT_SEED, Scenario, build
+from gridsim.simulator import End
+
+COLUMNS = (
+    "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
+    "speed_mps/mean", "target_m", "race/success_rate", "validation/success_rate", "car_steps", "wall_s",
+    "car_steps_per_s",
+)  # fmt: skip
+"""Columns of history.csv after `generation`; the names that MLflow has them under."""
+
+MAPS_KEPT = 48
+
+
+class Maps:
+    """Builds maps, each once, and ahead of their use in a thread; keeps the latest."""
+
+    def __init__(self, scenario: str, config: SimConfig):
+        self._scenario, self._config = scenario, config
+        self._built: dict[int, Future[Scenario]] = {}
+        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="maps")
+
+    def ahead(self, seeds: list[int]) -> None:
+        """Begin to build maps that will be needed, in this order."""
+        with self._lock:
+            for seed in seeds:
+                if seed not in self._built:
+                    self._built[seed] = self._thread.submit(build, self._scenario, seed, self._config)
+
+    def get(self, seed: int) -> Scenario:
+        """The map of a seed."""
+        self.ahead([seed])
+        with self._lock:
+            future = self._built.pop(seed)
+            self._built[seed] = future  # the latest used is last
+            while len(self._built) > MAPS_KEPT:
+                del self._built[next(iter(self._built))]
+        return future.result()
+
+    def build(self, scenario: str, seed: int) -> Scenario:
+        """As pools ask for it."""
+        if scenario != self._scenario:
+            raise ValueError(f"a run on {self._scenario} has no map of {scenario}")
+        return self.get(seed)
+
+    def close(self) -> None:
+        """Forget what is not yet begun."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+
+@dataclass
+class Champion:
+    """The best member found so far, by validation.
+
+    Attributes:
+        genome: float32 [genes].
+        success_rate: of all validation episodes; -1 where it was never validated whole.
+        distance_m: its mean distance there.
+        generation: in which it was found.
+    """
+
+    genome: np.ndarray
+    success_rate: float = -1.0
+    distance_m: float = 0.0
+    generation: int = -1
+
+
+@dataclass
+class Evolution:
+    """One run of the genetic algorithm, between pool and files.
+
+    Attributes:
+        settings: what the run was asked to do.
+        pool: who evaluates.
+        maps: who builds maps.
+    """
+
+    settings: EvolveSettings
+    pool: WorkerPool
+    maps: Maps
+    initial: np.ndarray | None = None  # a genome to start from, float32 [genes]
+    score: Callable[[np.ndarray, float], np.ndarray] = fitness.scalar  # (RESULT [n, e], target m) -> [n], greater is better
+    champion: Champion | None = None
+    solved: bool = False
+    history: list[dict[str, float]] = field(default_factory=list)
+    elites: list[np.ndarray] = field(default_factory=list)
+    car_steps: int = 0
+    wall_before_s: float = 0.0
+    started: float = 0.0  # time.perf_counter() of this process's start
+    on_progress: Callable[[str, int, int], None] | None = None
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self.sim = SimConfig()
+        self.spec = PolicySpec.parse(s.policy)
+        self.genetic = Genetic(
+            self.spec,
+            GeneticConfig(s.population, s.elites, s.tournament, s.parents, s.crossover),
+            s.seed,
+            random_search=s.search == "random",
+        )
+        episode = self.sim.episode
+        self.curriculum = Curriculum(
+            s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period
+        )
+        if self.initial is not None:
+            self.genetic.seed_with(self.initial)
+        self.outcomes: list[Outcome] = []  # of the last generation, for statistics
+
+    # ------------------------------------------------------------------------------------------------- evaluating
+
+    def _score(self, results: np.ndarray, target: float) -> np.ndarray:
+        """Scores float64 [n]; what is not a number loses."""
+        score = np.asarray(self.score(results, target), dtype=np.float64)
+        if score.shape != (len(results),):
+            raise ValueError(f"a fitness returns one number a member, [{len(results)}], not {score.shape}")
+        return np.where(np.isfinite(score), score, -1e300)
+
+    def _mutation(self) -> Mutation:
+        s = self.settings
+        return Mutation(s.mutation_rate, self.curriculum.sigma(s.sigma), s.bump_rate)
+
+    def _evaluate(
+        self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, maps: list[int], episodes: np.ndarray,
+        limits: Limits, rewind: int = 0,
+    ) -> np.ndarray:  # fmt: skip
+        task = Task(
+            policy=self.settings.policy,
+            parents=parents,
+            key=key,
+            mutation=self._mutation(),
+            episodes=episodes,
+            maps=tuple((self.settings.scenario, seed) for seed in maps),
+            limits=limits,
+            config=self.sim,
+            rewind=rewind,
+        )
+        progress = self.on_progress
+        outcome = self.pool.evaluate(task, recipes, (lambda k, n: progress(stage, k, n)) if progress else None)
+        self.outcomes.append(outcome)
+        self.car_steps += int(outcome.results["steps"].sum())
+        return outcome.results
+
+    def drive(
+        self, stage: str, genomes: np.ndarray, maps: list[int], episodes: np.ndarray, limits: Limits, rewind: int = 0
+    ) -> np.ndarray:
+        """Results RESULT [n, e] of given genomes [n, genes]: recipes that are plain copies."""
+        recipes = np.zeros(len(genomes), dtype=RECIPE)
+        recipes["a"] = recipes["b"] = np.arange(len(genomes))
+        return self._evaluate(stage, genomes, recipes, 0, maps, episodes, limits, rewind)
+
+    # ------------------------------------------------------------------------------------------------ a generation
+
+    @property
+    def generation(self) -> int:
+        """Generations that are done."""
+        return self.genetic.generation
+
+    def done(self) -> bool:
+        """Whether there is nothing left to evolve."""
+        return self.solved or self.generation >= self.settings.generations
+
+    def step(self) -> dict[str, float]:
+        """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
+        s, curriculum = self.settings, self.curriculum
+        self.outcomes.clear()
+        generation, limits = self.generation, curriculum.limits()
+        maps, episodes = curriculum.episodes(generation)
+        recipes, key = self.genetic.ask(self._mutation())
+        self.maps.ahead(curriculum.map_seeds[: generation + 4])
+        results = self._evaluate("evolve", self.genetic.parents, recipes, key, maps, episodes, limits)
+        score = self._score(results, limits.target)
+        rank = fitness.pareto(fitness.elements(results, limits.target)) if s.ranking == "pareto" else score
+
+        # The generation's best race on more episodes; who raced comes before who did not.
+        best = np.argsort(-np.nan_to_num(rank, nan=-np.inf), kind="stable")[: curriculum.config.racers]
+        race_maps, race_episodes = curriculum.race(generation)
+        racers = self.genetic.genomes(best)
+        raced = self.drive("race", racers, race_maps, race_episodes, limits, curriculum.config.rewind)
+        n, m = len(episodes), len(race_episodes)
+        race_score = (n * score[best] + m * self._score(raced, limits.target)) / (n + m)
+        order = np.argsort(-race_score, kind="stable")
+        total = rank - rank.max() - 1.0  # below 0
+        total[best[order]] = np.arange(len(order), 0, -1)
+        race_success = float(success_rate(raced)[order[:8]].mean())
+        curriculum.raced(order, raced, raced["rewound"], race_maps, race_episodes)
+        self.genetic.tell(total)
+
+        if limits.target >= curriculum.config.validation_target or generation + 1 >= s.generations:
+            self._validate(racers[order[: curriculum.config.contenders]])
+        self.elites.append(racers[order[0]])
+        top = order[0]
+        seconds = results["steps"] * self.sim.episode.control_period
+        speed = results["distance"].sum(axis=1) / np.maximum(seconds.sum(axis=1), 1e-9)
+        row = {
+            "fitness/best": float(race_score[top]),
+            "fitness/mean": float(score.mean()),
+            "fitness/std": float(score.std()),
+            "distance_m/best": float(raced["distance"][top].mean()),
+            "distance_m/mean": float(results["distance"].mean()),
+            "speed_mps/best": _speed(raced[top], self.sim.episode.control_period),
+            "speed_mps/mean": float(speed.mean()),
+            "target_m": limits.target,
+            "race/success_rate": race_success,
+            "validation/success_rate": max(self.champion.success_rate, 0.0) if self.champion else 0.0,
+            "car_steps": float(self.car_steps),
+        }
+        self.history.append(row)
+        return row
+
+    def _validate(self, contenders: np.ndarray) -> None:
+        """Find out whether one of [n, genes] is better than the champion; only who passes a first stage is tried whole."""
+        maps, episodes = self.curriculum.validation()
+        limits = self.curriculum.validation_limits()
+        first = self.curriculum.config.first_validation
+        trial = self.drive("validate", contenders, maps, episodes[:first], limits)
+        k = _best(trial)
+        if self.champion is not None and success_rate(trial)[k] < self.champion.success_rate - 0.02:
+            return
+        rest = self.drive("validate", contenders[k : k + 1], maps, episodes[first:], limits)
+        whole = np.concatenate([trial[k : k + 1], rest], axis=1)
+        rate, distance = float(success_rate(whole)[0]), float(whole["distance"].mean())
+        now = self.champion
+        if now is None or (rate, distance) > (now.success_rate, now.distance_m):
+            self.champion = Champion(contenders[k].copy(), rate, distance, self.generation - 1)
+        self.solved = self.champion is not None and self.champion.success_rate >= self.settings.until
+
+    def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
+        """Add the wall clock's columns to a row."""
+        row["wall_s"] = wall_s
+        steps, seconds = row["car_steps"], wall_s
+        if previous is not None:
+            steps, seconds = steps - previous["car_steps"], wall_s - previous["wall_s"]
+        row["car_steps_per_s"] = steps / max(seconds, 1e-9)
+
+    def held_out(self) -> dict[str, float]:
+        """The champion on roads nobody was trained or chosen on: the same 64 episodes for every run of a scenario."""
+        assert self.champion is not None
+        before = self.car_steps
+        maps, episodes = held_out_episodes(self.maps)
+        results = self.drive("held out", self.champion.genome[None], maps, episodes, self.curriculum.goal_limits())
+        self.car_steps = before  # not part of learning
+        return summarise(results[0], self.sim.episode.control_period)
+
+    # ------------------------------------------------------------------------------------------------------- state
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All that an exact resume needs: arrays and plain numbers."""
+        genes = self.spec.size
+        rows = [[row[name] for name in COLUMNS] for row in self.history]
+        champion = self.champion
+        arrays = {
+            "parents": self.genetic.parents,
+            "crashes": _plain(self.curriculum.crashes),
+            "history": np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS)),
+            "elites": np.array(self.elites, dtype=np.float32).reshape(-1, genes),
+            "champion": champion.genome if champion else np.zeros(0, dtype=np.float32),
+        }
+        meta = {
+            "generation": self.generation,
+            "elite_rows": self.genetic.elites,
+            "target_m": self.curriculum.target,
+            "car_steps": self.car_steps,
+            "solved": self.solved,
+            "columns": list(COLUMNS),
+            "champion": [champion.success_rate, champion.distance_m, champion.generation] if champion else [],
+        }
+        return arrays, meta
+
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        """Take up a state. Raises CheckpointError with one line where it does not fit this run."""
+        genes = self.spec.size
+        try:
+            history, parents, elites = arrays["history"], arrays["parents"], arrays["elites"]
+            generation, crashes = int(meta["generation"]), arrays["crashes"]
+            fits = (
+                meta["columns"] == list(COLUMNS)
+                and history.shape == (generation, len(COLUMNS))
+                and elites.shape == (generation, genes)
+                and elites.dtype == np.float32
+                and parents.ndim == 2
+                and parents.shape[1] == genes
+                and parents.dtype == np.float32
+                and crashes.ndim == 2
+                and crashes.shape[1] == 6
+                and 0 <= int(meta["elite_rows"]) <= len(parents)
+                and arrays["champion"].size in (0, genes)
+            )
+            if not fits or not np.isfinite(history).all() or not 0.0 < float(meta["target_m"]) <= self.curriculum.goal:
+                raise ValueError("its parts do not fit each other")
+            self.genetic.generation, self.genetic.elites = generation, int(meta["elite_rows"])
+            self.genetic.parents = parents
+            self.curriculum.target = float(meta["target_m"])
+            self.curriculum.crashes = _crashes(crashes)
+            self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
+            self.history = [dict(zip(COLUMNS, row.tolist(), strict=True)) for row in history]
+            self.elites = list(elites)
+            if meta["champion"]:
+                rate, distance, found = meta["champion"]
+                self.champion = Champion(arrays["champion"], float(rate), float(distance), int(found))
+            self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
+
+    def history_csv(self) -> bytes:
+        """history.csv: a row a generation."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["generation", *COLUMNS])
+        for k, row in enumerate(self.history):
+            writer.writerow([k, *(repr(row[name]) for name in COLUMNS)])
+        return text.getvalue().encode()
+
+
+def held_out_episodes(maps: Maps) -> tuple[list[int], np.ndarray]:
+    """Map seeds and EPISODE [64] that are reported on and never chosen on."""
+    return spread_starts(maps.get, HELD_OUT_SEED, HELD_OUT_MAPS, HELD_OUT_EPISODES)
+
+
+def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
+    """Means over the episodes of one member: RESULT [e]."""
+    return {
+        "episodes": len(results),
+        "success_rate": float((results["end"] == End.SUCCESS).mean()),
+        "distance_m": float(results["distance"].mean()),
+        "speed_mps": _speed(results, period_s),
+        "collision_rate": float((results["end"] == End.COLLISION).mean()),
+    }
+
+
+def _speed(results: np.ndarray, period_s: float) -> float:
+    """Mean over episodes of the speed made good: new ground over time, in m/s."""
+    seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
+    return float((results["distance"] / seconds).mean())
+
+
+def _best(results: np.ndarray) -> int:
+    """Index of the member with the most successes, the greater distance among equals."""
+    return int(np.lexsort((results["distance"].mean(axis=1), success_rate(results)))[-1])
+
+
+def _plain(episodes: np.ndarray) -> np.ndarray:
+    """EPISODE [n] as float64 [n, 6]."""
+    return np.concatenate([episodes["map"][:, None].astype(np.float64), episodes["start"]], axis=1)
+
+
+def _crashes(plain: np.ndarray) -> np.ndarray:
+    episodes = np.zeros(len(plain), dtype=EPISODE)
+    episodes["map"], episodes["start"] = plain[:, 0], plain[:, 1:]
+    return episodes
+
+
+def now() -> float:
+    """The clock that durations are taken with; nothing is decided by it."""
+    return time.perf_counter()

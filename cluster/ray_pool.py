@@ -1,0 +1,484 @@
+"""A pool of Ray actors, on a Ray of its own or on an existing cluster. The only file that knows Ray.
+
+What differs from Ray's own habits, and why:
+
+* A Ray of our own goes without dashboard server, autoscaler monitor and log monitor, none of which a run uses: they
+  cost a second at the start, another one at the end, and 1.5 core-seconds of the workers' time (`_lean_head`).
+* Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the kernel
+  kills Ray's processes when their parent *thread* dies, and so they die with us whatever kills us.
+* Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and a
+  chunk that kills whoever takes it has to end the run with a clear line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import os
+import pickle
+import secrets
+import shutil
+import signal
+import socket
+import threading
+import time
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from cluster.pool import BuildMap, Outcome, PoolError, Progress, chunks, describe, last_line, new_outcome
+from cluster.worker import Task, Worker
+from evolution.breeding import RECIPE
+from gridsim.roads import freeze
+from gridsim.scenarios import Scenario
+
+PROBE_S = 3.0
+CONNECT_S = 60.0
+QUEUE = 2  # chunks that a worker holds: one that it works on, one so that it need not wait for us
+MAX_KILLS = 3  # workers that one chunk may cost
+MAX_FAILED_STARTS = 3  # in a row
+STORE_BYTES = 256 << 20  # of shared memory, taken page by page as it is used
+LEAST_STORE_BYTES = 80 << 20  # Ray takes no less than 75 MiB
+MAP_BYTES = 112 << 20  # of maps that are kept in the object store
+
+# Read when Ray is imported.
+_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal when we are told to stop
+}
+# Read by the processes of a Ray of our own.
+_OWN_ENVIRONMENT = {
+    "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it just misses its object store, and then sleeps 1 s
+    "RAY_raylet_client_num_connect_attempts": "500",
+    "RAY_prestart_worker_first_driver": "0",  # with it, init waits for ever where a worker dies as it starts
+    "RAY_enable_metrics_collection": "0",
+    "RAY_task_events_report_interval_ms": "0",
+}
+_TOKEN = secrets.token_hex(32)
+_AUTH_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+
+
+class _Actor:
+    """Runs in a worker's process: holds the generation's task and maps, answers chunks."""
+
+    def __init__(self, factory: Callable[[], Worker]):
+        # Ctrl-C goes to every process of the terminal; whether the workers stop is the coordinator's business.
+        with contextlib.suppress(ValueError):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self._worker = factory()
+        self._serial = 0
+        self._task: Task | None = None
+        self._maps: dict[tuple[str, int], Scenario] = {}
+        self._failure: Exception | None = None
+
+    def hello(self) -> int:
+        return os.getpid()
+
+    def prepare(self, serial: int, held: list[Any], map_refs: list[Any]) -> None:
+        """Take up a generation. References come in lists, so that Ray hands them over as they are."""
+        import ray
+
+        self._serial, self._task, self._failure = serial, None, None
+        try:
+            task: Task = ray.get(held[0])
+            # Maps that the last task had too are kept as they are; those that left are let go.
+            self._maps = {
+                name: self._maps[name] if name in self._maps else Scenario.from_arrays(ray.get(ref))
+                for name, ref in zip(task.maps, map_refs, strict=True)
+            }
+            self._task = task
+        except Exception as error:  # nobody reads this call's answer: the first chunk reports it
+            self._failure = error
+
+    def run(self, serial: int, recipes: bytes) -> bytes:
+        """The seconds it took as float64, then the task's rows [n, episodes], as bytes: a fifth of what pickled arrays need."""
+        if self._failure:
+            raise self._failure
+        if self._task is None or serial != self._serial:
+            raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
+        maps = [self._maps[name] for name in self._task.maps]
+        results, seconds = self._worker.evaluate(self._task, maps, np.frombuffer(recipes, RECIPE))
+        return np.float64(seconds).tobytes() + results.tobytes()
+
+
+@dataclass
+class _Slot:
+    """One worker's place; who dies in it is replaced."""
+
+    number: int
+    actor: Any
+    hello: Any  # the answer that says it is up; None once it is
+    pid: int = 0
+    serial: int = 0  # of the last task that it was prepared for
+    sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (chunk, answer), oldest first
+
+
+class RayPool:
+    """Workers as Ray actors of one CPU each. One pool at a time in a process.
+
+    Args:
+        workers: how many. On a cluster the first one that is up starts, the others join as they come.
+        build_map: builds a map, here, once; workers see it in shared memory.
+        address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
+        worker_factory: makes what evaluates; must be importable in the workers.
+        start_timeout_s: how long there may be no worker at all; default 60 s, on a cluster 300 s (it may be growing).
+
+    Raises PoolError at once where nothing answers at `address`; all else that goes wrong is raised by `evaluate`.
+    """
+
+    def __init__(
+        self,
+        workers: int,
+        build_map: BuildMap,
+        address: str | None = None,
+        worker_factory: Callable[[], Worker] = Worker,
+        start_timeout_s: float | None = None,
+    ):
+        if workers < 1:
+            raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
+        for name, value in _ENVIRONMENT.items():
+            os.environ.setdefault(name, value)
+        self.address = None if address is None else check_address(address)
+        self._auto = address == "auto"
+        self._asked = workers
+        self._build_map = build_map
+        self._factory = worker_factory
+        self._start_timeout_s = start_timeout_s or (60.0 if address is None else 300.0)
+        self._slots: list[_Slot] = []
+        self._maps: OrderedDict[tuple[str, int], tuple[Any, int]] = OrderedDict()  # references and bytes
+        self._map_bytes = MAP_BYTES
+        self._serial = 0
+        self._failed_starts = 0
+        self._session: str | None = None  # folder of our own Ray's logs
+        self._failure: BaseException | None = None
+        self._connected = self._troubled = False
+        self._booted, self._closed = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
+        self._thread.start()
+
+    def workers(self) -> int:
+        return len(self.pids())
+
+    def pids(self) -> list[int]:
+        """Process ids of the workers that are up, on whichever machine they are."""
+        return [slot.pid for slot in self._slots if slot.pid]
+
+    def evaluate(self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None) -> Outcome:
+        import ray
+
+        started = time.perf_counter()
+        self._wait_for_ray()
+        recipes = freeze(recipes)
+        outcome = new_outcome(task, recipes)
+        cut = chunks(len(recipes), self._asked)
+        todo = deque(range(len(cut)))
+        kills: Counter[int] = Counter()
+        done = 0
+        self._serial += 1
+        for slot in self._slots:
+            slot.sent.clear()  # left over where the last call was interrupted
+        held, map_refs = self._broadcast(task, outcome)
+        nobody_since = time.monotonic()
+
+        while done < len(recipes):
+            for slot in self._free(todo):
+                if slot.serial != self._serial:
+                    slot.actor.prepare.remote(self._serial, held, map_refs)
+                    slot.serial = self._serial
+                chunk = todo.popleft()
+                raw = recipes[cut[chunk]].tobytes()
+                slot.sent.append((chunk, slot.actor.run.remote(self._serial, raw)))
+                outcome.bytes_down += len(raw)
+            waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
+            for ref in ray.wait(list(waiting), num_returns=1, timeout=1.0)[0]:
+                slot = waiting[ref]
+                if slot.hello:
+                    self._greet(slot)
+                    continue
+                chunk = slot.sent[0][0]
+                rows = cut[chunk]
+                try:
+                    raw = ray.get(ref)
+                except ray.exceptions.RayTaskError as error:
+                    cause = error.cause if isinstance(error.cause, BaseException) else error
+                    raise PoolError(f"a worker failed on {describe(chunk, rows)}: {last_line(cause)}") from error
+                except ray.exceptions.RayError as error:
+                    kills[chunk] += 1
+                    if kills[chunk] >= MAX_KILLS:
+                        raise PoolError(
+                            f"{describe(chunk, rows)} killed its worker {MAX_KILLS} times; the last time: "
+                            + _reason(error)
+                        ) from error
+                    todo.extendleft(index for index, _ in reversed(slot.sent))
+                    outcome.retries += len(slot.sent)
+                    self._replace(slot)
+                    continue
+                slot.sent.popleft()
+                results = np.frombuffer(raw, task.row, offset=8).reshape(-1, len(task.episodes))
+                outcome.add(slot.number, rows, results, float(np.frombuffer(raw, np.float64, 1)[0]))
+                outcome.bytes_up += len(raw)
+                done += rows.stop - rows.start
+                if on_progress:
+                    on_progress(done, len(recipes))
+            if self.pids():
+                nobody_since = time.monotonic()
+            elif time.monotonic() - nobody_since > self._start_timeout_s:
+                raise PoolError(f"no worker came up within {self._start_timeout_s:g} s: {_capacity()}")
+        outcome.wall_s = time.perf_counter() - started
+        return outcome
+
+    def close(self) -> None:
+        if self._closed.is_set():
+            return
+        with _no_interrupt():  # a second Ctrl-C must not leave half of it behind
+            self._booted.wait(CONNECT_S)  # what is only just starting cannot be stopped
+            if self._connected:
+                import ray
+
+                for slot in self._slots:
+                    ray.kill(slot.actor)
+                ray.shutdown(wait_for_processes=True)
+                _forget_token()
+                if self._session and not self._troubled:
+                    shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never clears up its logs
+            self._slots = []
+            self._closed.set()
+            self._thread.join(1.0)
+
+    def _boot(self) -> None:
+        """Bring up Ray and ask it for the workers; then wait, since Ray's processes die with this thread."""
+        try:
+            import ray
+
+            if ray.is_initialized():
+                raise PoolError("Ray is in use in this process already; close the other pool first")
+            if self.address is None:
+                store = _store_bytes()
+                self._map_bytes = store * MAP_BYTES // STORE_BYTES
+                self._session = _start_own(self._asked, store)
+            else:
+                _join(self.address, self._auto)
+            self._connected = True
+            self._actor_class = ray.remote(num_cpus=1)(_Actor)
+            for number in range(self._asked):
+                self._slots.append(_Slot(number, *self._new_actor()))
+        except BaseException as error:
+            self._failure = error
+        finally:
+            self._booted.set()
+        self._closed.wait()
+
+    def _wait_for_ray(self) -> None:
+        if self._closed.is_set():
+            raise PoolError("the pool of workers is closed")
+        if not self._booted.wait(CONNECT_S):
+            raise PoolError(f"Ray did not come up within {CONNECT_S:g} s")
+        if isinstance(self._failure, PoolError):
+            raise self._failure
+        if self._failure:
+            where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
+            raise PoolError(f"{where}: {_reason(self._failure)}") from self._failure
+
+    def _new_actor(self) -> tuple[Any, Any]:
+        actor: Any = self._actor_class.remote(self._factory)
+        return actor, actor.hello.remote()
+
+    def _replace(self, slot: _Slot) -> None:
+        import ray
+
+        self._troubled = True
+        ray.kill(slot.actor)  # it may be alive and merely out of reach
+        actor, hello = self._new_actor()
+        self._slots[slot.number] = _Slot(slot.number, actor, hello)
+
+    def _greet(self, slot: _Slot) -> None:
+        """A worker is up, or could not start."""
+        import ray
+
+        try:
+            slot.pid = ray.get(slot.hello)
+        except ray.exceptions.RayError as error:
+            self._failed_starts += 1
+            if self._failed_starts >= MAX_FAILED_STARTS:
+                raise PoolError(f"no worker can be started: {_reason(error)}") from error
+            self._replace(slot)
+        else:
+            slot.hello = None
+            self._failed_starts = 0
+
+    def _free(self, todo: deque[int]) -> Iterator[_Slot]:
+        """Whom to give the next chunk, as long as there is one. The last ones only go to who has nothing to do."""
+        up = [slot for slot in self._slots if slot.pid]
+        for depth in range(QUEUE):
+            for slot in up:
+                if len(slot.sent) == depth and len(todo) > (len(up) if depth else 0):
+                    yield slot
+
+    def _broadcast(self, task: Task, outcome: Outcome) -> tuple[list[Any], list[Any]]:
+        """Put the task, and those of its maps that are not there yet, into the object store."""
+        import ray
+
+        buffers: list[pickle.PickleBuffer] = []
+        head = pickle.dumps(task, protocol=5, buffer_callback=buffers.append)
+        outcome.broadcast_bytes = len(head) + sum(buffer.raw().nbytes for buffer in buffers)
+        for name in task.maps:
+            if name not in self._maps:
+                arrays = self._build_map(*name).arrays()
+                size = sum(array.nbytes for array in arrays.values())
+                self._maps[name] = ray.put(arrays), size
+                outcome.broadcast_bytes += size
+            self._maps.move_to_end(name)
+        used = sum(size for _, size in self._maps.values())
+        while used > self._map_bytes and len(self._maps) > len(set(task.maps)):
+            used -= self._maps.popitem(last=False)[1][1]
+        return [ray.put(task)], [self._maps[name][0] for name in task.maps]
+
+
+def check_address(address: str) -> str:
+    """The `host:port` of the Ray cluster meant by `address` (`host:port`, or `auto`: RAY_ADDRESS, else this machine's).
+
+    Raises PoolError, one line, within some seconds where no Ray can be there. (Unprobed, Ray hangs for minutes.)
+    """
+    if address == "auto":
+        address = os.environ.get("RAY_ADDRESS", "auto")
+    if address == "auto":
+        logging.getLogger("ray").setLevel(logging.CRITICAL)
+        services = importlib.import_module("ray._private.services")
+        try:
+            address = services.canonicalize_bootstrap_address("auto")
+        except ConnectionError:
+            raise PoolError(
+                "no Ray cluster runs on this machine; start one with `ray start --head`, or give its host:port"
+            ) from None
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65_536 or "/" in address:
+        raise PoolError(f"{address!r} is no address of a Ray cluster; give host:port (of `ray start --head`) or auto")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), PROBE_S) as connection:
+            if os.environ.get("RAY_USE_TLS", "0") in ("", "0"):
+                # Ray speaks gRPC: HTTP/2's preface with empty settings is answered by settings (a frame of type 4).
+                connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0")
+                answer = connection.recv(9)
+                if answer[3:4] != b"\4":
+                    raise PoolError(
+                        f"what answers at {address} is no Ray cluster; is this the port of `ray start --head`?"
+                    )
+    except OSError as error:
+        reason = "no answer within 3 s" if isinstance(error, TimeoutError) else error.strerror or str(error)
+        raise PoolError(f"no Ray cluster answers at {address}: {reason}; is `ray start --head` up?") from None
+    return address
+
+
+def _start_own(workers: int, store_bytes: int) -> str:
+    """Start Ray on this machine with one CPU for each worker; returns the folder of its logs."""
+    import ray
+
+    if not any(name in os.environ for name in _AUTH_ENVIRONMENT):
+        # Ray listens on all interfaces and lets in who has its token. One of our own need not outlive the run in
+        # ~/.ray, where it would change what `ray start` does from then on.
+        os.environ["RAY_AUTH_TOKEN"] = _TOKEN
+    with _environment(_OWN_ENVIRONMENT), _lean_head():
+        context: Any = ray.init(
+            address="local",  # whatever RAY_ADDRESS says
+            num_cpus=workers,
+            num_gpus=0,
+            object_store_memory=store_bytes,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.CRITICAL,
+        )
+    return context.address_info["session_dir"]
+
+
+def _join(address: str, auto: bool) -> None:
+    """Connect to a cluster. Ray looks for its token by itself only where it is asked to look for the cluster too."""
+    import ray
+
+    ray.init(address="auto" if auto else address, log_to_driver=False, logging_level=logging.CRITICAL)
+
+
+@contextlib.contextmanager
+def _lean_head() -> Iterator[None]:
+    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
+
+    Ray has no setting for that, so this replaces private names while `ray.init` runs. Where a version lacks them, Ray
+    starts with all its helpers, as it would by itself.
+    """
+    try:
+        node = importlib.import_module("ray._private.node").Node
+        parameter: Any = importlib.import_module("ray._private.parameter")
+        start_api_server, ray_params = node.start_api_server, parameter.RayParams
+        ray_params(no_monitor=True, include_log_monitor=False)
+    except (ImportError, AttributeError, TypeError):
+        yield
+        return
+
+    def no_api_server(self: Any, **_: Any) -> None:
+        self._webui_url = ""
+
+    node.start_api_server = no_api_server
+    parameter.RayParams = partial(ray_params, no_monitor=True, include_log_monitor=False)
+    try:
+        yield
+    finally:
+        node.start_api_server, parameter.RayParams = start_api_server, ray_params
+
+
+@contextlib.contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for the processes that are started meanwhile; what the user has set stays."""
+    ours = {name: value for name, value in values.items() if name not in os.environ}
+    os.environ.update(ours)
+    try:
+        yield
+    finally:
+        for name in ours:
+            os.environ.pop(name, None)
+
+
+@contextlib.contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Ignore Ctrl-C meanwhile (where signals can be set: in the main thread)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _forget_token() -> None:
+    """Leave the environment as it was, so that a cluster can be joined afterwards."""
+    if os.environ.get("RAY_AUTH_TOKEN") == _TOKEN:
+        del os.environ["RAY_AUTH_TOKEN"]
+        os.environ.pop("RAY_AUTH_MODE", None)  # Ray's own doing
+
+
+def _store_bytes() -> int:
+    """Size of the object store: small, and smaller where shared memory is (a container's default is 64 MB)."""
+    try:
+        free = shutil.disk_usage("/dev/shm").free
+    except OSError:
+        return STORE_BYTES
+    return max(min(STORE_BYTES, free * 9 // 10), LEAST_STORE_BYTES)
+
+
+def _capacity() -> str:
+    """What the cluster has to offer, in words."""
+    import ray
+
+    free, total = ray.available_resources().get("CPU", 0), ray.cluster_resources().get("CPU", 0)
+    return f"Ray has {total:g} CPUs, {free:g} of them free, and a worker needs 1"
+
+
+def _reason(error: BaseException) -> str:
+    """One short line of Ray's long messages."""
+    return last_line(error).split(". There are some potential root causes")[0][:300]

@@ -1,0 +1,293 @@
+"""A run's folder and its life: prepare or resume, evolve, save after every generation, close.
+
+The order of saving, after each generation: the checkpoint (which holds the history), history.csv made from it, the MLflow
+row. Whatever kills the process, the folder holds the last whole generation, and a resumed run gives the same champion.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cluster import checkpoint
+from cluster.champion import Champion
+from cluster.checkpoint import CheckpointError
+from cluster.coordinator import COLUMNS, Evolution, Maps, held_out_episodes, now
+from cluster.pool import WorkerPool
+from cluster.settings import EvolveSettings, SettingsError, from_dict, to_dict
+from cluster.tracking import Tracker, git_commit
+from evolution.rollout import trajectory as drive_trajectory
+from gridsim.config import SimConfig
+
+CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
+HISTORY, ELITES, SUMMARY = "history.csv", "elites.npz", "summary.json"
+CONFIG_FORMAT = 1
+METRICS = tuple(name for name in COLUMNS if name not in ("target_m",))
+
+
+class RunError(Exception):
+    """A run's folder that cannot be made, read or resumed; the message is one line for the user."""
+
+
+@dataclass
+class RunFolder:
+    """Where a run is kept, and what it was asked to do.
+
+    Attributes:
+        path: the folder.
+        settings: what decides its champion.
+        init: path of the champion it started from, or "".
+        init_sha256: digest of that genome, or "".
+        saved: arrays and meta of its checkpoint, where it is resumed.
+        tracking_key: by which MLflow's run is found again, even if a process was killed before it knew the run's id.
+    """
+
+    path: Path
+    settings: EvolveSettings
+    init: str = ""
+    init_sha256: str = ""
+    saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None
+    tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    def config(self) -> dict[str, Any]:
+        """What config.json holds: enough to repeat the run."""
+        return {
+            "format": CONFIG_FORMAT,
+            "command": "gridsim-evolve",
+            "gridsim": version("gridsim"),
+            "settings": to_dict(self.settings),
+            "curriculum": dataclasses.asdict(self.settings.curriculum()),
+            "simulator": dataclasses.asdict(SimConfig()),
+            "init": self.init,
+            "init_sha256": self.init_sha256,
+        }
+
+    def digest(self) -> str:
+        """Of what must not differ between a run and its resumption."""
+        parts = self.config()
+        parts["settings"].pop("generations")
+        for name in ("gridsim", "init"):
+            parts.pop(name)
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+    def write_config(self) -> None:
+        """Write config.json."""
+        checkpoint.write_atomic(self.path / CONFIG, (json.dumps(self.config(), indent=2) + "\n").encode())
+
+
+def read_config(path: Path) -> tuple[EvolveSettings, str]:
+    """Settings and the initial champion's path from a run's config.json. Raises RunError."""
+    try:
+        if path.stat().st_size > 1 << 20:
+            raise RunError(f"{path}: too large for a run's {CONFIG}")
+        config = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(config, dict) or config.get("format") != CONFIG_FORMAT:
+            raise RunError(f"{path}: not a {CONFIG} of this GridSim")
+        return from_dict(dict(config["settings"])), str(config.get("init", ""))
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror or error}") from error
+    except SettingsError as error:
+        raise RunError(f"{path}: {error}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{path}: not a run's {CONFIG}: {type(error).__name__}") from error
+
+
+def open_run(folder: Path) -> RunFolder:
+    """A run's folder to be resumed, its checkpoint read and checked. Raises RunError."""
+    if not (folder / CONFIG).is_file():
+        raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
+    settings, init = read_config(folder / CONFIG)
+    run = RunFolder(folder.resolve(), settings, init)
+    if not (folder / CHECKPOINT).is_file():
+        raise RunError(f"{folder} has no {CHECKPOINT} to resume from; start it anew with --config {folder / CONFIG}")
+    try:
+        run.saved = checkpoint.load(folder / CHECKPOINT)
+    except CheckpointError as error:
+        raise RunError(str(error)) from error
+    run.init_sha256 = str(run.saved[1].get("init_sha256", ""))
+    run.tracking_key = str(run.saved[1].get("tracking", {}).get("key", run.tracking_key))
+    if run.saved[1].get("digest") != run.digest():
+        raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
+    return run
+
+
+def new_run(output: Path, name: str, settings: EvolveSettings, init: str = "", init_sha256: str = "") -> RunFolder:
+    """A new run's folder, checked but not yet made. Raises RunError."""
+    if not name:
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        kind = "evolution" if settings.search == "evolution" else "random"
+        name = f"{settings.scenario}-{kind}-s{settings.seed}-{stamp}"
+        if (output / name).exists():
+            name += f"-{os.getpid()}"
+    if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
+        raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
+    path = output / name
+    if path.exists():
+        raise RunError(f"{path} exists already; choose another --name, or continue it with --resume {path}")
+    parent = output
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise RunError(f"--output {output}: cannot be written; choose another folder")
+    return RunFolder(path.absolute(), settings, init, init_sha256)
+
+
+def is_finished(run: RunFolder) -> bool:
+    """Whether there is nothing left to do: evolved to the end, and all files are there."""
+    if run.saved is None or not (run.path / SUMMARY).is_file():
+        return False
+    meta = run.saved[1]
+    return bool(meta["solved"]) or int(meta["generation"]) >= run.settings.generations
+
+
+@dataclass
+class Session:
+    """One process's share of a run, from start or resume to its end.
+
+    Attributes:
+        run: the folder.
+        pool: who evaluates.
+        maps: who builds maps.
+        tracker: who logs to MLflow.
+        process_started: time.perf_counter() of the process's start.
+        on_row: told each generation's number and row.
+    """
+
+    run: RunFolder
+    pool: WorkerPool
+    maps: Maps
+    tracker: Tracker
+    process_started: float
+    initial: np.ndarray | None = None
+    on_row: Callable[[int, dict[str, float]], None] | None = None
+    on_progress: Callable[[str, int, int], None] | None = None
+    evolution: Evolution = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.evolution = Evolution(self.run.settings, self.pool, self.maps, self.initial, on_progress=self.on_progress)
+        if self.run.saved is not None:
+            self.evolution.restore(*self.run.saved)
+
+    def evolve(self) -> None:
+        """Evolve to the end, saving after every generation."""
+        evolution = self.evolution
+        for step, past in enumerate(evolution.history):
+            self._log(step, past)  # what MLflow has is skipped
+        while not evolution.done():
+            row = evolution.step()
+            wall = evolution.wall_before_s + now() - self.process_started
+            evolution.timed(row, wall, evolution.history[-2] if len(evolution.history) > 1 else None)
+            self.save()
+            self._log(evolution.generation - 1, row)
+            if self.on_row:
+                self.on_row(evolution.generation, row)
+
+    def _log(self, step: int, row: dict[str, float]) -> None:
+        self.tracker.log_row(step, {name: row[name] for name in METRICS})
+
+    def save(self) -> None:
+        """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
+        arrays, meta = self.evolution.state()
+        meta |= {
+            "digest": self.run.digest(),
+            "init_sha256": self.run.init_sha256,
+            "tracking": {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key},
+        }
+        checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
+        checkpoint.write_atomic(self.run.path / HISTORY, self.evolution.history_csv(), durable=False)
+
+    def finish(self, workers: int) -> dict[str, Any]:
+        """Measure the champion on held-out roads and write what is left: champion, elites, summary, pictures.
+
+        Returns: the summary.
+        """
+        from cluster import report
+
+        evolution, path = self.evolution, self.run.path
+        assert evolution.champion is not None
+        champion = Champion(
+            evolution.champion.genome, self.run.settings.policy, self.run.settings.scenario, evolution.sim
+        )
+        champion.save(path / CHAMPION)
+        checkpoint.save(path / ELITES, {"genomes": np.array(evolution.elites)}, {"policy": self.run.settings.policy})
+        figures = evolution.held_out()
+        report.curves(evolution.history, path / "curves.png")
+        seeds, episodes = held_out_episodes(self.maps)
+        scenario = self.maps.get(seeds[int(episodes[0]["map"])])
+        result, states = drive_trajectory(
+            evolution.spec, champion.genome, scenario, episodes[0]["start"], evolution.curriculum.goal_limits(),
+            evolution.sim,
+        )  # fmt: skip
+        report.trajectory(
+            scenario, states, path / "trajectory.png",
+            f"{self.run.settings.scenario}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
+        )  # fmt: skip
+        wall = evolution.wall_before_s + now() - self.process_started
+        summary = {
+            "name": self.run.name,
+            "mlflow_run_id": self.tracker.run_id or "",
+            "scenario": self.run.settings.scenario,
+            "seed": self.run.settings.seed,
+            "workers": workers,
+            "generations": evolution.generation,
+            "car_steps": evolution.car_steps,
+            "wall_s": round(wall, 3),
+            "car_steps_per_s": round(evolution.car_steps / wall, 1),
+            "champion_sha256": champion.sha256,
+            "champion_generation": evolution.champion.generation,
+            "validation_success_rate": evolution.champion.success_rate,
+            "solved": evolution.solved,
+            "held_out": figures,
+        }
+        self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
+        self.write_summary(summary)
+        return summary
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Write summary.json, the mark of a finished run."""
+        checkpoint.write_atomic(self.run.path / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
+
+
+def make_tracker(run: RunFolder, uri: str, experiment: str) -> Tracker:
+    """The run's tracker, not yet started."""
+    settings = run.settings
+    known = run.saved[1]["tracking"] if run.saved else {}
+    params = {name: str(value) for name, value in to_dict(settings).items()}
+    params |= {f"curriculum/{k}": str(v) for k, v in dataclasses.asdict(settings.curriculum()).items()}
+    for part, values in dataclasses.asdict(SimConfig()).items():
+        params |= {f"{part}/{k}": str(v) for k, v in values.items()}
+    tags = {
+        "algorithm": "evolution",
+        "search": settings.search,
+        "scenario": settings.scenario,
+        "seed": str(settings.seed),
+        "git_commit": git_commit(),
+    }
+    return Tracker(
+        uri, experiment, run.name, params, tags,
+        run_id=known.get("run_id") if known.get("uri") == uri else None,
+        key=run.tracking_key, start=False,
+    )  # fmt: skip
+
+
+def read_history(path: Path) -> list[dict[str, float]]:
+    """Rows of a history.csv."""
+    with path.open(newline="") as file:
+        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]

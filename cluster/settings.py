@@ -1,0 +1,111 @@
+"""What a run was asked to do: the fields are the command's flags, and config.json is them written down."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from evolution.curriculum import CurriculumConfig
+from evolution.genetic import GeneticConfig
+from evolution.policy import PolicySpec
+from gridsim.scenarios import REGISTRY, VALIDATION_SEED
+
+MAX_POPULATION = 1_000_000
+
+
+class SettingsError(ValueError):
+    """Settings that make no sense; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class EvolveSettings:
+    """What an evolution run depends on: two runs with equal settings have the same champion."""
+
+    scenario: str = "seamless"
+    """Road to learn to drive on."""
+    traffic: int = 0
+    """Other cars on the road."""
+    seed: int = 0
+    """Seed of every random number of the run."""
+    policy: str = "mlp:6,7"
+    """Network: mlp: and the sizes of its hidden layers."""
+    population: int = 512
+    """Members of a generation."""
+    generations: int = 100
+    """Generations at most; a run whose champion is solved stops earlier."""
+    elites: int = 8
+    """Members that go on unmodified."""
+    tournament: int = 8
+    """Members drawn for each tournament."""
+    parents: int = 64
+    """Size of the mating pool, which bounds what is sent to the workers."""
+    crossover: float = 0.5
+    """Share of children with two parents."""
+    mutation_rate: float = 0.03
+    """Share of a child's genes that are mutated."""
+    sigma: float = 0.5
+    """Standard deviation of mutation, while episodes are short."""
+    bump_rate: float = 0.3
+    """Share of children of which one hidden unit's view is changed across neighbouring rays."""
+    ranking: Literal["scalar", "pareto"] = "scalar"
+    """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
+    search: Literal["evolution", "random"] = "evolution"
+    """random: new random genomes in every generation, the baseline that evolution must beat."""
+    until: float = 0.98
+    """Stop when the champion succeeds in this share of validation episodes; above 1: never."""
+
+    def curriculum(self) -> CurriculumConfig:
+        """The curriculum of such a run."""
+        return CurriculumConfig()
+
+    def check(self) -> None:
+        """Raises SettingsError, one line that says what to change."""
+        if self.scenario not in REGISTRY:
+            raise SettingsError(f"unknown scenario {self.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+        if self.traffic:
+            raise SettingsError(f"--traffic {self.traffic}: there is no traffic on {self.scenario} yet; use --traffic 0")
+        if not 0 <= self.seed < 1 << 63:
+            raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
+        if self.generations < 1:
+            raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
+        if self.population > MAX_POPULATION:
+            raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
+        for name in ("crossover", "mutation_rate", "bump_rate"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise SettingsError(f"--{name.replace('_', '-')} must be 0 to 1, not {getattr(self, name)}")
+        if not 0.0 <= self.sigma < math.inf:
+            raise SettingsError(f"--sigma must be 0 or more, not {self.sigma}")
+        if not self.until > 0.0:
+            raise SettingsError(f"--until must be above 0, not {self.until}")
+        try:
+            PolicySpec.parse(self.policy)
+            GeneticConfig(self.population, self.elites, self.tournament, self.parents, self.crossover).check()
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
+
+
+def to_dict(settings: EvolveSettings) -> dict[str, Any]:
+    """Plain numbers and strings."""
+    return dataclasses.asdict(settings)
+
+
+def from_dict(values: dict[str, Any]) -> EvolveSettings:
+    """The inverse of `to_dict`. Raises SettingsError for names or types that do not fit."""
+    fields = {f.name: f for f in dataclasses.fields(EvolveSettings)}
+    unknown = sorted(set(values) - set(fields))
+    if unknown:
+        raise SettingsError(f"unknown setting {unknown[0]!r}")
+    defaults = EvolveSettings()
+    for name, value in values.items():
+        wanted = type(getattr(defaults, name))
+        if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+            value = values[name] = float(value)
+        if type(value) is not wanted:
+            raise SettingsError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
+    settings = EvolveSettings(**values)
+    if settings.ranking not in ("scalar", "pareto") or settings.search not in ("evolution", "random"):
+        raise SettingsError("ranking is scalar or pareto, search is evolution or random")
+    settings.check()
+    return settings

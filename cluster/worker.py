@@ -1,0 +1,74 @@
+"""What one worker does with its share of a generation: a plain class that any pool can hold. No Ray in it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evolution.breeding import Mutation, breed
+from evolution.policy import PolicySpec
+from evolution.rollout import RACED, RESULT, Limits, evaluate
+from gridsim.config import SimConfig
+from gridsim.roads import freeze
+from gridsim.scenarios import Scenario
+
+
+@dataclass(frozen=True)
+class Task:
+    """What all chunks of one generation share; broadcast once. Its arrays become read-only.
+
+    Attributes:
+        policy: the network, as in `mlp:6,7`.
+        parents: genomes float32 [parents, genes] that the recipes name.
+        key: the generation's number for breeding, 64 bits.
+        mutation: how children differ from their parents.
+        episodes: EPISODE [episodes], the same for every member.
+        maps: (scenario, seed) of each map that `episodes` indexes.
+        limits: where an episode ends if nothing happens.
+        config: the simulator's.
+        rewind: control steps before each episode's end whose state is wanted back; 0 for none.
+    """
+
+    policy: str
+    parents: np.ndarray
+    key: int
+    mutation: Mutation
+    episodes: np.ndarray
+    maps: tuple[tuple[str, int], ...]
+    limits: Limits
+    config: SimConfig
+    rewind: int = 0
+
+    @property
+    def row(self) -> np.dtype:
+        """What comes back of each member's episode."""
+        return RACED if self.rewind else RESULT
+
+    def __post_init__(self) -> None:
+        # What comes out of the object store is read-only. Numba compiles once more for what is not, so no pool has it.
+        freeze(self.parents)
+        freeze(self.episodes)
+
+
+class Worker:
+    """Breeds members from recipes and drives them. It keeps nothing that a result depends on."""
+
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        """Results `task.row` [n, episodes] of recipes RECIPE [n], and the seconds it took (for statistics only).
+
+        `maps` are those of `task.maps`, in that order.
+        """
+        started = time.perf_counter()
+        spec = PolicySpec.parse(task.policy)
+        genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
+        results, rewound = evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.rewind)
+        if task.rewind:
+            raced = np.zeros(results.shape, dtype=RACED)
+            for name in RESULT.names or ():
+                raced[name] = results[name]
+            raced["rewound"] = rewound
+            results = raced
+        return results, time.perf_counter() - started

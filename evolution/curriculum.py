@@ -1,0 +1,151 @@
+"""How the task grows: which episodes a generation meets, who races, and who becomes champion.
+
+Distance and speed alone are deceptive under limited grip: the best member is flat out into the first bend. So episodes
+begin short and double in length as the best succeed; a few of them start just before a crash of a recent leader, where
+there is most to learn; the generation's best are raced on more episodes before anybody is selected; and the champion is
+chosen on validation maps that nobody is trained on, and replaced reluctantly.
+
+State is arrays and numbers only; all randomness comes from (seed, generation).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from evolution.episodes import lane_starts
+from evolution.rollout import EPISODE, Limits
+from gridsim.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, Scenario
+from gridsim.simulator import End
+
+HELD_OUT_MAPS = 8
+HELD_OUT_EPISODES = 64
+VALIDATION_MAPS = 16
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    """The curriculum's parameters."""
+
+    maps: int = 16  # training maps
+    starts: int = 2  # new episodes a generation
+    crash_starts: int = 2  # episodes a generation that start before a crash of a recent leader
+    crash_memory: int = 64  # crashes that are remembered
+    rewind: int = 64  # control steps before the crash
+    racers: int = 24  # members raced on more episodes
+    race_episodes: int = 8
+    leaders: int = 4  # racers whose crashes are remembered
+    first_target: float = 150.0  # m, length of the first episodes
+    last_target: float = 1000.0  # m
+    growth: float = 0.5  # share of the race's episodes in which the best 8 must succeed before the target doubles
+    pace: float = 6.5  # m/s that the time limit of a training episode allows for
+    slack: float = 3.0  # s, added to it
+    validation_target: float = 300.0  # m, from which on champions are looked for
+    contenders: int = 2  # racers that are validated each generation
+    first_validation: int = 64  # episodes of validation's first stage
+    validation: int = 256  # ... and in all
+    champion_pace: float = 5.75  # m/s, below which a validation episode is no success
+
+
+def spread_starts(build: Callable[[int], Scenario], first_seed: int, maps: int, episodes: int) -> tuple[list[int], np.ndarray]:
+    """Map seeds and EPISODE [episodes] over `maps` maps in turn; the same for every run of a scenario."""
+    seeds = [first_seed + k for k in range(maps)]
+    rng = np.random.default_rng(np.random.SeedSequence([first_seed, episodes]))
+    return seeds, lane_starts([build(seed) for seed in seeds], np.arange(episodes) % maps, rng)
+
+
+class Curriculum:
+    """Episodes, races and champions of one run."""
+
+    def __init__(self, config: CurriculumConfig, seed: int, build: Callable[[int], Scenario], target_m: float, time_s: float, period_s: float):
+        self.config, self.seed, self.build = config, seed, build
+        self.goal, self.period = target_m, period_s
+        self.goal_steps = round(time_s / period_s)
+        self.target = min(config.first_target, target_m)
+        self.crashes = np.zeros(0, dtype=EPISODE)
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
+        self.map_seeds = [int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)]
+
+    def _rng(self, generation: int, purpose: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
+
+    def _maps(self, generation: int) -> int:
+        """Training maps in use: they come in one by one, so that none needs to be waited for."""
+        return min(self.config.maps, self.config.starts + generation)
+
+    def limits(self) -> Limits:
+        """Of training episodes."""
+        seconds = self.target / self.config.pace + self.config.slack
+        return Limits(self.target, math.ceil(seconds / self.period))
+
+    def validation_limits(self) -> Limits:
+        """Of validation: the goal at the champion's pace or faster."""
+        seconds = self.goal / self.config.champion_pace
+        return Limits(self.goal, min(self.goal_steps, math.ceil(seconds / self.period)))
+
+    def goal_limits(self) -> Limits:
+        """Of a full episode, as held-out ones are."""
+        return Limits(self.goal, self.goal_steps)
+
+    def sigma(self, sigma: float) -> float:
+        """Mutation's standard deviation: finer as episodes grow longer."""
+        return sigma * (self.config.first_target / self.target) ** 0.35
+
+    def _new_starts(self, generation: int, count: int, purpose: int) -> tuple[list[int], np.ndarray]:
+        rng = self._rng(generation, purpose)
+        n = self._maps(generation)
+        maps = rng.choice(n, count, replace=count > n)
+        used = sorted({int(m) for m in maps})
+        local = np.array([used.index(int(m)) for m in maps])
+        episodes = lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng)
+        return used, episodes
+
+    def episodes(self, generation: int) -> tuple[list[int], np.ndarray]:
+        """Map seeds and EPISODE [e] that every member of a generation meets: new ones, and some before crashes."""
+        used, fresh = self._new_starts(generation, self.config.starts, 0)
+        if len(self.crashes) and self.config.crash_starts:
+            chosen = self._rng(generation, 1).integers(len(self.crashes), size=self.config.crash_starts)
+            crashes = self.crashes[chosen].copy()
+            for m in sorted({int(m) for m in crashes["map"]} - set(used)):
+                used.append(m)
+            crashes["map"] = [used.index(int(m)) for m in crashes["map"]]
+            fresh = np.concatenate([fresh, crashes])
+        return [self.map_seeds[m] for m in used], fresh
+
+    def race(self, generation: int) -> tuple[list[int], np.ndarray]:
+        """Map seeds and EPISODE of the race that decides among the generation's best."""
+        used, episodes = self._new_starts(generation, self.config.race_episodes, 2)
+        return [self.map_seeds[m] for m in used], episodes
+
+    def raced(self, order: np.ndarray, results: np.ndarray, rewound: np.ndarray, map_seeds: Sequence[int], episodes: np.ndarray) -> None:
+        """Learn from a race: remember the leaders' crashes, lengthen the task when the best succeed.
+
+        Args: racers from best to worst; RESULT [racers, e]; states float32 [racers, e, 5] some steps before each end;
+        the race's maps and EPISODE [e].
+        """
+        new = []
+        for racer in order[: self.config.leaders]:
+            for e in range(len(episodes)):
+                row = results[racer, e]
+                if row["end"] in (End.COLLISION, End.IDLE) and row["steps"] > 10:
+                    start = np.zeros((), dtype=EPISODE)
+                    start["map"] = self.map_seeds.index(map_seeds[episodes[e]["map"]])
+                    start["start"] = rewound[racer, e]
+                    new.append(start)
+        if new:
+            self.crashes = np.concatenate([self.crashes, np.array(new, dtype=EPISODE)])[-self.config.crash_memory :]
+        best = results[order[:8]]
+        if (best["end"] == End.SUCCESS).mean() >= self.config.growth:
+            self.target = min(2.0 * self.target, self.config.last_target, self.goal)
+
+    def validation(self) -> tuple[list[int], np.ndarray]:
+        """Map seeds and EPISODE [validation], the same for every run of the scenario."""
+        return spread_starts(self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation)
+
+
+def success_rate(results: np.ndarray) -> np.ndarray:
+    """Share of episodes [n] that reached their target, from results [n, e]."""
+    return (results["end"] == End.SUCCESS).mean(axis=1)

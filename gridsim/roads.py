@@ -1,0 +1,269 @@
+"""Roads: strips with exact geometry, lanes with successors, and the fields that kernels read.
+
+The drivable area is the union of strips: straight pieces and arcs of a centre line, each with a half width. The signed
+clearance of a point is the greatest (half width - distance to the centre line) over the strips: positive on the road,
+zero on its edge, exact outside and at the edge, and never too large inside. Kernels read it from a byte field,
+bilinearly; tests hold it against the strips themselves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.jit import njit
+
+CELLS_PER_M = 2  # nodes of the clearance field per metre
+FIELD_FLOOR = -2.0  # m, clearance of byte 0: deeper inside a wall is all the same
+FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
+HEADING_BINS = 90  # of the ray start table: 4 degrees each
+HEADING_WRAP = 64  # bins repeated behind the last, so that a fan of rays never wraps
+START_UNITS = 4.0  # steps of a start range byte per metre
+START_CELLS_PER_M = 1  # cells of the ray start table per metre
+VISIT_CELL = 4  # m, side of the cells in which new ground is counted
+MEMORY_LIMIT_CELLS = 1 << 24  # nodes of a field; above this a map is refused
+
+_F, _I, _U = np.float32, np.int32, np.uint32
+
+
+class Road(NamedTuple):
+    """What the kernels read of a map; all arrays flat, read-only and C-contiguous. Sides are powers of two."""
+
+    field: np.ndarray  # uint32 [rows * columns], bytes of the four corners: (0,0), (1,0), (0,1), (1,1) in (x, y)
+    start_row: np.ndarray  # int32 [cells of 1 m], row of `start` or -1 where no car can be
+    start: np.ndarray  # uint8 [rows * (HEADING_BINS + HEADING_WRAP)], range no ray from here falls short of
+    columns: np.uint32  # nodes along x
+    rows: np.uint32  # nodes along y
+    width: np.float32  # m along x
+    height: np.float32  # m along y
+    speed_low: np.float32  # m/s, the scenario's interval
+    speed_high: np.float32  # m/s
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Centre lines with half widths, in metres; the exact description of the drivable area.
+
+    Attributes:
+        lines: float64 [n, 5]: x0, y0, x1, y1, half width.
+        arcs: float64 [m, 6]: centre x, centre y, radius, start angle, sweep (rad, counter-clockwise), half width.
+    """
+
+    lines: np.ndarray
+    arcs: np.ndarray
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Directed lanes as polylines, joined by successors.
+
+    Attributes:
+        points: float32 [n, 2], m; a lane's points lie together, in driving direction, not wrapped over the torus.
+        offsets: int32 [lanes + 1], where each lane's points begin.
+        successors: int32 [lanes, k], -1 where there is none further; every lane has at least one.
+    """
+
+    points: np.ndarray
+    offsets: np.ndarray
+    successors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def lane(self, i: int) -> np.ndarray:
+        """Points [n, 2] of lane i."""
+        return self.points[self.offsets[i] : self.offsets[i + 1]]
+
+
+@njit(nogil=True)
+def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
+    """Greatest (half width - distance) at each node of the grid, floor FIELD_FLOOR; each strip touches its band only."""
+    field = np.full((rows, columns), _F(FIELD_FLOOR), dtype=np.float32)
+    reach = -FIELD_FLOOR
+    for k in range(lines.shape[0] + arcs.shape[0]):
+        is_line = k < lines.shape[0]
+        if is_line:
+            ax, ay, bx, by, w = lines[k]
+            dx, dy = bx - ax, by - ay
+            inverse = 1.0 / max(dx * dx + dy * dy, 1e-12)
+            x_low, x_high, y_low, y_high = min(ax, bx), max(ax, bx), min(ay, by), max(ay, by)
+        else:
+            ax, ay, radius, first, sweep, w = arcs[k - lines.shape[0]]
+            middle, half = first + 0.5 * sweep, 0.5 * abs(sweep)
+            mx, my, cos_half = math.cos(middle), math.sin(middle), math.cos(half)
+            e0x, e0y = ax + radius * math.cos(first), ay + radius * math.sin(first)
+            e1x, e1y = ax + radius * math.cos(first + sweep), ay + radius * math.sin(first + sweep)
+            px, py = ax + radius * mx, ay + radius * my
+            if half > 0.25 * math.pi + 1e-6:
+                x_low, x_high, y_low, y_high = ax - radius, ax + radius, ay - radius, ay + radius
+            else:
+                x_low, x_high = min(e0x, e1x, px), max(e0x, e1x, px)
+                y_low, y_high = min(e0y, e1y, py), max(e0y, e1y, py)
+        band = w + reach
+        # Below a quarter turn the end points and the middle bound the arc up to its bulge; one node more covers that.
+        slack = 0.0 if is_line else 0.09 * radius
+        i0, i1 = int(math.floor((x_low - band - slack) / node)), int(math.ceil((x_high + band + slack) / node))
+        j0, j1 = int(math.floor((y_low - band - slack) / node)), int(math.ceil((y_high + band + slack) / node))
+        if not wrap:
+            i0, i1, j0, j1 = max(i0, 0), min(i1, columns - 1), max(j0, 0), min(j1, rows - 1)
+        for j in range(j0, j1 + 1):
+            y = j * node
+            for i in range(i0, i1 + 1):
+                x = i * node
+                if is_line:
+                    t = min(max(((x - ax) * dx + (y - ay) * dy) * inverse, 0.0), 1.0)
+                    distance = math.sqrt((x - ax - t * dx) ** 2 + (y - ay - t * dy) ** 2)
+                else:
+                    ux, uy = x - ax, y - ay
+                    norm = math.sqrt(ux * ux + uy * uy)
+                    if half >= math.pi - 1e-9 or ux * mx + uy * my >= norm * cos_half:
+                        distance = abs(norm - radius)
+                    else:
+                        distance = math.sqrt(
+                            min((x - e0x) ** 2 + (y - e0y) ** 2, (x - e1x) ** 2 + (y - e1y) ** 2)
+                        )
+                clearance = _F(w - distance)
+                row, column = j % rows, i % columns
+                if clearance > field[row, column]:
+                    field[row, column] = clearance
+    return field
+
+
+@njit
+def _pack(nodes):
+    """Clearance [rows, columns] in m to the four-corner words that `clearance` reads."""
+    rows, columns = nodes.shape
+    quantised = np.empty((rows, columns), dtype=np.uint32)
+    for j in range(rows):
+        for i in range(columns):
+            value = (nodes[j, i] - _F(FIELD_FLOOR)) * _F(FIELD_UNITS) + _F(0.5)
+            quantised[j, i] = np.uint32(min(max(value, _F(0.0)), _F(255.0)))
+    packed = np.empty(rows * columns, dtype=np.uint32)
+    for j in range(rows):
+        below = (j + 1) % rows
+        for i in range(columns):
+            right = (i + 1) % columns
+            packed[j * columns + i] = (
+                quantised[j, i]
+                | (quantised[j, right] << np.uint32(8))
+                | (quantised[below, i] << np.uint32(16))
+                | (quantised[below, right] << np.uint32(24))
+            )
+    return packed
+
+
+@njit(nogil=True)
+def _ray_starts(nodes, columns, rows, ray_range):
+    """Start ranges: for each 1 m cell where a car can be and each bin of 4 degrees, how far every ray surely gets.
+
+    A cone that holds every ray of the cell and bin is marched through the field; where it first may touch an edge
+    is the start. Returns (row of each cell or -1, ranges as bytes [rows, bins + wrap]).
+    """
+    k = CELLS_PER_M // START_CELLS_PER_M
+    cells_x, cells_y = columns // k, rows // k
+    row_of = np.full(cells_x * cells_y, -1, dtype=np.int32)
+    count = 0
+    for j in range(cells_y):
+        for i in range(cells_x):
+            best = _F(FIELD_FLOOR)
+            for dj in range(k + 1):
+                for di in range(k + 1):
+                    best = max(best, nodes[(j * k + dj) % rows, (i * k + di) % columns])
+            if best > _F(0.0):
+                row_of[j * cells_x + i] = count
+                count += 1
+    stride = HEADING_BINS + HEADING_WRAP
+    ranges = np.zeros(count * stride, dtype=np.uint8)
+    radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
+    spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
+    margin = _F(0.2)  # m: not worth another step
+    mask_x, mask_y = _U(columns - 1), _U(rows - 1)
+    # Positions are kept above 0, where truncation is rounding down, by whole turns of the torus.
+    turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
+    turn_y = _F(rows * math.ceil(ray_range * CELLS_PER_M / rows) + 0.5)
+    for b in range(HEADING_BINS):
+        angle = (b + 0.5) * 2.0 * math.pi / HEADING_BINS
+        c, s = _F(math.cos(angle) * CELLS_PER_M), _F(math.sin(angle) * CELLS_PER_M)
+        for j in range(cells_y):
+            for i in range(cells_x):
+                row = row_of[j * cells_x + i]
+                if row < 0:
+                    continue
+                x, y = _F((i + 0.5) * k) + turn_x, _F((j + 0.5) * k) + turn_y
+                t = _F(0.0)
+                while t < ray_range:
+                    # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
+                    column = _U(_I(x + t * c)) & mask_x
+                    line = _U(_I(y + t * s)) & mask_y
+                    free = nodes[line, column] - radius - spread * t
+                    if free <= margin:
+                        break
+                    t += free
+                ranges[row * stride + b] = np.uint8(min(t, ray_range) * _F(START_UNITS))
+    for row in range(count):
+        for b in range(HEADING_WRAP):
+            ranges[row * stride + HEADING_BINS + b] = ranges[row * stride + b]
+    return row_of, ranges
+
+
+@njit
+def clearance(road, x, y):
+    """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, any tile of the torus."""
+    px, py = x * _F(CELLS_PER_M), y * _F(CELLS_PER_M)
+    fx, fy = math.floor(px), math.floor(py)
+    ux, uy = _F(px - fx), _F(py - fy)
+    i = np.uint32(np.int32(fx)) & np.uint32(road.columns - np.uint32(1))
+    j = np.uint32(np.int32(fy)) & np.uint32(road.rows - np.uint32(1))
+    word = road.field[np.uint32(j * road.columns + i)]
+    q00 = _F(np.int32(word & np.uint32(255)))
+    q10 = _F(np.int32((word >> np.uint32(8)) & np.uint32(255)))
+    q01 = _F(np.int32((word >> np.uint32(16)) & np.uint32(255)))
+    q11 = _F(np.int32(word >> np.uint32(24)))
+    low = q00 + ux * (q10 - q00)
+    high = q01 + ux * (q11 - q01)
+    return (low + uy * (high - low)) * _F(1.0 / FIELD_UNITS) + _F(FIELD_FLOOR)
+
+
+def freeze(array: np.ndarray) -> np.ndarray:
+    """The array, C-contiguous and read-only: the one form in which kernels are given their inputs."""
+    array = np.ascontiguousarray(array)
+    array.setflags(write=False)
+    return array
+
+
+def power_of_two(n: float) -> int:
+    """Smallest power of two that is n or more."""
+    return 1 << max(int(math.ceil(n)) - 1, 0).bit_length()
+
+
+def clearance_nodes(strips: Strips, width: float, height: float, torus: bool = True) -> np.ndarray:
+    """Clearance float32 [rows, columns] at the nodes of the field, in m.
+
+    Raises: ValueError if the sides are no powers of two, or the field would be too large.
+    """
+    columns, rows = round(width * CELLS_PER_M), round(height * CELLS_PER_M)
+    if power_of_two(columns) != columns or power_of_two(rows) != rows:
+        raise ValueError(f"a field's sides must be powers of two, not {columns} x {rows}")
+    if columns * rows > MEMORY_LIMIT_CELLS:
+        raise ValueError(f"a map of {width:.0f} m x {height:.0f} m is too large")
+    return _clearance_nodes(freeze(strips.lines), freeze(strips.arcs), columns, rows, torus, 1.0 / CELLS_PER_M)
+
+
+def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float) -> Road:
+    """The kernels' view of a clearance field [rows, columns] in m."""
+    rows, columns = nodes.shape
+    start_row, start = _ray_starts(nodes, columns, rows, _F(ray_range))
+    return Road(
+        field=freeze(_pack(nodes)),
+        start_row=freeze(start_row),
+        start=freeze(start),
+        columns=np.uint32(columns),
+        rows=np.uint32(rows),
+        width=_F(columns / CELLS_PER_M),
+        height=_F(rows / CELLS_PER_M),
+        speed_low=_F(speed_interval[0]),
+        speed_high=_F(speed_interval[1]),
+    )

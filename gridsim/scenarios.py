@@ -1,0 +1,147 @@
+"""Scenarios: builders from a seed, in one registry. A scenario is data; another one is one function and one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gridsim.config import SimConfig
+from gridsim.roads import Lanes, Road, Strips, clearance_nodes, freeze, make_road
+from gridsim.seamless import seamless_layout
+
+TRAINING_SEED = 0  # first seed of the maps that are trained on
+VALIDATION_SEED = 1_000_000  # ... that choose the champion
+HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
+ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One map, ready to drive on.
+
+    Attributes:
+        name: the scenario's name in the registry.
+        seed: the seed it was built from.
+        road: what the kernels read.
+        lanes: directed polylines, for starts, traffic and drivers.
+        strips: exact geometry of the drivable area, for pictures and tests.
+        torus: whether leaving on one side means entering on the other.
+    """
+
+    name: str
+    seed: int
+    road: Road
+    lanes: Lanes
+    strips: Strips
+    torus: bool = True
+
+    @cached_property
+    def mileage(self) -> np.ndarray:
+        """Metres of lane before each point of `lanes`, all lanes one after another: float64 [points]."""
+        step = np.diff(self.lanes.points.astype(np.float64), axis=0)
+        length = np.hypot(step[:, 0], step[:, 1])
+        length[self.lanes.offsets[1:-1] - 1] = 0.0  # from one lane's end to the next lane's beginning is no road
+        return freeze(np.concatenate([[0.0], np.cumsum(length)]))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it as plain arrays, to be shared between processes without a copy."""
+        scalars = np.array([float(getattr(self.road, name)) for name in ROAD_FIELDS] + [self.seed, self.torus])
+        return {
+            "name": np.frombuffer(self.name.encode(), dtype=np.uint8),
+            "scalars": scalars,
+            "field": self.road.field,
+            "start_row": self.road.start_row,
+            "start": self.road.start,
+            "points": self.lanes.points,
+            "offsets": self.lanes.offsets,
+            "successors": self.lanes.successors,
+            "lines": self.strips.lines,
+            "arcs": self.strips.arcs,
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Scenario:
+        """The inverse of `arrays`; arrays are used as they are, read-only."""
+        frozen = {key: freeze(value) for key, value in arrays.items()}
+        columns, rows, width, height, low, high, seed, torus = frozen["scalars"]
+        f = np.float32
+        return cls(
+            name=frozen["name"].tobytes().decode(),
+            seed=int(seed),
+            road=Road(
+                frozen["field"],
+                frozen["start_row"],
+                frozen["start"],
+                np.uint32(columns),
+                np.uint32(rows),
+                f(width),
+                f(height),
+                f(low),
+                f(high),
+            ),
+            lanes=Lanes(frozen["points"], frozen["offsets"], frozen["successors"]),
+            strips=Strips(frozen["lines"], frozen["arcs"]),
+            torus=bool(torus),
+        )
+
+
+@dataclass(frozen=True)
+class ScenarioSpec:
+    """A scenario's builder and its driving limitations (the paper's term)."""
+
+    summary: str
+    speed_interval: tuple[float, float]  # m/s, within which speed counts
+    layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
+
+
+REGISTRY: dict[str, ScenarioSpec] = {
+    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), seamless_layout),
+}
+
+
+def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
+    """Build a scenario's map from a seed; the same seed gives the same map.
+
+    Raises: ValueError with one line for an unknown scenario or a seed below 0.
+    """
+    if name not in REGISTRY:
+        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    if seed < 0:
+        raise ValueError(f"a seed must be 0 or more, not {seed}")
+    config = config or SimConfig()
+    spec = REGISTRY[name]
+    rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
+    strips, lanes, width, height = spec.layout(rng)
+    nodes = clearance_nodes(strips, width, height)
+    return Scenario(
+        name=name,
+        seed=seed,
+        road=make_road(nodes, spec.speed_interval, config.sensors.range),
+        lanes=Lanes(freeze(lanes.points), freeze(lanes.offsets), freeze(lanes.successors)),
+        strips=Strips(freeze(strips.lines), freeze(strips.arcs)),
+    )
+
+
+def starts_at(scenario: Scenario, shares: np.ndarray) -> np.ndarray:
+    """Starts float32 [n, 5] at these shares [n], in [0, 1), of the length of all lanes, at the scenario's lower speed.
+
+    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it.
+    """
+    points, mileage = scenario.lanes.points, scenario.mileage
+    metres = shares * mileage[-1]
+    at = np.minimum(np.searchsorted(mileage, metres, side="right"), len(points) - 1) - 1
+    step = points[at + 1] - points[at]
+    part = (metres - mileage[at]) / np.maximum(mileage[at + 1] - mileage[at], 1e-9)
+    starts = np.zeros((len(shares), 5), dtype=np.float32)
+    starts[:, :2] = points[at] + part[:, None] * step
+    starts[:, 2] = np.arctan2(step[:, 1], step[:, 0])
+    starts[:, 3] = scenario.road.speed_low
+    return starts
+
+
+def sample_starts(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts float32 [count, 5] uniformly over the lanes, as `starts_at` gives them."""
+    return starts_at(scenario, rng.random(count))

@@ -1,0 +1,179 @@
+"""The seamless road network: square tiles on a torus, laid from a random graph, so that the road never ends.
+
+Every tile is read off the edges its node has in the graph: two opposite ones make a straight, two others a curve, three
+a T, four a crossing; now and then a T or crossing is built as a roundabout. No node has one edge alone, so every open
+edge meets an open edge and every lane has a successor. No block of the network has fewer than eight tiles around it:
+driving round one is more than the 200 m within which a stretch counts once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.roads import Lanes, Strips
+
+TILE = 32.0  # m, side of a tile
+TILES = 8  # along each side of the torus
+LANE_WIDTH = 3.5  # m
+SHOULDER = 0.5  # m of paved road outside the outer lane
+HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
+ROUNDABOUT_RADIUS = 10.0  # m, of the ring's centre line
+ROUNDABOUT_HALF = 3.5  # m, half width of the ring
+ROUNDABOUT_SHARE = 0.1  # of the T and crossing tiles
+EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
+SHORTEST_BLOCK = 8  # tiles around the smallest block of the network
+LANE_STEP = 1.0  # m between points of a lane, at most
+
+# Edges of a tile in counter-clockwise order: east, north, west, south.
+DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+
+def _distance(edges: np.ndarray, start: int, goal: int, limit: int) -> int:
+    """Tiles from start to goal over present edges [n, 4], at most `limit`."""
+    frontier, seen, distance = {start}, {start}, 0
+    while frontier and distance < limit:
+        if goal in frontier:
+            return distance
+        frontier = {
+            _neighbour(tile, d) for tile in frontier for d in range(4) if edges[tile, d]
+        } - seen
+        seen |= frontier
+        distance += 1
+    return limit
+
+
+def _neighbour(tile: int, direction: int) -> int:
+    dx, dy = DIRECTIONS[direction]
+    return (tile // TILES + dy) % TILES * TILES + (tile % TILES + dx) % TILES
+
+
+def tile_graph(rng: np.random.Generator) -> np.ndarray:
+    """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends."""
+    while True:
+        edges = np.zeros((TILES * TILES, 4), dtype=bool)
+        pairs = [(tile, d) for tile in range(TILES * TILES) for d in (0, 1)]
+        for k in rng.permutation(len(pairs))[: round(EDGE_SHARE * len(pairs))]:
+            tile, d = pairs[k]
+            other = _neighbour(tile, d)
+            if _distance(edges, tile, other, SHORTEST_BLOCK - 1) >= SHORTEST_BLOCK - 1:
+                edges[tile, d] = edges[other, (d + 2) % 4] = True
+        while (ends := np.flatnonzero(edges.sum(axis=1) == 1)).size:
+            for tile in ends:
+                for d in np.flatnonzero(edges[tile]):
+                    edges[tile, d] = edges[_neighbour(tile, d), (d + 2) % 4] = False
+        largest = _largest_component(edges)
+        edges[~largest] = False
+        if largest.sum() >= TILES * TILES // 2:
+            return edges
+
+
+def _largest_component(edges: np.ndarray) -> np.ndarray:
+    """Mask [tiles] of the largest connected part."""
+    label = np.full(len(edges), -1)
+    for tile in range(len(edges)):
+        stack = [tile] if label[tile] < 0 and edges[tile].any() else []
+        while stack:
+            here = stack.pop()
+            if label[here] < 0:
+                label[here] = tile
+                stack += [_neighbour(here, d) for d in range(4) if edges[here, d]]
+    used = label[label >= 0]
+    return label == np.bincount(used).argmax() if used.size else label >= 0
+
+
+def _arc_points(cx: float, cy: float, radius: float, first: float, sweep: float) -> np.ndarray:
+    n = max(2, math.ceil(abs(sweep) * radius / LANE_STEP) + 1)
+    angle = first + sweep * np.linspace(0.0, 1.0, n)
+    return np.stack([cx + radius * np.cos(angle), cy + radius * np.sin(angle)], axis=1)
+
+
+def _through(entry: int, exit: int) -> np.ndarray:
+    """Lane [n, 2] through a plain tile centred on the origin, from edge `entry` to edge `exit`, on the right."""
+    half, offset = TILE / 2, LANE_WIDTH / 2
+    dx, dy = DIRECTIONS[entry]
+    if (exit - entry) % 4 == 2:
+        along = np.linspace(half, -half, math.ceil(TILE / LANE_STEP) + 1)[:, None]
+        # Driving against (dx, dy); right of that is (-dy, dx).
+        return along * np.array([dx, dy]) + offset * np.array([-dy, dx])
+    ex, ey = DIRECTIONS[exit]
+    left = (exit - entry) % 4 == 3
+    radius = half + offset if left else half - offset
+    cx, cy = half * (dx + ex), half * (dy + ey)
+    first = math.atan2(-ey, -ex)
+    return _arc_points(cx, cy, radius, first, math.pi / 2 if left else -math.pi / 2)
+
+
+def _around(entry: int, exit: int) -> np.ndarray:
+    """Lane [n, 2] through a roundabout: in on the right, counter-clockwise round the ring, out on the right."""
+    half, offset = TILE / 2, LANE_WIDTH / 2
+    reach = math.sqrt(ROUNDABOUT_RADIUS**2 - offset**2)
+    slip = math.asin(offset / ROUNDABOUT_RADIUS)
+    dx, dy = DIRECTIONS[entry]
+    ex, ey = DIRECTIONS[exit]
+    inward = np.linspace(half, reach, 7)[:, None] * np.array([dx, dy]) + offset * np.array([-dy, dx])
+    outward = np.linspace(reach, half, 7)[:, None] * np.array([ex, ey]) + offset * np.array([ey, -ex])
+    # Right of the inbound direction lies counter-clockwise of the arm, right of the outbound one clockwise.
+    sweep = (exit - entry) % 4 * math.pi / 2 - 2 * slip
+    ring = _arc_points(0.0, 0.0, ROUNDABOUT_RADIUS, entry * math.pi / 2 + slip, sweep)
+    return np.concatenate([inward, ring[1:-1], outward])
+
+
+def _tile_strips(arms: list[int], roundabout: bool) -> tuple[list[list[float]], list[list[float]]]:
+    """Lines and arcs of one tile centred on the origin."""
+    half = TILE / 2
+    lines: list[list[float]] = []
+    arcs: list[list[float]] = []
+    if roundabout:
+        arcs.append([0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF])
+        for arm in arms:
+            dx, dy = DIRECTIONS[arm]
+            # The end of a strip is round: stop where that stays within the ring's outer edge.
+            inner = ROUNDABOUT_RADIUS
+            lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
+        return lines, arcs
+    for k, a in enumerate(arms):
+        for b in arms[k + 1 :]:
+            ax, ay = DIRECTIONS[a]
+            bx, by = DIRECTIONS[b]
+            if (b - a) % 4 == 2:
+                lines.append([ax * half, ay * half, bx * half, by * half, HALF_ROAD])
+            else:
+                first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
+                sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
+                arcs.append([half * (ax + bx), half * (ay + by), half, first, sweep, HALF_ROAD])
+    return lines, arcs
+
+
+def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
+    """Lay a network: (strips, lanes, width m, height m)."""
+    edges = tile_graph(rng)
+    lines: list[list[float]] = []
+    arcs: list[list[float]] = []
+    points: list[np.ndarray] = []
+    ways: dict[tuple[int, int], list[int]] = {}  # (tile, entry edge) -> lanes that begin there
+    leads: list[tuple[int, int]] = []  # where each lane leads: (tile, entry edge)
+    for tile in range(len(edges)):
+        arms = [int(d) for d in np.flatnonzero(edges[tile])]
+        roundabout = rng.random() < ROUNDABOUT_SHARE and len(arms) > 2
+        x, y = (tile % TILES + 0.5) * TILE, (tile // TILES + 0.5) * TILE
+        tile_lines, tile_arcs = _tile_strips(arms, roundabout)
+        lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in tile_lines]
+        arcs += [[a + x, b + y, *rest] for a, b, *rest in tile_arcs]
+        for entry in arms:
+            for exit in arms:
+                if exit != entry:
+                    ways.setdefault((tile, entry), []).append(len(points))
+                    leads.append((_neighbour(tile, exit), (exit + 2) % 4))
+                    points.append((_around if roundabout else _through)(entry, exit) + [x, y])
+    successors = np.full((len(points), 3), -1, dtype=np.int32)
+    for k, lead in enumerate(leads):
+        successors[k, : len(ways[lead])] = ways[lead]
+    lanes = Lanes(
+        points=np.concatenate(points).astype(np.float32),
+        offsets=np.cumsum([0] + [len(p) for p in points]).astype(np.int32),
+        successors=successors,
+    )
+    strips = Strips(np.array(lines, dtype=np.float64).reshape(-1, 5), np.array(arcs, dtype=np.float64).reshape(-1, 6))
+    return strips, lanes, TILE * TILES, TILE * TILES

@@ -1,0 +1,120 @@
+"""The range sensor: rays over the forward field of view, marched through the signed clearance field.
+
+A ray is the root of the clearance along it. It starts where the table of `roads` says no ray can have ended yet, takes
+long steps while the road is wide and Newton steps near the edge; slopes are those of the bilinear field.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from gridsim.jit import njit
+from gridsim.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, HEADING_BINS, HEADING_WRAP, START_CELLS_PER_M, START_UNITS
+from gridsim.vector import LANES, march_intrinsic
+
+_F, _I, _U = np.float32, np.int32, np.uint32
+_SCALE = _F(CELLS_PER_M)
+_UNIT = _F(1.0 / FIELD_UNITS)
+_FLOOR = _F(FIELD_FLOOR)
+_SLOPE = _F(CELLS_PER_M / FIELD_UNITS)
+_BINS_PER_RADIAN = _F(HEADING_BINS / (2.0 * math.pi))
+_PER_START = _U(CELLS_PER_M // START_CELLS_PER_M)
+_STRIDE = _I(HEADING_BINS + HEADING_WRAP)
+# Chosen for the least error at the least steps of the slowest ray, over 4,000 poses: 99th percentile 0.06 m.
+_NEAR = _F(2.0)  # m of clearance below which steps are Newton's
+_STRETCH = _F(1.5)  # of the steps above it
+_CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
+_SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance ...
+_LEAP = _F(2.0)  # ... and at most this many m longer than a stretched one, so as not to jump over an island
+_STEPS = 16  # at most
+
+
+def fan(count: int, first: float, step: float) -> np.ndarray:
+    """Directions of the rays from the heading: float32 [3, lanes] of cosine, sine, and bins from the first ray's.
+
+    `lanes` is count rounded up to whole blocks of LANES; a lane without a ray of its own repeats the last one.
+    """
+    ray = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
+    angle = first + step * ray
+    bins = step * ray * HEADING_BINS / (2.0 * math.pi)
+    table = np.stack([np.cos(angle), np.sin(angle), bins]).astype(np.float32)
+    table.setflags(write=False)
+    return table
+
+
+@njit
+def march(field, columns, rows, px0, py0, reach, beams):
+    """Move each of LANES rays from its start range to the edge of the road.
+
+    Args: packed field with its sides; origin in cells; reach m; beams float32 [3, LANES]: direction x, direction y and
+    range, the start on entry and the result on return, in [0, reach].
+    """
+    mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
+    for r in range(LANES):
+        dx, dy, t = beams[0, r], beams[1, r], beams[2, r]
+        for _ in range(_STEPS):
+            px, py = px0 + t * (dx * _SCALE), py0 + t * (dy * _SCALE)
+            fx, fy = math.floor(px), math.floor(py)
+            ux, uy = px - fx, py - fy
+            word = field[_U(_U(_U(_I(fy)) & mask_y) * columns + (_U(_I(fx)) & mask_x))]
+            q00, q10 = _F(_I(word & _U(255))), _F(_I((word >> _U(8)) & _U(255)))
+            q01, q11 = _F(_I((word >> _U(16)) & _U(255))), _F(_I(word >> _U(24)))
+            rise_low, rise_high = q10 - q00, q11 - q01
+            low, high = q00 + ux * rise_low, q01 + ux * rise_high
+            clear = (low + uy * (high - low)) * _UNIT + _FLOOR
+            if t >= reach:
+                break
+            if clear > _NEAR:
+                t += _STRETCH * clear
+            else:
+                slope = -(dx * (rise_low + uy * (rise_high - rise_low)) + dy * (high - low)) * _SLOPE
+                t += min(clear / min(max(slope, _SLOPE_MIN), _F(1.0)), max(_STRETCH * clear, _F(0.0)) + _LEAP)
+                if abs(clear) < _CLOSE:
+                    break
+        beams[2, r] = min(max(t, _F(0.0)), reach)
+
+
+# Compiled, the same marching runs as vector code; `NUMBA_DISABLE_JIT=1` takes the plain kernel above.
+fast_march = (
+    march
+    if numba.config.DISABLE_JIT
+    else march_intrinsic(
+        _STEPS, float(_SCALE), float(_UNIT), float(_FLOOR), float(_SLOPE), float(_NEAR), float(_STRETCH),
+        float(_CLOSE), float(_SLOPE_MIN), float(_LEAP),
+    )
+)
+
+
+@njit
+def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
+    """Ranges of all rays from a point, in m.
+
+    Args: fan of `fan()`, first ray's angle from the heading (rad), reach m, position m, heading as cosine and sine;
+    beams float32 [3, LANES], overwritten.
+    Writes: ranges float32 [rays], in [0, reach].
+    """
+    px0, py0 = x * _SCALE, y * _SCALE
+    columns = road.columns
+    mask_x, mask_y = _U(columns - _U(1)), _U(road.rows - _U(1))
+    cell_x = (_U(_I(math.floor(px0))) & mask_x) // _PER_START
+    cell_y = (_U(_I(math.floor(py0))) & mask_y) // _PER_START
+    row = road.start_row[_U(cell_y * (columns // _PER_START) + cell_x)]
+    angle = math.atan2(sine, cosine) + first
+    bin0 = angle * _BINS_PER_RADIAN
+    bin0 -= math.floor(bin0 * _F(1.0 / HEADING_BINS)) * _F(HEADING_BINS)
+    base = max(row, _I(0)) * _STRIDE
+    known = _F(1.0 / START_UNITS) if row >= 0 else _F(0.0)
+    rays = ranges.shape[0]
+    for block in range(0, fan.shape[1], LANES):
+        for r in range(LANES):
+            beams[0, r] = cosine * fan[0, block + r] - sine * fan[1, block + r]
+        for r in range(LANES):
+            beams[1, r] = sine * fan[0, block + r] + cosine * fan[1, block + r]
+        for r in range(LANES):
+            beams[2, r] = _F(road.start[_U(base + _I(bin0 + fan[2, block + r]))]) * known
+        fast_march(road.field, columns, road.rows, px0, py0, reach, beams)
+        for r in range(min(rays - block, LANES)):
+            ranges[block + r] = beams[2, r]

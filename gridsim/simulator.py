@@ -1,0 +1,374 @@
+"""State, reset and step: the one order of events, for one car and for a batch.
+
+`drive` is one control period of one car: act, advance in sub-steps with collision checks, count new ground, end. The
+batched `step` and the fused rollout of `evolution` are loops over it. State is float32 [cars, FIELDS]; fields below.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.jit import njit
+from gridsim.roads import VISIT_CELL, Road, clearance, freeze
+from gridsim.scenarios import Scenario
+from gridsim.sensors import LANES, fan, sense
+from gridsim.vehicle import Action, act, advance, path_curvature
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+# Fields of a car's state.
+X, Y = 0, 1  # m, centre of mass
+COS, SIN = 2, 3  # heading
+SPEED = 4  # m/s, negative backwards
+STEERING = 5  # rad, left positive
+DISTANCE = 6  # m of new ground
+PACED = 7  # m of new ground at a speed within the scenario's interval
+ODOMETER = 8  # m driven, either way
+DEBT = 9  # m reversed and not yet made good
+IDLE = 10  # control steps in a row without progress
+STEPS = 11  # control steps
+CELL = 12  # index of the visit cell the car is in
+FRESH = 13  # 1 where this cell's ground is new
+FIELDS = 14
+
+SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
+_REENTRY = _F(12.0)  # m: coming back to a cell so soon is the same visit, not a second one
+_VISIT_SCALE = _F(1.0 / VISIT_CELL)
+
+
+class End(IntEnum):
+    """How an episode ended."""
+
+    RUNNING = 0
+    COLLISION = 1  # off the road or into a car
+    IDLE = 2  # too many steps without progress
+    SUCCESS = 3  # the target distance is reached
+    TIME = 4  # the time limit (truncation)
+
+
+# Points on the outline that are checked against the edge, as shares of half length and half width: corners first.
+_OUTLINE = np.array(
+    [[1, 1], [1, -1], [-1, 1], [-1, -1], [0.5, 1], [0.5, -1], [0, 1], [0, -1], [-0.5, 1], [-0.5, -1], [1, 0], [-1, 0]],
+    dtype=np.float32,
+)
+_OUTLINE.setflags(write=False)
+
+
+@njit
+def collides(road, constants, x, y, cosine, sine):
+    """Whether any part of the car's outline is off the road."""
+    length, width = constants.half_length, constants.half_width
+    # Two circles cover each half of the car: free if both are clear of the edge, without a look at the outline.
+    half = _HALF * length
+    radius = math.sqrt(half * half + width * width)
+    front = clearance(road, x + half * cosine, y + half * sine)
+    rear = clearance(road, x - half * cosine, y - half * sine)
+    if min(front, rear) > radius + _F(0.02):
+        return False
+    if min(front, rear) < _ZERO:
+        return True
+    for k in range(_OUTLINE.shape[0]):
+        along, across = _OUTLINE[k, 0] * length, _OUTLINE[k, 1] * width
+        if clearance(road, x + along * cosine - across * sine, y + along * sine + across * cosine) < _ZERO:
+            return True
+    return False
+
+
+@njit
+def visit_cell(road, x, y):
+    """Index of the visit cell that holds a point of the torus."""
+    columns = _I(road.width * _VISIT_SCALE)
+    rows = _I(road.height * _VISIT_SCALE)
+    column = min(max(_I(x * _VISIT_SCALE), _I(0)), columns - _I(1))
+    row = min(max(_I(y * _VISIT_SCALE), _I(0)), rows - _I(1))
+    return row * columns + column
+
+
+@njit
+def place(road, start, car, visits):
+    """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
+    car[:] = _ZERO
+    car[X] = start[0] - math.floor(start[0] / road.width) * road.width
+    car[Y] = start[1] - math.floor(start[1] / road.height) * road.height
+    car[COS], car[SIN] = math.cos(start[2]), math.sin(start[2])
+    car[SPEED], car[STEERING] = start[3], start[4]
+    visits[:] = _F(-1e6)
+    cell = visit_cell(road, car[X], car[Y])
+    car[CELL], car[FRESH] = _F(cell), _ONE
+    visits[cell] = _ZERO
+
+
+@njit
+def look(road, constants, fan, car, beams, ranges):
+    """Ranges (m) of the car's sensor, from the middle of its front axle."""
+    x = car[X] + constants.front_axle * car[COS]
+    y = car[Y] + constants.front_axle * car[SIN]
+    sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
+
+
+@njit
+def drive(road, constants, car, visits, action):
+    """One control period of one car under one of the eight actions. Returns RUNNING, COLLISION or IDLE."""
+    acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
+    car[STEERING] = steering
+    return move(road, constants, car, visits, acceleration)
+
+
+@njit
+def move(road, constants, car, visits, acceleration):
+    """One control period with the car's present steering and an acceleration in m/s2."""
+    x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
+    curvature = path_curvature(constants, speed, car[STEERING])
+    fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
+    parts = _I(1) + _I(fastest * constants.dt / SUBSTEP)
+    dt = constants.dt / _F(parts)
+    moved = _ZERO
+    crashed = False
+    for _ in range(parts):
+        x, y, cosine, sine, speed, length = advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
+        moved += length
+        if collides(road, constants, x, y, cosine, sine):
+            crashed = True
+            break
+    if x < _ZERO:
+        x += road.width
+    elif x >= road.width:
+        x -= road.width
+    if y < _ZERO:
+        y += road.height
+    elif y >= road.height:
+        y -= road.height
+    car[X], car[Y], car[COS], car[SIN], car[SPEED] = x, y, cosine, sine, speed
+    car[STEPS] += _ONE
+    odometer = car[ODOMETER] + abs(moved)
+    car[ODOMETER] = odometer
+    cell = visit_cell(road, x, y)
+    if _F(cell) != car[CELL]:
+        gap = odometer - visits[cell]
+        car[CELL] = _F(cell)
+        if gap > _REENTRY:
+            car[FRESH] = _ONE if gap > constants.revisit else _ZERO
+    visits[cell] = odometer
+    gained = _ZERO
+    if moved < _ZERO:
+        car[DEBT] -= moved
+    else:
+        paid = min(car[DEBT], moved)
+        car[DEBT] -= paid
+        gained = (moved - paid) * car[FRESH]
+    car[DISTANCE] += gained
+    if road.speed_low <= speed and speed <= road.speed_high:
+        car[PACED] += gained
+    if gained < constants.progress:
+        car[IDLE] += _ONE
+    else:
+        car[IDLE] = _ZERO
+    if crashed:
+        return 1
+    if car[IDLE] >= _F(constants.patience):
+        return 2
+    return 0
+
+
+@njit
+def control(road, constants, car, visits, action, target, max_steps):
+    """`drive`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
+    end = drive(road, constants, car, visits, action)
+    if end == 0:
+        if car[DISTANCE] >= target:
+            return 3
+        if car[STEPS] >= max_steps:
+            return 4
+    return end
+
+
+@njit(nogil=True)
+def _place_all(road, constants, fan, which, rows, starts, cars, visits, ranges):
+    """Put the cars that `which` names in these rows, all on one map, at `starts`; ranges [k, rays] is what they see."""
+    beams = np.empty((3, LANES), dtype=np.float32)
+    for k in rows:
+        i = which[k]
+        place(road, starts[k], cars[i], visits[i])
+        look(road, constants, fan, cars[i], beams, ranges[k])
+
+
+@njit(nogil=True)
+def _control_all(
+    road, constants, fan, which, actions, target, max_steps, cars, visits, ends, ranges, speeds, progress
+):
+    """One control period of the cars `which` of one map; other rows are left alone. Who has ended stands still."""
+    beams = np.empty((3, LANES), dtype=np.float32)
+    for k in range(which.shape[0]):
+        i = which[k]
+        car = cars[i]
+        progress[i] = _ZERO
+        if ends[i] == 0:
+            before = car[DISTANCE]
+            ends[i] = control(road, constants, car, visits[i], actions[i], target, max_steps)
+            progress[i] = car[DISTANCE] - before
+        look(road, constants, fan, car, beams, ranges[i])
+        speeds[i] = car[SPEED]
+
+
+@dataclass(frozen=True)
+class State:
+    """A batch of cars; arrays with one leading axis, one row a car. Copy the arrays to keep a state.
+
+    Attributes:
+        cars: float32 [n, FIELDS], the fields above.
+        visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
+        maps: int32 [n], index of the car's map among the simulator's scenarios.
+        ends: uint8 [n], End.
+    """
+
+    cars: np.ndarray
+    visits: np.ndarray
+    maps: np.ndarray
+    ends: np.ndarray
+
+
+class Simulator:
+    """A batch of cars on one or several maps, each in an episode of its own: arrays in, arrays out.
+
+    What a car does depends on its own map, start and actions alone, not on the batch it is in. Maps may be added to
+    `scenarios` at any time; a reset names them by index. Replace one only before all cars are reset.
+    """
+
+    def __init__(
+        self,
+        scenarios: Sequence[Scenario],
+        cars: int,
+        config: SimConfig | None = None,
+        target: float | None = None,
+        max_steps: int | None = None,
+    ):
+        """Make room for `cars` cars; `target` (m) and `max_steps` (control steps) are the configuration's unless given.
+
+        Raises: ValueError with one line where a number makes no sense.
+        """
+        self.config = config or SimConfig()
+        episode = self.config.episode
+        self.target = episode.target if target is None else target
+        self.max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
+        if cars < 1:
+            raise ValueError(f"a simulator needs 1 car or more, not {cars}")
+        if not self.target > 0.0 or self.max_steps < 1:
+            raise ValueError(f"an episode has a target above 0 m and 1 step or more, not {self.target}, {self.max_steps}")
+        self.scenarios = list(scenarios)
+        self._constants: Constants = constants(self.config)
+        self._fan = fan(self.config.sensors.rays, self._constants.ray_first, self._constants.ray_step)
+        self.state = State(
+            cars=np.zeros((cars, FIELDS), dtype=np.float32),
+            visits=np.zeros((cars, 0), dtype=np.float32),
+            maps=np.full(cars, -1, dtype=np.int32),
+            ends=np.zeros(cars, dtype=np.uint8),
+        )
+        self._groups: list[tuple[Road, np.ndarray]] | None = None  # the cars of each map; None before all were reset
+
+    def __len__(self) -> int:
+        return len(self.state.ends)
+
+    def _road(self, m: int) -> Road:
+        """What the kernels read of map m, read-only (a deep copy of a scenario is not)."""
+        road = self.scenarios[m].road
+        return road._replace(field=freeze(road.field), start_row=freeze(road.start_row), start=freeze(road.start))
+
+    def reset(
+        self, starts: np.ndarray, maps: np.ndarray | int = 0, cars: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Begin episodes.
+
+        Args:
+            starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
+            maps: indices [k] into `scenarios`, or one for all.
+            cars: indices [k] of the cars that begin; None is all of them.
+
+        Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
+        Raises: ValueError with one line for a wrong shape, a number that is not finite, or a map that is not there.
+        """
+        n = len(self)
+        cars = np.arange(n) if cars is None else np.asarray(cars, dtype=np.intp)
+        starts = np.array(starts, dtype=np.float32)
+        maps = np.broadcast_to(np.asarray(maps, dtype=np.int32), cars.shape)
+        if starts.shape != (len(cars), 5) or not np.isfinite(starts).all():
+            raise ValueError(f"starts must be {len(cars)} rows of finite x, y, heading, speed, steering")
+        if maps.size and not 0 <= maps.min() <= maps.max() < len(self.scenarios):
+            raise ValueError(f"a start names a map that is not among the {len(self.scenarios)} there are")
+        roads = {m: self._road(m) for m in np.unique(maps)}
+        cells = max((_visit_cells(road) for road in roads.values()), default=0)
+        if cells > self.state.visits.shape[1]:
+            visits = np.full((n, cells), -1e6, dtype=np.float32)
+            visits[:, : self.state.visits.shape[1]] = self.state.visits
+            self.state = replace(self.state, visits=visits)
+        state = self.state
+        ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
+        for m, road in roads.items():
+            of = np.flatnonzero(maps == m)
+            _place_all(road, self._constants, self._fan, cars, of, starts, state.cars, state.visits, ranges)
+        state.ends[cars] = End.RUNNING
+        if self._groups is None or len(cars) == n or (state.maps[cars] != maps).any():
+            state.maps[cars] = maps
+            self._group()
+        return ranges, starts[:, 3].copy()
+
+    def _group(self) -> None:
+        """Sort the cars by map."""
+        maps = self.state.maps
+        if maps.min() < 0:
+            self._groups = None
+            return
+        order = np.argsort(maps, kind="stable")
+        names, first = np.unique(maps[order], return_index=True)
+        self._groups = list(zip([self._road(m) for m in names], np.split(order, first[1:]), strict=True))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """One control period of every car. A car whose episode has ended stands still until it is reset.
+
+        Args: actions integers [n], 0 to 7 (`vehicle.Action`).
+        Returns: (ranges float32 [n, rays] in m, speeds float32 [n] in m/s, progress float32 [n], m of new ground in
+        this step, ends uint8 [n], End); arrays of the caller's own.
+        Raises: ValueError with one line for anything but an action for each car; RuntimeError before the first reset.
+        """
+        if self._groups is None:
+            raise RuntimeError("step() was called before every car was reset; call reset() first")
+        n = len(self)
+        actions = checked_actions(actions, n)
+        state = self.state
+        ranges = np.empty((n, self.config.sensors.rays), dtype=np.float32)
+        speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)
+        for road, which in self._groups:
+            _control_all(
+                road, self._constants, self._fan, which, actions, _F(self.target), self.max_steps, state.cars,
+                state.visits, state.ends, ranges, speeds, progress,
+            )
+        return ranges, speeds, progress, state.ends.copy()
+
+
+def _visit_cells(road: Road) -> int:
+    """Number of visit cells of a map."""
+    return int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
+
+
+def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
+    """Actions int64 [n], C-contiguous.
+
+    Raises: ValueError with one line unless they are n whole numbers that name actions.
+    """
+    array = np.asarray(actions)
+    if array.shape != (n,):
+        raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")
+    if array.dtype.kind not in "iu":
+        wrong = f"{array.dtype} ({array[0]!s} is the first)"
+        raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {wrong}")
+    array = np.ascontiguousarray(array, dtype=np.int64)
+    if array.view(np.uint64).max() >= len(Action):  # below 0 is far above
+        wrong = array[(array < 0) | (array >= len(Action))][0]
+        raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {wrong}")
+    return array

@@ -1,0 +1,92 @@
+"""The car: kinematic bicycle about the centre of mass (Kong et al. 2015) and the eight driving actions.
+
+Equations, with l_r the distance from the centre of mass to the rear axle and L the wheelbase:
+    beta = atan(l_r / L * tan(steering))        slip angle
+    x' = v cos(psi + beta),  y' = v sin(psi + beta),  psi' = v / l_r * sin(beta),  v' = a
+The path's curvature is sin(beta) / l_r. It is bounded to grip / v^2: faster than the tyres allow, the car runs wide.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numpy as np
+
+from gridsim.jit import njit
+
+_F = np.float32
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+
+class Action(IntEnum):
+    """The paper's eight actions, in its order."""
+
+    ACCELERATE = 0
+    LEFT = 1
+    RIGHT = 2
+    BRAKE = 3
+    NONE = 4
+    ACCELERATE_LEFT = 5
+    ACCELERATE_RIGHT = 6
+    REVERSE = 7
+
+
+@njit
+def act(constants, action, speed, steering):
+    """What an action asks of the car in one control period.
+
+    Returns: (acceleration m/s2, steering angle rad after the period). Without left or right the wheels return to the
+    centre. Braking stops at standstill; reverse goes on backwards.
+    """
+    target = _ZERO
+    if action == 1 or action == 5:
+        target = constants.steering_limit
+    elif action == 2 or action == 6:
+        target = -constants.steering_limit
+    step = constants.steering_step
+    steering = min(max(target, steering - step), steering + step)
+    acceleration = _ZERO
+    if action == 0 or action == 5 or action == 6:
+        acceleration = constants.acceleration
+    elif action == 3:
+        # Brakes only slow down: no more than what stops the car within the period.
+        acceleration = -min(max(speed / constants.dt, -constants.braking), constants.braking)
+    elif action == 7:
+        acceleration = -constants.acceleration
+    return acceleration, steering
+
+
+@njit
+def path_curvature(constants, speed, steering):
+    """Curvature (1/m, left positive) of the centre of mass's path: the bicycle's, bounded by lateral grip."""
+    tangent = constants.rear_share * math.tan(steering)  # of the slip angle
+    curvature = tangent / (math.sqrt(_ONE + tangent * tangent) * constants.rear_axle)
+    bound = constants.grip / max(speed * speed, _F(1e-6))
+    return min(max(curvature, -bound), bound)
+
+
+@njit
+def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
+    """Move on an arc of constant curvature for dt seconds: exact for constant speed and steering.
+
+    Args: pose (m, m, heading as cosine and sine), speed m/s, acceleration m/s2, curvature 1/m, dt s.
+    Returns: (x, y, cosine, sine, speed, signed path length in m).
+    """
+    after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
+    length = _HALF * (speed + after) * dt
+    # Heading turns by `turn`; the chord points along heading + slip + turn / 2.
+    half = _HALF * length * curvature
+    square = half * half
+    sine_half = half * (_ONE - square * (_F(1.0 / 6.0) - square * _F(1.0 / 120.0)))
+    cosine_half = _ONE - square * (_HALF - square * (_F(1.0 / 24.0) - square * _F(1.0 / 720.0)))
+    chord = length * (_ONE - square * (_F(1.0 / 6.0) - square * _F(1.0 / 120.0)))
+    sine_slip = curvature * constants.rear_axle
+    cosine_slip = math.sqrt(max(_ONE - sine_slip * sine_slip, _ZERO))
+    # Unit vector along heading + turn / 2, then turned on by the slip angle.
+    ch, sh = cosine * cosine_half - sine * sine_half, sine * cosine_half + cosine * sine_half
+    x += chord * (ch * cosine_slip - sh * sine_slip)
+    y += chord * (sh * cosine_slip + ch * sine_slip)
+    c, s = ch * cosine_half - sh * sine_half, sh * cosine_half + ch * sine_half
+    norm = _F(1.5) - _HALF * (c * c + s * s)  # one Newton step of 1 / sqrt: keeps the vector a unit
+    return x, y, c * norm, s * norm, after, length

@@ -1,0 +1,47 @@
+"""What the tests share: the checkout's root, a clean environment, and commands run as a user runs them."""
+
+import os
+import subprocess
+import sysconfig
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# Nothing may reach a cluster or a tracking server that the shell happens to name.
+for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "MLFLOW_RUN_ID", "RAY_ADDRESS"):
+    os.environ.pop(_name, None)
+
+# No deadline: an example that comes first may compile a kernel. CI's examples are the same in every run.
+settings.register_profile("gridsim", settings.get_profile("ci" if os.environ.get("CI") else "default"), deadline=None)
+settings.load_profile("gridsim")
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The checkout's root folder."""
+    return Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> Command:
+    """Run an installed console script in the test's empty folder: `command("gridsim-evolve", "--seed", 1)`.
+
+    Keywords but `timeout_s` are set in its environment. Nothing is asserted of how it ends.
+    """
+
+    def run(name: str, *arguments: object, timeout_s: float = 300, **environment: str) -> subprocess.CompletedProcess:
+        return subprocess.run(
+            [Path(sysconfig.get_path("scripts")) / name, *map(str, arguments)],
+            cwd=tmp_path,
+            env={**os.environ, **environment},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+        )
+
+    return run

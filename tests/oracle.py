@@ -1,0 +1,436 @@
+"""The oracle: road, rays, car and episode once more, in float64 NumPy and in textbook form.
+
+Written from the design and the docstrings, not from the kernels, and used by tests alone. Where a kernel marches, looks
+up a table or approximates, the oracle intersects lines with circles, or integrates in closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gridsim.config import SimConfig
+from gridsim.roads import Strips
+
+SQUARE = 4.0  # m, side of the squares in which new ground is counted
+SAME_VISIT = 12.0  # m of driving: back in a square so soon is the same visit
+CHECK_EVERY = 1.0  # m that a car moves between two looks at its outline, at most
+GROUP = 16.0  # m, side of the squares whose points are looked at together
+
+
+# --- The road --------------------------------------------------------------------------------------------------------
+
+
+class ExactRoad:
+    """The union of capsules (lines) and round-ended annular sectors (arcs), repeated over the torus."""
+
+    def __init__(self, strips: Strips, width: float, height: float, torus: bool = True):
+        self.width, self.height, self.torus = width, height, torus
+        pieces = []  # arcs cut into pieces of a quarter turn at most: within one, two half planes bound the sector
+        for cx, cy, radius, first, sweep, half_width in strips.arcs:
+            n = max(1, math.ceil(abs(sweep) / (math.pi / 2) - 1e-9))
+            low = min(first, first + sweep)
+            pieces += [(cx, cy, radius, low + abs(sweep) * k / n, abs(sweep) / n, half_width) for k in range(n)]
+        self.lines = np.array(strips.lines, dtype=np.float64).reshape(-1, 5)
+        self.arcs = np.array(pieces, dtype=np.float64).reshape(-1, 6)
+        self._bounds: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounding boxes of lines and arcs, [4, n]: x from, x to, y from, y to."""
+        lines, arcs = self.lines, self.arcs
+        a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4:5]
+        low, high = np.minimum(a, b) - w, np.maximum(a, b) + w
+        # A piece of a quarter turn at most lies in the circle about its middle that reaches its ends.
+        middle = arcs[:, 3] + arcs[:, 4] / 2
+        mx, my = arcs[:, 0] + arcs[:, 2] * np.cos(middle), arcs[:, 1] + arcs[:, 2] * np.sin(middle)
+        size = 2 * arcs[:, 2] * np.sin(arcs[:, 4] / 4) + arcs[:, 5]
+        return (
+            np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]]),
+            np.stack([mx - size, mx + size, my - size, my + size]),
+        )
+
+    def _near(self, x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lines and arcs, with their repetitions over the torus, that may come within `radius` of a point."""
+        if self._bounds is None:
+            self._bounds = self._boxes()
+        found_lines: list[np.ndarray] = []
+        found_arcs: list[np.ndarray] = []
+        for dx in self._shifts(x, radius, self.width):
+            for dy in self._shifts(y, radius, self.height):
+                for items, box, found, shift in (
+                    (self.lines, self._bounds[0], found_lines, [dx, dy, dx, dy, 0.0]),
+                    (self.arcs, self._bounds[1], found_arcs, [dx, dy, 0.0, 0.0, 0.0, 0.0]),
+                ):
+                    away_x = np.maximum(np.maximum(box[0] + dx - x, x - box[1] - dx), 0.0)
+                    away_y = np.maximum(np.maximum(box[2] + dy - y, y - box[3] - dy), 0.0)
+                    found.append(items[away_x**2 + away_y**2 <= radius**2] + shift)
+        return np.concatenate(found_lines), np.concatenate(found_arcs)
+
+    def _shifts(self, at: float, radius: float, side: float) -> Iterator[float]:
+        if not self.torus:
+            yield 0.0
+            return
+        # A strip may reach a side's length beyond the map itself.
+        for k in range(math.floor((at - radius) / side) - 1, math.floor((at + radius) / side) + 2):
+            yield k * side
+
+    def _groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
+        """Yield indices of points that lie together, and the middle of their square."""
+        square = np.floor(points / GROUP).astype(np.int64)
+        _, group = np.unique(square, axis=0, return_inverse=True)
+        group = group.ravel()
+        order = np.argsort(group, kind="stable")
+        for chosen in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+            x, y = (square[chosen[0]] + 0.5) * GROUP
+            yield chosen, float(x), float(y)
+
+    def clearance(self, points: np.ndarray, deepest: float = 3.0) -> np.ndarray:
+        """Greatest (half width - distance to the centre line) at points [n, 2], in m; below -deepest it is -deepest."""
+        points = np.asarray(points, dtype=np.float64)
+        result = np.full(len(points), -deepest)
+        for chosen, x, y in self._groups(points):
+            lines, arcs = self._near(x, y, deepest + GROUP * math.sqrt(0.5))
+            p = points[chosen, None, :]
+            best = [np.full(len(chosen), -deepest)]
+            if len(lines):
+                a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4]
+                along = np.einsum("nki,ki->nk", p - a, b - a) / np.maximum(((b - a) ** 2).sum(axis=1), 1e-300)
+                nearest = a + np.clip(along, 0.0, 1.0)[..., None] * (b - a)
+                best.append((w - np.linalg.norm(p - nearest, axis=2)).max(axis=1))
+            if len(arcs):
+                centre, radius, first, sweep, w = arcs[:, 0:2], arcs[:, 2], arcs[:, 3], arcs[:, 4], arcs[:, 5]
+                q = p - centre
+                # The nearest point of an arc has the angle of the point, or that of the nearer end.
+                beyond = (np.arctan2(q[..., 1], q[..., 0]) - first) % (2 * np.pi)
+                after_end = beyond - sweep
+                angle = np.where(after_end <= 0, beyond, np.where(after_end < 2 * np.pi - beyond, sweep, 0.0)) + first
+                nearest = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+                best.append((w - np.linalg.norm(q - nearest, axis=2)).max(axis=1))
+            result[chosen] = np.max(best, axis=0)
+        return result
+
+    def cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:
+        """How far each ray gets before it leaves the union: [n, r] m for origins [n, 2] and directions rad [n, r]."""
+        origins, angles = np.asarray(origins, dtype=np.float64), np.asarray(angles, dtype=np.float64)
+        result = np.zeros(angles.shape)
+        # Most rays end soon, where few strips need to be looked at; the others are cast again with all of them.
+        for limit in (min(reach, 16.0), reach):
+            todo = result >= min(limit, 16.0) if limit == reach > 16.0 else np.ones(angles.shape, dtype=bool)
+            if limit < reach or todo.any():
+                ray, of = np.nonzero(todo)
+                result[ray, of] = self._cast(origins[ray], angles[ray, of], limit)
+            if limit == reach:
+                break
+        return result
+
+    def _cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:
+        result = np.zeros(len(angles))
+        for chosen, x, y in self._groups(origins):
+            lines, arcs = self._near(x, y, reach + GROUP * math.sqrt(0.5))
+            p, d = origins[chosen, None, :], np.stack([np.cos(angles[chosen]), np.sin(angles[chosen])], axis=-1)
+            d = d[:, None, :]
+            inside = []
+            if len(lines):
+                inside.append(_in_capsule(p, d, lines))
+            if len(arcs):
+                inside += _in_annular_sector(p, d, arcs)
+            if not inside:
+                continue
+            low = np.concatenate([i[0] for i in inside], axis=1)
+            high = np.concatenate([i[1] for i in inside], axis=1)
+            # Within the union as long as some strip that was entered before is not left yet.
+            t = np.zeros(len(chosen))
+            while True:
+                further = np.where(low <= t[:, None] + 1e-9, high, 0.0).max(axis=1)
+                further = np.maximum(further, t)
+                if (further <= t + 1e-9).all():
+                    break
+                t = further
+            result[chosen] = np.minimum(t, reach)
+        return result
+
+    def outline_on_road(self, poses: np.ndarray, half_length: float, half_width: float) -> np.ndarray:
+        """Whether the car's whole outline lies on the road: bool [n] for poses [n, 3] of x, y, heading.
+
+        Each side is a ray from one corner to the next: the outline is on the road if all four arrive.
+        """
+        poses = np.asarray(poses, dtype=np.float64)
+        x, y, heading = poses.T
+        on = np.ones(len(poses), dtype=bool)
+        turn = 0.0
+        for along, across in ((-1, -1), (1, -1), (1, 1), (-1, 1)):  # counter-clockwise, from the rear right
+            u, v = along * half_length, across * half_width
+            corner = np.stack(
+                [x + u * np.cos(heading) - v * np.sin(heading), y + u * np.sin(heading) + v * np.cos(heading)], axis=1
+            )
+            side = 2 * (half_length if along == across else half_width)
+            on &= self.cast(corner, (heading + turn)[:, None], side)[:, 0] >= side - 1e-7
+            turn += math.pi / 2
+        return on
+
+    def widened(self, margin: float) -> ExactRoad:
+        """The road with its edges moved outwards by `margin` (m), inwards if that is negative."""
+        wider = ExactRoad(Strips(self.lines, self.arcs), self.width, self.height, self.torus)
+        wider.lines[:, 4] += margin
+        wider.arcs[:, 5] += margin
+        return wider
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def _between(p: np.ndarray, d: np.ndarray, low: float | np.ndarray, high: float | np.ndarray) -> tuple:
+    """Where low <= p + t d <= high: t from, t to; (inf, -inf) where nowhere."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - p) / d, (high - p) / d
+    still = d == 0
+    within = still & (low <= p) & (p <= high)
+    first = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(a, b))
+    last = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(a, b))
+    return first, last
+
+
+def _in_disc(p: np.ndarray, d: np.ndarray, radius: np.ndarray) -> tuple:
+    """Where |p + t d| <= radius, for unit vectors d."""
+    b = _dot(p, d)
+    root = b * b - _dot(p, p) + np.where(radius > 0, radius, 0.0) ** 2
+    hit = (root >= 0) & (radius > 0)
+    root = np.sqrt(np.maximum(root, 0.0))
+    return np.where(hit, -b - root, np.inf), np.where(hit, -b + root, -np.inf)
+
+
+def _meet(*intervals: tuple) -> tuple:
+    """Intersection of intervals, empty as (inf, -inf)."""
+    low = np.maximum.reduce([i[0] for i in intervals])
+    high = np.minimum.reduce([i[1] for i in intervals])
+    return np.where(low <= high, low, np.inf), np.where(low <= high, high, -np.inf)
+
+
+def _in_capsule(p: np.ndarray, d: np.ndarray, lines: np.ndarray) -> tuple:
+    """Where rays [n, 1, 2] are within capsules [k]: one interval, because a capsule is convex."""
+    a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4]
+    length = np.linalg.norm(b - a, axis=1)
+    u = np.where(length[:, None] > 0, b - a, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
+    v = np.stack([-u[:, 1], u[:, 0]], axis=1)
+    q = p - a
+    box = _meet(
+        _between(_dot(q, u), _dot(d, u), 0.0, length),
+        _between(_dot(q, v), _dot(d, v), -w, w),
+    )
+    parts = (box, _in_disc(q, d, w), _in_disc(p - b, d, w))
+    return np.minimum.reduce([i[0] for i in parts]), np.maximum.reduce([i[1] for i in parts])
+
+
+def _in_annular_sector(p: np.ndarray, d: np.ndarray, arcs: np.ndarray) -> list[tuple]:
+    """Where rays [n, 1, 2] are within round-ended annular sectors [k]: four intervals each."""
+    centre, radius, first, last, w = arcs[:, 0:2], arcs[:, 2], arcs[:, 3], arcs[:, 3] + arcs[:, 4], arcs[:, 5]
+    q = p - centre
+    e0 = np.stack([np.cos(first), np.sin(first)], axis=1)
+    e1 = np.stack([np.cos(last), np.sin(last)], axis=1)
+    n0, n1 = np.stack([-e0[:, 1], e0[:, 0]], axis=1), np.stack([e1[:, 1], -e1[:, 0]], axis=1)
+    sector = _meet(
+        _between(_dot(q, n0), _dot(d, n0), 0.0, np.inf),
+        _between(_dot(q, n1), _dot(d, n1), 0.0, np.inf),
+    )
+    outer = _meet(sector, _in_disc(q, d, radius + w))
+    hole = _in_disc(q, d, radius - w)
+    before = _meet(outer, (np.full_like(hole[0], -np.inf), hole[0]))
+    behind = _meet(outer, (hole[1], np.full_like(hole[1], np.inf)))
+    ends = [_in_disc(q - radius[:, None] * e, d, w) for e in (e0, e1)]
+    return [before, behind, *ends]
+
+
+# --- The car ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Car:
+    """A car and its books."""
+
+    x: float
+    y: float
+    heading: float  # rad
+    speed: float  # m/s
+    steering: float  # rad
+
+
+def act(config: SimConfig, action: int, speed: float, steering: float) -> tuple[float, float]:
+    """(acceleration m/s2, steering rad after the period) of one of the paper's eight actions, in its order:
+    accelerate, left, right, brake, none, accelerate-left, accelerate-right, reverse."""
+    vehicle, dt = config.vehicle, config.episode.control_period
+    wanted = math.radians(vehicle.steering_limit) * {1: 1, 5: 1, 2: -1, 6: -1}.get(action, 0)
+    most = math.radians(vehicle.steering_rate) * dt
+    steering += float(np.clip(wanted - steering, -most, most))
+    if action in (0, 5, 6):
+        return vehicle.acceleration, steering
+    if action == 7:
+        return -vehicle.acceleration, steering
+    if action == 3:
+        return -math.copysign(min(vehicle.braking, abs(speed) / dt), speed), steering
+    return 0.0, steering
+
+
+def curvature(config: SimConfig, speed: float, steering: float) -> float:
+    """Curvature of the path (1/m): sin(beta) / l_r, held to what the tyres can do at this speed."""
+    vehicle = config.vehicle
+    beta = math.atan(vehicle.rear_axle / vehicle.wheelbase * math.tan(steering))
+    most = vehicle.lateral_grip / speed**2 if speed else math.inf
+    return float(np.clip(math.sin(beta) / vehicle.rear_axle, -most, most))
+
+
+def path_length(config: SimConfig, speed: float, acceleration: float, t: float) -> tuple[float, float]:
+    """(m driven, speed in m/s) after t seconds of constant acceleration, up to the speed limits."""
+    limit = config.vehicle.speed_limit if acceleration > 0 else -config.vehicle.reverse_limit
+    until = (limit - speed) / acceleration if acceleration else math.inf
+    if t <= until:
+        return speed * t + acceleration * t * t / 2, speed + acceleration * t
+    return speed * until + acceleration * until**2 / 2 + limit * (t - until), limit
+
+
+def on_arc(config: SimConfig, x: float, y: float, heading: float, kappa: float, s: float) -> tuple[float, float, float]:
+    """Pose after s metres on a path of constant curvature: the integral of (cos, sin)(psi + beta + kappa s) ds."""
+    course = heading + math.asin(kappa * config.vehicle.rear_axle)
+    if abs(kappa) < 1e-9:
+        return x + s * math.cos(course), y + s * math.sin(course), heading + kappa * s
+    return (
+        x + (math.sin(course + kappa * s) - math.sin(course)) / kappa,
+        y - (math.cos(course + kappa * s) - math.cos(course)) / kappa,
+        heading + kappa * s,
+    )
+
+
+def advance(config: SimConfig, car: Car, acceleration: float) -> tuple[Car, np.ndarray, np.ndarray]:
+    """One control period with the car's present steering.
+
+    Returns: (car afterwards, poses [n, 3] at which its outline is looked at, m driven up to each [n]); the last pose is
+    that at the period's end.
+    """
+    dt = config.episode.control_period
+    kappa = curvature(config, car.speed, car.steering)
+    fastest = max(abs(car.speed), abs(car.speed + acceleration * dt))
+    looks = math.floor(fastest * dt / CHECK_EVERY) + 1
+    poses, driven = [], []
+    speed = car.speed
+    for k in range(1, looks + 1):
+        s, speed = path_length(config, car.speed, acceleration, dt * k / looks)
+        driven.append(s)
+        poses.append(on_arc(config, car.x, car.y, car.heading, kappa, s))
+    return Car(*poses[-1], speed, car.steering), np.array(poses), np.array(driven)
+
+
+# --- The episode -----------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Books:
+    """New ground, and when an episode ends. A square driven again within `revisit` metres of driving counts nothing;
+    metres reversed are owed, and paid before anything counts again."""
+
+    config: SimConfig
+    width: float
+    height: float
+    interval: tuple[float, float]  # m/s, within which speed counts
+    target: float
+    max_steps: int
+    distance: float = 0.0
+    paced: float = 0.0
+    odometer: float = 0.0
+    owed: float = 0.0
+    idle: int = 0
+    steps: int = 0
+    square: tuple[int, int] | None = None
+    fresh: bool = True
+    last_seen: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    def begin(self, x: float, y: float) -> None:
+        """The square of the start is new ground."""
+        self.square = self._square(x, y)
+        self.last_seen[self.square] = 0.0
+
+    def _square(self, x: float, y: float) -> tuple[int, int]:
+        return int(x % self.width // SQUARE), int(y % self.height // SQUARE)
+
+    def enter(self, x: float, y: float, speed: float, moved: float, crashed: bool) -> str:
+        """Book one control step that moved the car to (x, y); how the episode stands: "" or its end's name."""
+        episode = self.config.episode
+        self.steps += 1
+        self.odometer += abs(moved)
+        square = self._square(x, y)
+        if square != self.square:
+            ago = self.odometer - self.last_seen.get(square, -math.inf)
+            if ago > episode.revisit:
+                self.fresh = True
+            elif ago > SAME_VISIT:
+                self.fresh = False
+            self.square = square
+        self.last_seen[square] = self.odometer
+        gained = 0.0
+        if moved < 0:
+            self.owed += -moved
+        else:
+            paid = min(self.owed, moved)
+            self.owed -= paid
+            gained = moved - paid if self.fresh else 0.0
+        self.distance += gained
+        if self.interval[0] <= speed <= self.interval[1]:
+            self.paced += gained
+        self.idle = self.idle + 1 if gained < episode.progress else 0
+        if crashed:
+            return "COLLISION"
+        if self.idle >= episode.patience:
+            return "IDLE"
+        if self.distance >= self.target:
+            return "SUCCESS"
+        if self.steps >= self.max_steps:
+            return "TIME"
+        return ""
+
+
+@dataclass
+class Drive:
+    """An episode as the oracle saw it; arrays have a row a control step."""
+
+    pose: np.ndarray  # float64 [n, 3]: x, y, heading, not wrapped over the torus
+    speed: np.ndarray
+    steering: np.ndarray
+    distance: np.ndarray
+    paced: np.ndarray
+    end: str  # name of End; "RUNNING" when the actions ran out
+
+
+def drive(
+    config: SimConfig,
+    road: ExactRoad,
+    interval: tuple[float, float],
+    start: np.ndarray,
+    actions: np.ndarray,
+    target: float,
+    max_steps: int,
+) -> Drive:
+    """Drive a whole episode from start (x, y, heading, speed, steering) under given actions."""
+    car = Car(*map(float, start))
+    cars, looks, driven = [], [], []
+    for action in actions:
+        acceleration, car.steering = act(config, int(action), car.speed, car.steering)
+        car, poses, lengths = advance(config, car, acceleration)
+        cars.append(car)
+        looks.append(poses)
+        driven.append(lengths)
+    on_road = road.outline_on_road(np.concatenate(looks), config.vehicle.length / 2, config.vehicle.width / 2)
+    books = Books(config, road.width, road.height, interval, target, max_steps)
+    books.begin(float(start[0]), float(start[1]))
+    rows, end, at = [], "", 0
+    for car, poses, lengths in zip(cars, looks, driven, strict=True):
+        off = np.flatnonzero(~on_road[at : at + len(poses)])
+        at += len(poses)
+        last = off[0] if off.size else len(poses) - 1
+        end = books.enter(poses[last, 0], poses[last, 1], car.speed, float(lengths[last]), bool(off.size))
+        rows.append((*poses[last], car.speed, car.steering, books.distance, books.paced))
+        if end:
+            break
+    table = np.array(rows)
+    return Drive(table[:, :3], table[:, 3], table[:, 4], table[:, 5], table[:, 6], end or "RUNNING")

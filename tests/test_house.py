@@ -1,0 +1,116 @@
+"""The house rules: who may import whom, what sits behind one file, and what a worker's process may carry."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+# Imports run downwards only: cluster -> evolution -> gridsim.
+RANK = {"gridsim": 0, "evolution": 1, "cluster": 2}
+# The only files that may import these, anywhere in them.
+BEHIND = {
+    "ray": {"cluster/ray_pool.py"},
+    "mlflow": {"cluster/tracking.py"},
+    "pygame": {"gridsim/render.py", "gridsim/drive.py"},
+}
+# What a package knows nothing of.
+NOT_IN = {"gridsim": {"ray", "mlflow", "torch", "tyro", "rich"}, "evolution": {"ray", "mlflow", "tyro", "rich"}}
+# Elsewhere torch is imported inside functions only: it costs seconds, and 200 MB in each worker.
+TORCH_AT_IMPORT = {"evolution/dqn.py"}
+
+
+def imported(tree: ast.Module) -> Iterator[tuple[str, int, bool]]:
+    """Yield each imported top-level module, its line, and whether it is imported when the file is."""
+    lazy: set[int] = set()
+    for node in ast.walk(tree):
+        typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        if typing_only or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            lazy.update(id(inner) for inner in ast.walk(node))
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.stmt | ast.expr):
+            continue
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names = [node.module]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+            names = [str(a.value) for a in node.args[:1] if isinstance(a, ast.Constant)]
+        for name in names:
+            yield name.partition(".")[0], node.lineno, id(node) not in lazy
+
+
+def breaches(file: str, source: str) -> list[str]:
+    """What in a file (its path from the root) breaks a rule, a line each."""
+    package = file.partition("/")[0]
+    found = []
+    for module, line, at_import in imported(ast.parse(source, filename=file)):
+        if RANK.get(module, 0) > RANK[package]:
+            found.append(f"{file}:{line}: {package} imports {module}, upwards")
+        elif module in NOT_IN.get(package, ()):
+            found.append(f"{file}:{line}: {package} knows no {module}")
+        elif module in BEHIND and file not in BEHIND[module]:
+            found.append(f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}")
+        elif module == "torch" and at_import and file not in TORCH_AT_IMPORT:
+            found.append(f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}")
+    return found
+
+
+@pytest.mark.parametrize("package", RANK)
+def test_package_keeps_the_rules(root: Path, package: str) -> None:
+    files = sorted((root / package).rglob("*.py"))
+    assert files, f"{package}/ is missing or empty"
+    assert [b for f in files for b in breaches(f.relative_to(root).as_posix(), f.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("gridsim/vehicle.py", "from evolution.policy import PolicySpec"),
+        ("evolution/genetic.py", "def f():\n    import cluster.pool"),
+        ("evolution/genetic.py", "import importlib\nimportlib.import_module('cluster.pool')"),
+        ("gridsim/env.py", "def f():\n    import torch"),
+        ("evolution/rollout.py", "import rich.progress"),
+        ("cluster/coordinator.py", "from ray.exceptions import RayActorError"),
+        ("cluster/worker.py", "__import__('ray')"),
+        ("cluster/cli.py", "def f():\n    import mlflow"),
+        ("gridsim/scenarios.py", "import pygame"),
+        ("cluster/tracking.py", "import torch"),
+        ("evolution/policy.py", "class A:\n    import torch"),
+    ],
+)
+def test_a_breach_is_found(file: str, source: str) -> None:
+    assert len(breaches(file, source)) == 1
+
+
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [
+        ("cluster/ray_pool.py", "import ray\nfrom evolution import genetic\nimport gridsim.config"),
+        ("cluster/tracking.py", "def f():\n    import mlflow"),
+        ("gridsim/render.py", "import pygame"),
+        ("evolution/policy.py", "def f():\n    import torch"),
+        ("evolution/policy.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch"),
+        ("gridsim/vehicle.py", "from . import config\nimport rayleigh, numpy"),
+    ],
+)
+def test_what_is_allowed_passes(file: str, source: str) -> None:
+    assert breaches(file, source) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "banned"),
+    [
+        ("cluster.worker", {"ray", "torch", "mlflow", "pygame", "matplotlib", "tyro", "rich"}),
+        ("cluster.ray_pool", {"torch", "mlflow", "pygame", "matplotlib"}),
+        ("cluster.cli", {"torch", "mlflow", "pygame"}),
+    ],
+)
+def test_a_fresh_process_loads_no_more_than_it_needs(root: Path, module: str, banned: set[str]) -> None:
+    code = f"import sys, {module}; print(*sorted({banned!r} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

@@ -1,0 +1,54 @@
+"""What is installed is what pyproject.toml says, and the commands and make's targets are there."""
+
+import re
+import subprocess
+import tomllib
+from importlib.metadata import distribution
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import Command
+
+PROJECT: dict[str, Any] = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+SCRIPTS: dict[str, str] = PROJECT["project"]["scripts"]
+
+
+def test_installed_version_is_the_declared_one() -> None:
+    assert distribution("gridsim").version == PROJECT["project"]["version"]
+
+
+def test_changelog_has_a_place_for_what_comes_next(root: Path) -> None:
+    headings = re.findall(r"^## \[(.+?)\]", (root / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert headings[0] == "Unreleased"
+
+
+def test_installed_commands_are_the_declared_ones() -> None:
+    installed = distribution("gridsim").entry_points.select(group="console_scripts")
+    assert {entry.name: entry.value for entry in installed} == SCRIPTS
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_command_explains_itself(command: Command, tmp_path: Path, name: str) -> None:
+    done = command(name, "--help", timeout_s=120)
+    assert done.returncode == 0, done.stderr
+    assert name in done.stdout
+    assert done.stderr == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_package_is_listed_and_typed(root: Path) -> None:
+    packages = set(PROJECT["tool"]["setuptools"]["packages"])
+    tops = {package.partition(".")[0] for package in packages}
+    found = {".".join(f.parent.relative_to(root).parts) for top in tops for f in (root / top).rglob("__init__.py")}
+    assert found == packages
+    assert [top for top in sorted(tops) if not (root / top / "py.typed").is_file()] == []
+
+
+def test_make_help_names_every_target(root: Path) -> None:
+    done = subprocess.run(["make", "help"], cwd=root, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    targets = re.search(r"^\.PHONY:(.*)$", (root / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert targets is not None
+    described = dict(re.findall(r"^  ([a-z]+) +(\S.*)$", done.stdout, flags=re.MULTILINE))
+    assert set(described) == set(targets[1].split())

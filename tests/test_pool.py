@@ -1,0 +1,175 @@
+"""SerialPool and what all pools share: chunks, one-line errors, the same result from any number of workers."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cluster.pool import SMALLEST_CHUNK, PoolError, SerialPool, chunks, last_line
+from cluster.worker import Task, Worker
+from evolution.breeding import FRESH, RECIPE, Mutation
+from evolution.episodes import lane_starts
+from evolution.rollout import EPISODE, RESULT, Limits
+from gridsim.config import SimConfig
+from gridsim.scenarios import Scenario, build
+
+MAPS = (("seamless", 0), ("seamless", 1))
+
+
+class Answering(Worker):
+    """A stand-in that answers at once: each result is a function of the recipe and the episode."""
+
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        started = time.perf_counter()
+        results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
+        results["distance"] = recipes["seed"][:, None] * 16.0 + np.arange(len(task.episodes))
+        results["paced"] = task.parents[recipes["a"], 0][:, None]
+        results["steps"] = [[m.seed for m in maps]] if maps else 0
+        return results, time.perf_counter() - started
+
+
+class Failing(Answering):
+    """Answers until it meets a member that it cannot bear."""
+
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        if 300 in recipes["seed"]:
+            raise ValueError("member 300 is\nnot to be had")
+        return super().evaluate(task, maps, recipes)
+
+
+def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | None = None) -> Task:
+    parents = np.random.default_rng(0).standard_normal((8, 311)).astype(np.float32)
+    if episodes is None:
+        episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
+    return Task("mlp:6,7", parents, 12345, Mutation(), episodes, maps, Limits(150.0, 300), SimConfig())
+
+
+def make_recipes(n: int) -> np.ndarray:
+    """Two copies first, then children of two parents."""
+    recipes = np.zeros(n, dtype=RECIPE)
+    recipes["seed"] = np.arange(n)
+    recipes["a"] = np.arange(n) % 8
+    recipes["b"] = np.arange(n) * 3 % 8
+    recipes["seed"][:2] = 0
+    recipes["b"][:2] = recipes["a"][:2]
+    return recipes
+
+
+def never_built(name: str, seed: int) -> Scenario:
+    raise AssertionError(f"nobody asked for {name} {seed}")
+
+
+def drive_task() -> tuple[Task, list[Scenario]]:
+    """A small real task on two maps, and the maps."""
+    scenarios = [build(*name) for name in MAPS]
+    episodes = lane_starts(scenarios, np.array([0, 1, 1]), np.random.default_rng(1))
+    return make_task(MAPS, episodes), scenarios
+
+
+@given(st.integers(0, 3000), st.integers(1, 64))
+def test_chunks_cover_all_members_once(n: int, workers: int):
+    cut = chunks(n, workers)
+    assert [i for rows in cut for i in range(n)[rows]] == list(range(n))
+    sizes = [rows.stop - rows.start for rows in cut]
+    assert sizes == sorted(sizes, reverse=True)
+    assert all(size >= SMALLEST_CHUNK for size in sizes[:-1])
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4, 16])
+def test_chunks_let_nobody_wait_for_the_slowest(workers: int):
+    """Simulated with equal members: from the first worker that runs out to the last, at most two small chunks pass."""
+    busy = [0] * workers
+    for rows in chunks(512, workers):
+        k = busy.index(min(busy))
+        busy[k] += rows.stop - rows.start
+    assert max(busy) - min(busy) <= 2 * SMALLEST_CHUNK
+
+
+def test_no_members_no_results():
+    outcome = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(0))
+    assert outcome.results.shape == (0, 2)
+
+
+def test_results_are_in_the_recipes_order_and_progress_is_told():
+    told: list[tuple[int, int]] = []
+    pool = SerialPool(never_built, Answering)
+    recipes = make_recipes(512)
+    outcome = pool.evaluate(make_task(), recipes, lambda done, of: told.append((done, of)))
+    assert np.array_equal(outcome.results["distance"][:, 1], recipes["seed"] * 16.0 + 1)
+    assert told == sorted(told)
+    assert told[-1] == (512, 512)
+    assert len(told) > 5
+    assert (outcome.retries, outcome.bytes_down, outcome.bytes_up, outcome.broadcast_bytes) == (0, 0, 0, 0)
+    assert 0 < sum(outcome.busy_s.values()) <= outcome.wall_s
+
+
+def test_a_failing_worker_ends_in_one_line_that_names_the_chunk():
+    pool = SerialPool(never_built, Failing)
+    with pytest.raises(PoolError) as caught:
+        pool.evaluate(make_task(), make_recipes(512))
+    text = str(caught.value)
+    assert "\n" not in text
+    first, last = (int(word.strip(")")) for word in text.split("members ")[1].split(":")[0].split(" to "))
+    assert first <= 300 <= last
+    assert text.endswith("ValueError: not to be had")
+    assert isinstance(caught.value.__cause__, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("one\n\n two \n"), "ValueError: two"),
+        (KeyError("x"), "KeyError: 'x'"),
+        (MemoryError(), "MemoryError"),
+    ],
+)
+def test_last_line(error: Exception, line: str):
+    assert last_line(error) == line
+
+
+def test_chunks_change_nothing_for_the_real_worker():
+    """All at once, in the pool's chunks, and member by member: the same bits."""
+    task, scenarios = drive_task()
+    recipes = make_recipes(40)
+    recipes["a"][30:] = recipes["b"][30:] = FRESH
+    known = dict(zip(MAPS, scenarios, strict=True))
+    outcome = SerialPool(lambda *name: known[name]).evaluate(task, recipes)
+    whole, seconds = Worker().evaluate(task, scenarios, recipes)
+    single = np.concatenate([Worker().evaluate(task, scenarios, recipes[i : i + 1])[0] for i in range(40)])
+    assert outcome.results.tobytes() == whole.tobytes() == single.tobytes()
+    assert whole["distance"].max() > 0
+    assert seconds > 0
+
+
+def test_every_input_of_the_kernels_is_read_only():
+    """As it is when it comes out of an object store: Numba would compile once more for anything else."""
+    seen: list[np.ndarray] = []
+
+    class Looking(Answering):
+        def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+            seen.extend([task.parents, task.episodes, recipes])
+            seen.extend(value for value in maps[0].road if isinstance(value, np.ndarray))
+            return super().evaluate(task, maps, recipes)
+
+    SerialPool(build, Looking).evaluate(make_task(MAPS[:1]), make_recipes(20))
+    assert len(seen) > 3
+    assert all(not array.flags.writeable and array.flags.c_contiguous for array in seen)
+
+
+def test_closing_twice_is_fine():
+    pool = SerialPool(never_built, Answering)
+    assert pool.workers() == 1
+    pool.close()
+    pool.close()
+
+
+def test_the_serial_pool_needs_no_ray(root: os.PathLike):
+    code = "import sys, cluster.pool; print('ray' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "False\n"
