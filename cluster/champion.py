@@ -1,8 +1,8 @@
 """Champions: what is written of them, and what a person does with one: load it, drive it, evaluate it.
 
-    champion = load_champion("runs/NAME/champion.npz")
-    env = champion.make_env()
-    print(evaluate(champion, "seamless", episodes=64))
+>>> champion = load_champion("runs/NAME/champion.npz")  # doctest: +SKIP
+>>> env = champion.make_env()  # doctest: +SKIP
+>>> evaluate(champion, "seamless", episodes=64)  # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -49,7 +49,13 @@ class Champion:
 
     def act(self, observation: np.ndarray) -> int | np.ndarray:
         """The action for an observation [32] of the environment, or actions [n] for [n, 32]."""
-        return act_on(PolicySpec.parse(self.policy), self.genome, observation, self.sim.sensors.range, self.sim.vehicle.speed_limit)
+        return act_on(
+            PolicySpec.parse(self.policy),
+            self.genome,
+            observation,
+            self.sim.sensors.range,
+            self.sim.vehicle.speed_limit,
+        )
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:
         """A Gymnasium environment on the champion's scenario, or another."""
@@ -82,7 +88,9 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         raise CheckpointError(f"{path}: no champion: {error}") from error
 
 
-def evaluate(champion: Champion, scenario: str | None = None, episodes: int = 64, seed: int = HELD_OUT_SEED) -> dict[str, float]:
+def evaluate(
+    champion: Champion, scenario: str | None = None, episodes: int = 64, seed: int = HELD_OUT_SEED
+) -> dict[str, float]:
     """Drive a champion through episodes on maps it never saw, in this process.
 
     Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed.

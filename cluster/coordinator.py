@@ -1,7 +1,7 @@
 """The generation loop of the genetic algorithm: ask, evaluate, race, validate, tell, save.
 
-The coordinator alone builds maps, selects, saves and logs. Everything it decides follows from the seed and from what the
-workers return; nothing follows from the clock or from who returned it.
+The coordinator alone builds maps, selects, saves and logs. Everything it decides follows from the seed and from what
+the workers return; nothing follows from the clock or from who returned it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from evolution.breeding import RECIPE, Mutation
 from evolution.curriculum import HELD_OUT_EPISODES, HELD_OUT_MAPS, Curriculum, spread_starts, success_rate
 from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits
+from evolution.rollout import EPISODE, Limits, targets
 from gridsim.config import SimConfig
 from gridsim.scenarios import HELD_OUT_SEED, Scenario, build
 from gridsim.simulator import End
@@ -109,7 +109,7 @@ class Evolution:
     pool: WorkerPool
     maps: Maps
     initial: np.ndarray | None = None  # a genome to start from, float32 [genes]
-    score: Callable[[np.ndarray, float], np.ndarray] = fitness.scalar  # (RESULT [n, e], target m) -> [n], greater is better
+    score: Callable[[np.ndarray, np.ndarray | float], np.ndarray] = fitness.scalar  # (RESULT [n, e], targets m) -> [n]
     champion: Champion | None = None
     solved: bool = False
     history: list[dict[str, float]] = field(default_factory=list)
@@ -139,7 +139,7 @@ class Evolution:
 
     # ------------------------------------------------------------------------------------------------- evaluating
 
-    def _score(self, results: np.ndarray, target: float) -> np.ndarray:
+    def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         """Scores float64 [n]; what is not a number loses."""
         score = np.asarray(self.score(results, target), dtype=np.float64)
         if score.shape != (len(results),):
@@ -199,8 +199,9 @@ class Evolution:
         recipes, key = self.genetic.ask(self._mutation())
         self.maps.ahead(curriculum.map_seeds[: generation + 4])
         results = self._evaluate("evolve", self.genetic.parents, recipes, key, maps, episodes, limits)
-        score = self._score(results, limits.target)
-        rank = fitness.pareto(fitness.elements(results, limits.target)) if s.ranking == "pareto" else score
+        goals = targets(episodes, limits)
+        score = self._score(results, goals)
+        rank = fitness.pareto(fitness.elements(results, goals)) if s.ranking == "pareto" else score
 
         # The generation's best race on more episodes; who raced comes before who did not.
         best = np.argsort(-np.nan_to_num(rank, nan=-np.inf), kind="stable")[: curriculum.config.racers]
@@ -215,6 +216,8 @@ class Evolution:
         race_success = float(success_rate(raced)[order[:8]].mean())
         curriculum.raced(order, raced, raced["rewound"], race_maps, race_episodes)
         self.genetic.tell(total)
+        if self.champion is not None:
+            self.genetic.readmit(self.champion.genome)
 
         if limits.target >= curriculum.config.validation_target or generation + 1 >= s.generations:
             self._validate(racers[order[: curriculum.config.contenders]])
@@ -239,7 +242,7 @@ class Evolution:
         return row
 
     def _validate(self, contenders: np.ndarray) -> None:
-        """Find out whether one of [n, genes] is better than the champion; only who passes a first stage is tried whole."""
+        """Find out whether one of [n, genes] beats the champion; only who passes a first stage is tried whole."""
         maps, episodes = self.curriculum.validation()
         limits = self.curriculum.validation_limits()
         first = self.curriculum.config.first_validation

@@ -75,36 +75,34 @@ class _Actor:
         self._serial = 0
         self._task: Task | None = None
         self._maps: dict[tuple[str, int], Scenario] = {}
-        self._failure: Exception | None = None
 
     def hello(self) -> int:
         return os.getpid()
 
-    def prepare(self, serial: int, held: list[Any], map_refs: list[Any]) -> None:
-        """Take up a generation. References come in lists, so that Ray hands them over as they are."""
-        import ray
+    def run(self, serial: int, recipes: bytes, news: tuple[Any, list[Any]] | None) -> bytes:
+        """A chunk's seconds as float64, then its RESULT [n, episodes], as bytes: a fifth of what pickled arrays take.
 
-        self._serial, self._task, self._failure = serial, None, None
-        try:
-            task: Task = ray.get(held[0])
-            # Maps that the last task had too are kept as they are; those that left are let go.
-            self._maps = {
-                name: self._maps[name] if name in self._maps else Scenario.from_arrays(ray.get(ref))
-                for name, ref in zip(task.maps, map_refs, strict=True)
-            }
-            self._task = task
-        except Exception as error:  # nobody reads this call's answer: the first chunk reports it
-            self._failure = error
-
-    def run(self, serial: int, recipes: bytes) -> bytes:
-        """The seconds it took as float64, then the task's rows [n, episodes], as bytes: a fifth of what pickled arrays need."""
-        if self._failure:
-            raise self._failure
+        `news` holds references to the generation's task and maps, for a worker that does not have them yet.
+        """
+        if news:
+            self._take_up(serial, *news)
         if self._task is None or serial != self._serial:
             raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
         maps = [self._maps[name] for name in self._task.maps]
         results, seconds = self._worker.evaluate(self._task, maps, np.frombuffer(recipes, RECIPE))
         return np.float64(seconds).tobytes() + results.tobytes()
+
+    def _take_up(self, serial: int, task_ref: Any, map_refs: list[Any]) -> None:
+        import ray
+
+        self._task = None
+        task: Task = ray.get(task_ref)
+        # Maps that the last task had too are kept as they are; those that left are let go.
+        self._maps = {
+            name: self._maps[name] if name in self._maps else Scenario.from_arrays(ray.get(ref))
+            for name, ref in zip(task.maps, map_refs, strict=True)
+        }
+        self._serial, self._task = serial, task
 
 
 @dataclass
@@ -115,7 +113,7 @@ class _Slot:
     actor: Any
     hello: Any  # the answer that says it is up; None once it is
     pid: int = 0
-    serial: int = 0  # of the last task that it was prepared for
+    serial: int = 0  # of the last task that it was told of
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (chunk, answer), oldest first
 
 
@@ -183,17 +181,16 @@ class RayPool:
         self._serial += 1
         for slot in self._slots:
             slot.sent.clear()  # left over where the last call was interrupted
-        held, map_refs = self._broadcast(task, outcome)
+        news = self._broadcast(task, outcome)
         nobody_since = time.monotonic()
 
         while done < len(recipes):
             for slot in self._free(todo):
-                if slot.serial != self._serial:
-                    slot.actor.prepare.remote(self._serial, held, map_refs)
-                    slot.serial = self._serial
                 chunk = todo.popleft()
                 raw = recipes[cut[chunk]].tobytes()
-                slot.sent.append((chunk, slot.actor.run.remote(self._serial, raw)))
+                known = slot.serial == self._serial
+                slot.sent.append((chunk, slot.actor.run.remote(self._serial, raw, None if known else news)))
+                slot.serial = self._serial
                 outcome.bytes_down += len(raw)
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
             for ref in ray.wait(list(waiting), num_returns=1, timeout=1.0)[0]:
@@ -258,6 +255,8 @@ class RayPool:
 
             if ray.is_initialized():
                 raise PoolError("Ray is in use in this process already; close the other pool first")
+            ray_worker: Any = importlib.import_module("ray._private.worker")
+            ray_worker._worker_logs_enabled = False  # else it prints each worker's death, `log_to_driver` or not
             if self.address is None:
                 store = _store_bytes()
                 self._map_bytes = store * MAP_BYTES // STORE_BYTES
@@ -320,7 +319,7 @@ class RayPool:
                 if len(slot.sent) == depth and len(todo) > (len(up) if depth else 0):
                     yield slot
 
-    def _broadcast(self, task: Task, outcome: Outcome) -> tuple[list[Any], list[Any]]:
+    def _broadcast(self, task: Task, outcome: Outcome) -> tuple[Any, list[Any]]:
         """Put the task, and those of its maps that are not there yet, into the object store."""
         import ray
 
@@ -337,7 +336,7 @@ class RayPool:
         used = sum(size for _, size in self._maps.values())
         while used > self._map_bytes and len(self._maps) > len(set(task.maps)):
             used -= self._maps.popitem(last=False)[1][1]
-        return [ray.put(task)], [self._maps[name][0] for name in task.maps]
+        return ray.put(task), [self._maps[name][0] for name in task.maps]
 
 
 def check_address(address: str) -> str:
@@ -480,5 +479,8 @@ def _capacity() -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """One short line of Ray's long messages."""
-    return last_line(error).split(". There are some potential root causes")[0][:300]
+    """What matters in Ray's long messages, in one short line."""
+    text = last_line(error)
+    if "Worker exit detail: " in text:
+        text = text.split("Worker exit detail: ")[1].split(". Some common causes")[0]
+    return text[:300]

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
 from evolution.policy import PolicySpec
-from gridsim.scenarios import REGISTRY, VALIDATION_SEED
+from gridsim.scenarios import REGISTRY
 
 MAX_POPULATION = 1_000_000
 
@@ -65,7 +65,7 @@ class EvolveSettings:
         if self.scenario not in REGISTRY:
             raise SettingsError(f"unknown scenario {self.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
         if self.traffic:
-            raise SettingsError(f"--traffic {self.traffic}: there is no traffic on {self.scenario} yet; use --traffic 0")
+            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no traffic yet; use --traffic 0")
         if not 0 <= self.seed < 1 << 63:
             raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
         if self.generations < 1:

@@ -1,7 +1,7 @@
 """Breeding: genomes from recipes, by kernels with a counter-based generator.
 
-A recipe is a few bytes; together with the parents and the generation's key it *is* the child: whoever breeds it, wherever
-and how often, gets the same bits.
+A recipe is a few bytes; together with the parents and the generation's key it *is* the child: whoever breeds it,
+wherever and how often, gets the same bits.
 """
 
 from __future__ import annotations
@@ -132,7 +132,15 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, 
         raise ValueError(f"a recipe names a parent beyond the {len(parents)} there are")
     children = np.empty((len(recipes), spec.size), dtype=np.float32)
     _breed(
-        freeze(parents), freeze(recipes), _U(key), spec.layers, _F(mutation.rate), _F(mutation.sigma),
-        _F(mutation.bump_rate), _F(mutation.bump_width), _F(mutation.first_scale), children,
+        freeze(parents),
+        freeze(recipes),
+        _U(key),
+        spec.layers,
+        _F(mutation.rate),
+        _F(mutation.sigma),
+        _F(mutation.bump_rate),
+        _F(mutation.bump_width),
+        _F(mutation.first_scale),
+        children,
     )
     return children

@@ -18,7 +18,7 @@ import numpy as np
 
 from evolution.episodes import lane_starts
 from evolution.rollout import EPISODE, Limits
-from gridsim.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, Scenario
+from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
 from gridsim.simulator import End
 
 HELD_OUT_MAPS = 8
@@ -32,7 +32,8 @@ class CurriculumConfig:
 
     maps: int = 16  # training maps
     starts: int = 2  # new episodes a generation
-    crash_starts: int = 2  # episodes a generation that start before a crash of a recent leader
+    crash_starts: int = 6  # short episodes a generation that start before a crash of a recent leader
+    crash_target: float = 150.0  # m, their length
     crash_memory: int = 64  # crashes that are remembered
     rewind: int = 64  # control steps before the crash
     racers: int = 24  # members raced on more episodes
@@ -40,17 +41,20 @@ class CurriculumConfig:
     leaders: int = 4  # racers whose crashes are remembered
     first_target: float = 150.0  # m, length of the first episodes
     last_target: float = 1000.0  # m
-    growth: float = 0.5  # share of the race's episodes in which the best 8 must succeed before the target doubles
+    growth: float = 0.5  # share of the race's episodes in which the best 8 must come far before the target doubles
+    far: float = 0.85  # of the target
     pace: float = 6.5  # m/s that the time limit of a training episode allows for
     slack: float = 3.0  # s, added to it
     validation_target: float = 300.0  # m, from which on champions are looked for
-    contenders: int = 2  # racers that are validated each generation
-    first_validation: int = 64  # episodes of validation's first stage
+    contenders: int = 4  # racers that are validated each generation
+    first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
     champion_pace: float = 5.75  # m/s, below which a validation episode is no success
 
 
-def spread_starts(build: Callable[[int], Scenario], first_seed: int, maps: int, episodes: int) -> tuple[list[int], np.ndarray]:
+def spread_starts(
+    build: Callable[[int], Scenario], first_seed: int, maps: int, episodes: int
+) -> tuple[list[int], np.ndarray]:
     """Map seeds and EPISODE [episodes] over `maps` maps in turn; the same for every run of a scenario."""
     seeds = [first_seed + k for k in range(maps)]
     rng = np.random.default_rng(np.random.SeedSequence([first_seed, episodes]))
@@ -60,14 +64,24 @@ def spread_starts(build: Callable[[int], Scenario], first_seed: int, maps: int, 
 class Curriculum:
     """Episodes, races and champions of one run."""
 
-    def __init__(self, config: CurriculumConfig, seed: int, build: Callable[[int], Scenario], target_m: float, time_s: float, period_s: float):
+    def __init__(
+        self,
+        config: CurriculumConfig,
+        seed: int,
+        build: Callable[[int], Scenario],
+        target_m: float,
+        time_s: float,
+        period_s: float,
+    ):
         self.config, self.seed, self.build = config, seed, build
         self.goal, self.period = target_m, period_s
         self.goal_steps = round(time_s / period_s)
         self.target = min(config.first_target, target_m)
         self.crashes = np.zeros(0, dtype=EPISODE)
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
-        self.map_seeds = [int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)]
+        self.map_seeds = [
+            int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
+        ]
 
     def _rng(self, generation: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
@@ -78,8 +92,11 @@ class Curriculum:
 
     def limits(self) -> Limits:
         """Of training episodes."""
-        seconds = self.target / self.config.pace + self.config.slack
-        return Limits(self.target, math.ceil(seconds / self.period))
+        return Limits(self.target, self._steps(self.target))
+
+    def _steps(self, target: float) -> int:
+        """Control steps that a training episode of so many m is given."""
+        return math.ceil((target / self.config.pace + self.config.slack) / self.period)
 
     def validation_limits(self) -> Limits:
         """Of validation: the goal at the champion's pace or faster."""
@@ -112,6 +129,8 @@ class Curriculum:
             for m in sorted({int(m) for m in crashes["map"]} - set(used)):
                 used.append(m)
             crashes["map"] = [used.index(int(m)) for m in crashes["map"]]
+            target = min(self.config.crash_target, self.target)
+            crashes["target"], crashes["steps"] = target, self._steps(target)
             fresh = np.concatenate([fresh, crashes])
         return [self.map_seeds[m] for m in used], fresh
 
@@ -120,7 +139,14 @@ class Curriculum:
         used, episodes = self._new_starts(generation, self.config.race_episodes, 2)
         return [self.map_seeds[m] for m in used], episodes
 
-    def raced(self, order: np.ndarray, results: np.ndarray, rewound: np.ndarray, map_seeds: Sequence[int], episodes: np.ndarray) -> None:
+    def raced(
+        self,
+        order: np.ndarray,
+        results: np.ndarray,
+        rewound: np.ndarray,
+        map_seeds: Sequence[int],
+        episodes: np.ndarray,
+    ) -> None:
         """Learn from a race: remember the leaders' crashes, lengthen the task when the best succeed.
 
         Args: racers from best to worst; RESULT [racers, e]; states float32 [racers, e, 5] some steps before each end;
@@ -138,7 +164,7 @@ class Curriculum:
         if new:
             self.crashes = np.concatenate([self.crashes, np.array(new, dtype=EPISODE)])[-self.config.crash_memory :]
         best = results[order[:8]]
-        if (best["end"] == End.SUCCESS).mean() >= self.config.growth:
+        if (best["distance"] >= self.config.far * self.target).mean() >= self.config.growth:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
     def validation(self) -> tuple[list[int], np.ndarray]:

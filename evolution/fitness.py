@@ -1,30 +1,34 @@
 """The two elements of fitness, their bounds, and how members are ranked by them.
 
 Element one is the distance travelled; element two the distance travelled at a forward speed within the scenario's
-interval, so that speed counts only where it is bounded. The scalar is logarithmic: the first bend is worth as much as
-the last kilometre.
+interval, so that speed counts only where it is bounded. Both are shares of the episode's target, mostly logarithmic (the first
+bend is worth as much as the last kilometre) and in part linear (so that the last kilometre is worth driving well).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-LINEAR_SHARE = 0.3
+LINEAR_SHARE = 0.3  # of an element; without it, who crawls through the last kilometre has nearly all
 PACED_SHARE = 0.7  # of the scalar's distance that must be driven at a speed within the interval
 
 
-def elements(results: np.ndarray, target: float) -> np.ndarray:
-    """Fitness elements float64 [n, 2] in [0, 1] from results [n, episodes]: means of log distance, log paced distance."""
-    both = np.stack([results["distance"], results["paced"]], axis=-1).astype(np.float64)
-    return (np.log1p(np.clip(both, 0.0, target)) / np.log1p(target)).mean(axis=1)
+def elements(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
+    """Fitness elements float64 [n, 2] in [0, 1] of results [n, episodes]: distance and paced distance, as shares."""
+    both = [_share(results[name].astype(np.float64), target).mean(axis=1) for name in ("distance", "paced")]
+    return np.stack(both, axis=1)
 
 
-def scalar(results: np.ndarray, target: float) -> np.ndarray:
+def scalar(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
     """Scalar fitness float64 [n] in [0, 1] from results [n, episodes]."""
     mixed = (1.0 - PACED_SHARE) * results["distance"].astype(np.float64) + PACED_SHARE * results["paced"]
-    mixed = np.clip(mixed, 0.0, target)
-    w = LINEAR_SHARE
-    return ((1.0 - w) * np.log1p(mixed) / np.log1p(target) + w * mixed / target).mean(axis=1)
+    return _share(mixed, target).mean(axis=1)
+
+
+def _share(distance: np.ndarray, target: np.ndarray | float) -> np.ndarray:
+    """How much of its target a distance [n, e] is worth, in [0, 1]."""
+    bounded = np.clip(distance, 0.0, target)
+    return (1.0 - LINEAR_SHARE) * np.log1p(bounded) / np.log1p(target) + LINEAR_SHARE * bounded / target
 
 
 def pareto(values: np.ndarray) -> np.ndarray:
@@ -34,7 +38,7 @@ def pareto(values: np.ndarray) -> np.ndarray:
     """
     n = len(values)
     key = np.empty(n)
-    better = (values[:, None, :] >= values[None, :, :]).all(axis=2)
+    better: np.ndarray = np.all(values[:, None, :] >= values[None, :, :], axis=2)
     dominates = better & ~better.T
     dominated_by = dominates.sum(axis=0)
     left = np.ones(n, dtype=bool)
@@ -50,9 +54,9 @@ def pareto(values: np.ndarray) -> np.ndarray:
             if len(here) > 2:
                 gap[1:-1] = (column[2:] - column[:-2]) / span if span > 0 else 0.0
             crowding[order] += gap
-        key[here] = -front + crowding / (1.0 + crowding) if np.isfinite(crowding).all() else -front + np.where(
-            np.isinf(crowding), 0.999, np.minimum(crowding, 1e9) / (1.0 + np.minimum(crowding, 1e9)) * 0.998
-        )
+        # Crowding in [0, 1): below the next better front whatever it is; those at the ends are loneliest of all.
+        finite = np.minimum(crowding, 1e6)
+        key[here] = -front + finite / (1.0 + finite)
         left[here] = False
         dominated_by = dominated_by - dominates[here].sum(axis=0)
         front += 1

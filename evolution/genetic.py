@@ -26,7 +26,7 @@ class GeneticConfig:
             raise ValueError(f"population must be 2 or more, not {self.population}")
         if not 0 <= self.elites < self.population:
             raise ValueError(f"population {self.population} must be larger than the {self.elites} elites")
-        if not 1 <= self.tournament:
+        if self.tournament < 1:
             raise ValueError(f"tournament size must be 1 or more, not {self.tournament}")
         if not 1 <= self.parents <= MAX_PARENTS - self.elites:
             raise ValueError(f"the mating pool must hold 1 to {MAX_PARENTS - self.elites} parents, not {self.parents}")
@@ -113,6 +113,12 @@ class Genetic:
         self.elites = len(best)
         self.generation += 1
         self._asked = None
+
+    def readmit(self, genome: np.ndarray) -> None:
+        """Put a genome [genes] in the place of the last elite, and of the last parent of the mating pool."""
+        if self.elites:
+            self.parents[self.elites - 1] = genome
+        self.parents[-1] = genome
 
 
 def tournaments(score: np.ndarray, size: int, count: int, rng: np.random.Generator) -> np.ndarray:

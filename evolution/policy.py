@@ -37,7 +37,9 @@ class PolicySpec:
             raise ValueError(f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7")
         spec = cls(tuple(int(n) for n in match[1].split(",")))
         if min(spec.hidden) < 1 or spec.size > MAX_GENES:
-            raise ValueError(f"policy {text!r}: every hidden layer needs 1 unit or more, {MAX_GENES:,} genes in all at most")
+            raise ValueError(
+                f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
+            )
         return spec
 
     def __str__(self) -> str:
@@ -68,11 +70,13 @@ def encode(ranges, speed, inputs):
 
 @njit
 def squash(x):
-    """tanh by a rational function (Lambert's continued fraction), within 2e-4 everywhere and exact in its limits."""
+    """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere and exact in its limits."""
     x = min(max(x, _F(-4.97)), _F(4.97))
     s = x * x
-    return x * (_F(135135.0) + s * (_F(17325.0) + s * (_F(378.0) + s))) / (
-        _F(135135.0) + s * (_F(62370.0) + s * (_F(3150.0) + s * _F(28.0)))
+    return (
+        x
+        * (_F(135135.0) + s * (_F(17325.0) + s * (_F(378.0) + s)))
+        / (_F(135135.0) + s * (_F(62370.0) + s * (_F(3150.0) + s * _F(28.0))))
     )
 
 
@@ -90,8 +94,11 @@ def packed_size(layers):
 
 @njit
 def pack(genome, layers, packed):
-    """Lay a genome out for `forward`: a layer's outputs in blocks of 8, in each block first the biases, then a row for
-    each input; missing units have weight 0."""
+    """Lay a genome out for `forward`.
+
+    A layer's outputs stand in blocks of 8; in each block come first the biases, then a row for each input. Missing units
+    have weight 0.
+    """
     packed[:] = _F(0.0)
     at, to = 0, 0
     for k in range(layers.shape[0] - 1):

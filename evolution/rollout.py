@@ -18,13 +18,26 @@ from gridsim.roads import VISIT_CELL, freeze
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan
 from gridsim.simulator import (
-    COS, DISTANCE, FIELDS, PACED, SIN, SPEED, STEERING, STEPS, X, Y, drive, look, place,
+    COS,
+    DISTANCE,
+    FIELDS,
+    PACED,
+    SIN,
+    SPEED,
+    STEERING,
+    STEPS,
+    X,
+    Y,
+    drive,
+    look,
+    place,
 )
 
 _F = np.float32
 
-#: An episode's start: index of its map among the task's, and x, y (m), heading (rad), speed (m/s), steering (rad).
-EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5)])
+#: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
+#: its own target (m) and limit (control steps), where these are not 0.
+EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4")])
 
 #: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
@@ -99,6 +112,11 @@ def _rollout(road, constants, fan, genomes, layers, start, target, max_steps, re
             rewound[i, column, 4] = back[STEERING]
 
 
+def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
+    """Target of each episode in m: float64 [e]."""
+    return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
+
+
 def evaluate(
     spec: PolicySpec,
     genomes: np.ndarray,
@@ -139,8 +157,8 @@ def evaluate(
             genomes,
             spec.layers,
             freeze(episode["start"].copy()),
-            _F(limits.target),
-            limits.steps,
+            _F(episode["target"] or limits.target),
+            int(episode["steps"] or limits.steps),
             rewind,
             results,
             column,
@@ -177,5 +195,7 @@ def _trajectory(road, constants, fan, genome, layers, start, target, max_steps):
     packed = np.empty(packed_size(layers), dtype=np.float32)
     pack(genome, layers, packed)
     ring = np.zeros((max_steps, FIELDS), dtype=np.float32)
-    end = _run(road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring)
+    end = _run(
+        road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring
+    )
     return (car[DISTANCE], car[PACED], car[STEPS], end), ring

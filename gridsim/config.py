@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class VehicleConfig:
@@ -55,27 +57,27 @@ class SimConfig:
 
 
 class Constants(NamedTuple):
-    """`SimConfig` as the kernels read it: plain float32-able numbers, SI units and radians."""
+    """`SimConfig` as the kernels read it: SI units and radians."""
 
-    half_length: float  # m
-    half_width: float  # m
-    front_axle: float  # m ahead of the centre of mass
-    rear_axle: float  # m
-    rear_share: float  # l_r / (l_f + l_r)
-    steering_limit: float  # rad
-    steering_step: float  # rad per control period
-    speed_limit: float  # m/s
-    reverse_limit: float  # m/s
-    acceleration: float  # m/s2
-    braking: float  # m/s2
-    grip: float  # m/s2
-    dt: float  # s
-    ray_range: float  # m
-    ray_first: float  # rad, of the rightmost ray from the heading
-    ray_step: float  # rad
-    progress: float  # m
-    revisit: float  # m
-    patience: int  # steps
+    half_length: np.float32  # m
+    half_width: np.float32  # m
+    front_axle: np.float32  # m ahead of the centre of mass
+    rear_axle: np.float32  # m
+    rear_share: np.float32  # l_r / (l_f + l_r)
+    steering_limit: np.float32  # rad
+    steering_step: np.float32  # rad per control period
+    speed_limit: np.float32  # m/s
+    reverse_limit: np.float32  # m/s
+    acceleration: np.float32  # m/s2
+    braking: np.float32  # m/s2
+    grip: np.float32  # m/s2
+    dt: np.float32  # s
+    ray_range: np.float32  # m
+    ray_first: np.float32  # rad, of the rightmost ray from the heading
+    ray_step: np.float32  # rad
+    progress: np.float32  # m
+    revisit: np.float32  # m
+    patience: np.int32  # steps
 
 
 def constants(config: SimConfig) -> Constants:
@@ -83,8 +85,6 @@ def constants(config: SimConfig) -> Constants:
 
     Raises: ValueError with one line if a number makes no sense.
     """
-    import numpy as np
-
     vehicle, sensors, episode = config.vehicle, config.sensors, config.episode
     for name, value in (
         ("length", vehicle.length),

@@ -1,15 +1,15 @@
 """Gymnasium: the native vector environment, and the single environment, which is the same thing with one car.
 
-Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and so on; Gymnasium imports it by itself for
-`gymnasium.make("gridsim.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
+Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and so on; Gymnasium imports it by itself
+for `gymnasium.make("gridsim.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
 
 Observation: float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s. Action: one of
-`vehicle.Action`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a collision.
-f(distance) is this step's new ground and f(speed) the forward speed, as shares of what the scenario's upper speed gives
-and no more than 1; min(S) is the shortest of the rays.
+`vehicle.Action`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
+collision. f(distance) is this step's new ground and f(speed) the forward speed, as shares of what the scenario's upper
+speed gives and no more than 1; min(S) is the shortest of the rays.
 
-An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that a
-single environment meets after `reset(seed=s + i)`, whatever the other cars do.
+An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
+a single environment meets after `reset(seed=s + i)`, whatever the other cars do.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ CRASH_REWARD = -1.0
 
 _F, _U = np.float32, np.uint64
 _NAMES = np.array([end.name.lower() for end in End])
+_TIME = int(End.TIME)  # a plain number: comparing arrays with an IntEnum is slow
 
 
 @njit
@@ -175,7 +176,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
-        begun = self.simulator.state.ends != End.RUNNING
+        begun = self.simulator.state.ends != 0
         ranges, speeds, progress, ends = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
@@ -185,8 +186,8 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ends[which] = End.RUNNING
             self._fastest[which] = self._upper_speeds(maps)
         observations, rewards = self._observe(ranges, speeds, progress, ends, begun)
-        truncations = ends == End.TIME
-        terminations = (ends != End.RUNNING) ^ truncations
+        truncations = ends == _TIME
+        terminations = (ends != 0) ^ truncations
         return observations, rewards, terminations, truncations, self._info(speeds, ends)
 
     def _keep_own_maps(self) -> None:
@@ -291,8 +292,8 @@ class GridSimEnv(gymnasium.Env[np.ndarray, np.int64]):
 
     def __init__(
         self,
-        *,
         scenario: str = "seamless",
+        *,
         maps: int | Sequence[Scenario] = 8,
         map_seed: int = TRAINING_SEED,
         max_episode_steps: int | None = None,

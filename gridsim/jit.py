@@ -1,7 +1,7 @@
 """Numba, configured once: where compiled kernels are cached and how they are compiled.
 
-Numba's own on-disk cache does not notice that a function in *another* file changed. So the cache lives in a folder whose
-name is a digest of every kernel source, of the constants and of the versions: an edit anywhere means a new folder.
+Numba's own on-disk cache does not notice that a function in *another* file changed. So the cache lives in a folder
+whose name is a digest of every kernel source, of the constants and of the versions: an edit anywhere means a new folder.
 `NUMBA_DISABLE_JIT=1` runs every kernel as plain Python.
 """
 
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numba.core.config as numba_config
 
 # Packages whose files may hold kernels; all their sources count, so that nobody has to keep a list in step.
 KERNEL_PACKAGES = ("gridsim", "evolution")
@@ -63,11 +64,11 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     """
     if function is None:
         return lambda f: njit(f, **options)
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(CACHE_FOLDER)
     try:
         return numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"}, **options)(
             function
         )
     finally:
-        numba.config.CACHE_DIR = before
+        numba_config.CACHE_DIR = before

@@ -122,9 +122,7 @@ def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
                     if half >= math.pi - 1e-9 or ux * mx + uy * my >= norm * cos_half:
                         distance = abs(norm - radius)
                     else:
-                        distance = math.sqrt(
-                            min((x - e0x) ** 2 + (y - e0y) ** 2, (x - e1x) ** 2 + (y - e1y) ** 2)
-                        )
+                        distance = math.sqrt(min((x - e0x) ** 2 + (y - e0y) ** 2, (x - e1x) ** 2 + (y - e1y) ** 2))
                 clearance = _F(w - distance)
                 row, column = j % rows, i % columns
                 if clearance > field[row, column]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from gridsim.config import SimConfig
+from gridsim.jit import njit
 from gridsim.roads import Lanes, Road, Strips, clearance_nodes, freeze, make_road
 from gridsim.seamless import seamless_layout
 
@@ -125,20 +127,25 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     )
 
 
+@njit
+def _starts_at(points, mileage, shares, speed, starts):
+    for k in range(shares.shape[0]):
+        metres = shares[k] * mileage[-1]
+        i = min(np.searchsorted(mileage, metres, side="right"), len(mileage) - 1) - 1
+        part = (metres - mileage[i]) / max(mileage[i + 1] - mileage[i], 1e-9)
+        x, y = points[i, 0], points[i, 1]
+        dx, dy = points[i + 1, 0] - x, points[i + 1, 1] - y
+        starts[k, 0], starts[k, 1] = x + part * dx, y + part * dy
+        starts[k, 2], starts[k, 3], starts[k, 4] = math.atan2(dy, dx), speed, 0.0
+
+
 def starts_at(scenario: Scenario, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5] at these shares [n], in [0, 1), of the length of all lanes, at the scenario's lower speed.
+    """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at the lower speed.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it.
     """
-    points, mileage = scenario.lanes.points, scenario.mileage
-    metres = shares * mileage[-1]
-    at = np.minimum(np.searchsorted(mileage, metres, side="right"), len(points) - 1) - 1
-    step = points[at + 1] - points[at]
-    part = (metres - mileage[at]) / np.maximum(mileage[at + 1] - mileage[at], 1e-9)
-    starts = np.zeros((len(shares), 5), dtype=np.float32)
-    starts[:, :2] = points[at] + part[:, None] * step
-    starts[:, 2] = np.arctan2(step[:, 1], step[:, 0])
-    starts[:, 3] = scenario.road.speed_low
+    starts = np.empty((len(shares), 5), dtype=np.float32)
+    _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, scenario.road.speed_low, starts)
     return starts
 
 

@@ -19,9 +19,9 @@ TILES = 8  # along each side of the torus
 LANE_WIDTH = 3.5  # m
 SHOULDER = 0.5  # m of paved road outside the outer lane
 HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
-ROUNDABOUT_RADIUS = 10.0  # m, of the ring's centre line
-ROUNDABOUT_HALF = 3.5  # m, half width of the ring
-ROUNDABOUT_SHARE = 0.1  # of the T and crossing tiles
+ROUNDABOUT_RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
+ROUNDABOUT_HALF = 4.5  # m, half width of the ring, which is wide enough for a lorry to turn
+ROUNDABOUT_SHARE = 0.08  # of the T and crossing tiles
 EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
 SHORTEST_BLOCK = 8  # tiles around the smallest block of the network
 LANE_STEP = 1.0  # m between points of a lane, at most
@@ -36,9 +36,7 @@ def _distance(edges: np.ndarray, start: int, goal: int, limit: int) -> int:
     while frontier and distance < limit:
         if goal in frontier:
             return distance
-        frontier = {
-            _neighbour(tile, d) for tile in frontier for d in range(4) if edges[tile, d]
-        } - seen
+        frontier = {_neighbour(tile, d) for tile in frontier for d in range(4) if edges[tile, d]} - seen
         seen |= frontier
         distance += 1
     return limit
@@ -62,7 +60,7 @@ def tile_graph(rng: np.random.Generator) -> np.ndarray:
         while (ends := np.flatnonzero(edges.sum(axis=1) == 1)).size:
             for tile in ends:
                 for d in np.flatnonzero(edges[tile]):
-                    edges[tile, d] = edges[_neighbour(tile, d), (d + 2) % 4] = False
+                    edges[tile, d] = edges[_neighbour(int(tile), int(d)), (d + 2) % 4] = False
         largest = _largest_component(edges)
         edges[~largest] = False
         if largest.sum() >= TILES * TILES // 2:
@@ -129,8 +127,7 @@ def _tile_strips(arms: list[int], roundabout: bool) -> tuple[list[list[float]], 
         arcs.append([0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF])
         for arm in arms:
             dx, dy = DIRECTIONS[arm]
-            # The end of a strip is round: stop where that stays within the ring's outer edge.
-            inner = ROUNDABOUT_RADIUS
+            inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
             lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
         return lines, arcs
     for k, a in enumerate(arms):

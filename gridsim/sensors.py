@@ -8,11 +8,19 @@ from __future__ import annotations
 
 import math
 
-import numba
+import numba.core.config as numba_config
 import numpy as np
 
 from gridsim.jit import njit
-from gridsim.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, HEADING_BINS, HEADING_WRAP, START_CELLS_PER_M, START_UNITS
+from gridsim.roads import (
+    CELLS_PER_M,
+    FIELD_FLOOR,
+    FIELD_UNITS,
+    HEADING_BINS,
+    HEADING_WRAP,
+    START_CELLS_PER_M,
+    START_UNITS,
+)
 from gridsim.vector import LANES, march_intrinsic
 
 _F, _I, _U = np.float32, np.int32, np.uint32
@@ -32,7 +40,7 @@ _LEAP = _F(2.0)  # ... and at most this many m longer than a stretched one, so a
 _STEPS = 16  # at most
 
 
-def fan(count: int, first: float, step: float) -> np.ndarray:
+def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:
     """Directions of the rays from the heading: float32 [3, lanes] of cosine, sine, and bins from the first ray's.
 
     `lanes` is count rounded up to whole blocks of LANES; a lane without a ray of its own repeats the last one.
@@ -80,10 +88,18 @@ def march(field, columns, rows, px0, py0, reach, beams):
 # Compiled, the same marching runs as vector code; `NUMBA_DISABLE_JIT=1` takes the plain kernel above.
 fast_march = (
     march
-    if numba.config.DISABLE_JIT
+    if numba_config.DISABLE_JIT
     else march_intrinsic(
-        _STEPS, float(_SCALE), float(_UNIT), float(_FLOOR), float(_SLOPE), float(_NEAR), float(_STRETCH),
-        float(_CLOSE), float(_SLOPE_MIN), float(_LEAP),
+        _STEPS,
+        float(_SCALE),
+        float(_UNIT),
+        float(_FLOOR),
+        float(_SLOPE),
+        float(_NEAR),
+        float(_STRETCH),
+        float(_CLOSE),
+        float(_SLOPE_MIN),
+        float(_LEAP),
     )
 )
 

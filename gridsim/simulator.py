@@ -13,9 +13,10 @@ from enum import IntEnum
 
 import numpy as np
 
+from gridsim.atlas import Atlas, make_atlas, road_of
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
-from gridsim.roads import VISIT_CELL, Road, clearance, freeze
+from gridsim.roads import VISIT_CELL, Road, clearance
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan, sense
 from gridsim.vehicle import Action, act, advance, path_curvature
@@ -41,6 +42,9 @@ FIELDS = 14
 SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
 _REENTRY = _F(12.0)  # m: coming back to a cell so soon is the same visit, not a second one
 _VISIT_SCALE = _F(1.0 / VISIT_CELL)
+
+
+ACTIONS = len(Action)
 
 
 class End(IntEnum):
@@ -190,10 +194,15 @@ def control(road, constants, car, visits, action, target, max_steps):
 
 
 @njit(nogil=True)
-def _place_all(road, constants, fan, which, rows, starts, cars, visits, ranges):
-    """Put the cars that `which` names in these rows, all on one map, at `starts`; ranges [k, rays] is what they see."""
+def _place_all(atlas, constants, fan, order, which, rows, starts, cars, visits, ranges):
+    """Put cars `which` [k] on maps `rows` [k] of the atlas at `starts` [k, 5]; `ranges` [k, rays] is what they see."""
     beams = np.empty((3, LANES), dtype=np.float32)
-    for k in rows:
+    here = rows[order[0]]
+    road = road_of(atlas, here)
+    for k in order:
+        if rows[k] != here:
+            here = rows[k]
+            road = road_of(atlas, here)
         i = which[k]
         place(road, starts[k], cars[i], visits[i])
         look(road, constants, fan, cars[i], beams, ranges[k])
@@ -201,12 +210,16 @@ def _place_all(road, constants, fan, which, rows, starts, cars, visits, ranges):
 
 @njit(nogil=True)
 def _control_all(
-    road, constants, fan, which, actions, target, max_steps, cars, visits, ends, ranges, speeds, progress
+    atlas, constants, fan, order, rows, actions, target, max_steps, cars, visits, ends, ranges, speeds, progress
 ):
-    """One control period of the cars `which` of one map; other rows are left alone. Who has ended stands still."""
+    """One control period of every car, taken in `order`, which is by map. Who has ended stands still."""
     beams = np.empty((3, LANES), dtype=np.float32)
-    for k in range(which.shape[0]):
-        i = which[k]
+    here = rows[order[0]]
+    road = road_of(atlas, here)
+    for i in order:
+        if rows[i] != here:
+            here = rows[i]
+            road = road_of(atlas, here)
         car = cars[i]
         progress[i] = _ZERO
         if ends[i] == 0:
@@ -260,7 +273,8 @@ class Simulator:
         if cars < 1:
             raise ValueError(f"a simulator needs 1 car or more, not {cars}")
         if not self.target > 0.0 or self.max_steps < 1:
-            raise ValueError(f"an episode has a target above 0 m and 1 step or more, not {self.target}, {self.max_steps}")
+            raise ValueError(f"an episode has a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
+        self._limit = _F(self.target)
         self.scenarios = list(scenarios)
         self._constants: Constants = constants(self.config)
         self._fan = fan(self.config.sensors.rays, self._constants.ray_first, self._constants.ray_step)
@@ -270,15 +284,13 @@ class Simulator:
             maps=np.full(cars, -1, dtype=np.int32),
             ends=np.zeros(cars, dtype=np.uint8),
         )
-        self._groups: list[tuple[Road, np.ndarray]] | None = None  # the cars of each map; None before all were reset
+        self._atlas: Atlas | None = None  # maps that cars are on; None before the first reset
+        self._shown: list[Scenario] = []  # what the atlas shows
+        self._rows = np.full(cars, -1, dtype=np.int32)  # each car's map in the atlas, -1 before its first reset
+        self._order = np.arange(cars)  # the cars, sorted by map
 
     def __len__(self) -> int:
         return len(self.state.ends)
-
-    def _road(self, m: int) -> Road:
-        """What the kernels read of map m, read-only (a deep copy of a scenario is not)."""
-        road = self.scenarios[m].road
-        return road._replace(field=freeze(road.field), start_row=freeze(road.start_row), start=freeze(road.start))
 
     def reset(
         self, starts: np.ndarray, maps: np.ndarray | int = 0, cars: np.ndarray | None = None
@@ -301,32 +313,50 @@ class Simulator:
             raise ValueError(f"starts must be {len(cars)} rows of finite x, y, heading, speed, steering")
         if maps.size and not 0 <= maps.min() <= maps.max() < len(self.scenarios):
             raise ValueError(f"a start names a map that is not among the {len(self.scenarios)} there are")
-        roads = {m: self._road(m) for m in np.unique(maps)}
-        cells = max((_visit_cells(road) for road in roads.values()), default=0)
+        if cars.ndim != 1 or (cars.size and not 0 <= cars.min() <= cars.max() < n):
+            raise ValueError(f"cars must be indices from 0 to {n - 1}")
+        ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
+        if not len(cars):
+            return ranges, starts[:, 3]
+        rows = self._chart(maps, everyone=len(cars) == n)
+        cells = max(_visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
             visits = np.full((n, cells), -1e6, dtype=np.float32)
             visits[:, : self.state.visits.shape[1]] = self.state.visits
             self.state = replace(self.state, visits=visits)
         state = self.state
-        ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
-        for m, road in roads.items():
-            of = np.flatnonzero(maps == m)
-            _place_all(road, self._constants, self._fan, cars, of, starts, state.cars, state.visits, ranges)
+        _place_all(
+            self._atlas,
+            self._constants,
+            self._fan,
+            np.argsort(rows, kind="stable"),
+            cars,
+            rows,
+            starts,
+            state.cars,
+            state.visits,
+            ranges,
+        )
+        state.maps[cars] = maps
         state.ends[cars] = End.RUNNING
-        if self._groups is None or len(cars) == n or (state.maps[cars] != maps).any():
-            state.maps[cars] = maps
-            self._group()
+        if (self._rows[cars] != rows).any():
+            self._rows[cars] = rows
+            self._order = np.argsort(self._rows, kind="stable")
         return ranges, starts[:, 3].copy()
 
-    def _group(self) -> None:
-        """Sort the cars by map."""
-        maps = self.state.maps
-        if maps.min() < 0:
-            self._groups = None
-            return
-        order = np.argsort(maps, kind="stable")
-        names, first = np.unique(maps[order], return_index=True)
-        self._groups = list(zip([self._road(m) for m in names], np.split(order, first[1:]), strict=True))
+    def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:
+        """Rows int32 [k] in the atlas of maps [k]. It is made anew if one is missing, of these alone for `everyone`.
+
+        One car alone is always on an atlas of one map, which is no copy.
+        """
+        wanted = {m: self.scenarios[m] for m in np.unique(maps).tolist()}
+        shown = [] if len(self) == 1 else self._shown
+        missing = [scenario for scenario in wanted.values() if not any(scenario is other for other in shown)]
+        if missing:
+            self._shown = list(wanted.values()) if everyone else shown + missing
+            self._atlas = make_atlas([scenario.road for scenario in self._shown])
+        row = {id(scenario): k for k, scenario in enumerate(self._shown)}
+        return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int32)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
@@ -336,18 +366,29 @@ class Simulator:
         this step, ends uint8 [n], End); arrays of the caller's own.
         Raises: ValueError with one line for anything but an action for each car; RuntimeError before the first reset.
         """
-        if self._groups is None:
-            raise RuntimeError("step() was called before every car was reset; call reset() first")
         n = len(self)
+        if self._rows.min() < 0:
+            raise RuntimeError("step() was called before every car was reset; call reset() first")
         actions = checked_actions(actions, n)
         state = self.state
         ranges = np.empty((n, self.config.sensors.rays), dtype=np.float32)
         speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)
-        for road, which in self._groups:
-            _control_all(
-                road, self._constants, self._fan, which, actions, _F(self.target), self.max_steps, state.cars,
-                state.visits, state.ends, ranges, speeds, progress,
-            )
+        _control_all(
+            self._atlas,
+            self._constants,
+            self._fan,
+            self._order,
+            self._rows,
+            actions,
+            self._limit,
+            self.max_steps,
+            state.cars,
+            state.visits,
+            state.ends,
+            ranges,
+            speeds,
+            progress,
+        )
         return ranges, speeds, progress, state.ends.copy()
 
 
@@ -366,9 +407,9 @@ def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
         raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")
     if array.dtype.kind not in "iu":
         wrong = f"{array.dtype} ({array[0]!s} is the first)"
-        raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {wrong}")
+        raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {wrong}")
     array = np.ascontiguousarray(array, dtype=np.int64)
-    if array.view(np.uint64).max() >= len(Action):  # below 0 is far above
-        wrong = array[(array < 0) | (array >= len(Action))][0]
-        raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {wrong}")
+    if array.view(np.uint64).max() >= ACTIONS:  # what is below 0 is far above
+        wrong = array[(array < 0) | (array >= ACTIONS)][0]
+        raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {wrong}")
     return array

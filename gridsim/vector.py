@@ -15,20 +15,30 @@ from numba.core.extending import intrinsic
 LANES = 32
 
 
-def march_intrinsic(steps: int, scale: float, unit: float, floor: float, slope_unit: float, near: float,
-                    stretch: float, close: float, slope_min: float, leap: float) -> Any:
+def march_intrinsic(
+    steps: int,
+    scale: float,
+    unit: float,
+    floor: float,
+    slope_unit: float,
+    near: float,
+    stretch: float,
+    close: float,
+    slope_min: float,
+    leap: float,
+) -> Any:
     """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; numbers as in `sensors`.
 
     beams float32 [3, LANES], C-contiguous: direction x, direction y, and the range, which is read and written.
     """
 
     @intrinsic
-    def march(typingctx, field, columns, rows, px0, py0, reach, beams):  # type: ignore[no-untyped-def]
+    def march(typingctx, field, columns, rows, px0, py0, reach, beams):
         signature = types.void(field, types.uint32, types.uint32, types.float32, types.float32, types.float32, beams)
 
-        def codegen(context, builder, sig, args):  # type: ignore[no-untyped-def]
-            f32, i32, i1 = ir.FloatType(), ir.IntType(32), ir.IntType(1)
-            vf, vi, vb = (ir.VectorType(t, LANES) for t in (f32, i32, i1))
+        def codegen(context, builder, sig, args):
+            f32, i32 = ir.FloatType(), ir.IntType(32)
+            vf, vi = ir.VectorType(f32, LANES), ir.VectorType(i32, LANES)
 
             def splat(value: ir.Value, vector: ir.VectorType) -> ir.Value:
                 single = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(i32, 0))
@@ -43,13 +53,13 @@ def march_intrinsic(steps: int, scale: float, unit: float, floor: float, slope_u
 
             flags = ("contract", "nsz", "arcp")
 
-            def add(a, b):  # type: ignore[no-untyped-def]
+            def add(a, b):
                 return builder.fadd(a, b, flags=flags)
 
-            def sub(a, b):  # type: ignore[no-untyped-def]
+            def sub(a, b):
                 return builder.fsub(a, b, flags=flags)
 
-            def mul(a, b):  # type: ignore[no-untyped-def]
+            def mul(a, b):
                 return builder.fmul(a, b, flags=flags)
 
             field_data = context.make_array(sig.args[0])(context, builder, args[0]).data
@@ -115,7 +125,8 @@ def march_intrinsic(steps: int, scale: float, unit: float, floor: float, slope_u
             t_next = add(t, builder.select(running, step, const(0.0)))
             size = builder.select(builder.fcmp_ordered("<", clear, const(0.0)), builder.fsub(const(0.0), clear), clear)
             active = builder.and_(running, builder.fcmp_ordered(">=", size, const(close)))
-            any_active = builder.icmp_unsigned("!=", builder.bitcast(active, ir.IntType(LANES)), ir.Constant(ir.IntType(LANES), 0))
+            bits = ir.IntType(LANES)
+            any_active = builder.icmp_unsigned("!=", builder.bitcast(active, bits), ir.Constant(bits, 0))
             k_next = builder.add(k, one)
             more = builder.and_(any_active, builder.icmp_unsigned("<", k_next, ir.Constant(i32, steps)))
             k.add_incoming(k_next, builder.block)

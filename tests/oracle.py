@@ -18,7 +18,8 @@ from gridsim.roads import Strips
 SQUARE = 4.0  # m, side of the squares in which new ground is counted
 SAME_VISIT = 12.0  # m of driving: back in a square so soon is the same visit
 CHECK_EVERY = 1.0  # m that a car moves between two looks at its outline, at most
-GROUP = 16.0  # m, side of the squares whose points are looked at together
+GROUP = 32.0  # m, side of the squares whose points are looked at together
+STAGES = (16.0,)  # m, to which rays are cast before they are cast to their whole reach
 
 
 # --- The road --------------------------------------------------------------------------------------------------------
@@ -79,13 +80,13 @@ class ExactRoad:
 
     def _groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
         """Yield indices of points that lie together, and the middle of their square."""
-        square = np.floor(points / GROUP).astype(np.int64)
-        _, group = np.unique(square, axis=0, return_inverse=True)
-        group = group.ravel()
-        order = np.argsort(group, kind="stable")
-        for chosen in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-            x, y = (square[chosen[0]] + 0.5) * GROUP
-            yield chosen, float(x), float(y)
+        square = np.floor(points / GROUP)
+        key = square[:, 0] * 1e6 + square[:, 1]
+        order = np.argsort(key, kind="stable")
+        for chosen in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+            if len(chosen):
+                x, y = (square[chosen[0]] + 0.5) * GROUP
+                yield chosen, float(x), float(y)
 
     def clearance(self, points: np.ndarray, deepest: float = 3.0) -> np.ndarray:
         """Greatest (half width - distance to the centre line) at points [n, 2], in m; below -deepest it is -deepest."""
@@ -116,14 +117,12 @@ class ExactRoad:
         """How far each ray gets before it leaves the union: [n, r] m for origins [n, 2] and directions rad [n, r]."""
         origins, angles = np.asarray(origins, dtype=np.float64), np.asarray(angles, dtype=np.float64)
         result = np.zeros(angles.shape)
-        # Most rays end soon, where few strips need to be looked at; the others are cast again with all of them.
-        for limit in (min(reach, 16.0), reach):
-            todo = result >= min(limit, 16.0) if limit == reach > 16.0 else np.ones(angles.shape, dtype=bool)
-            if limit < reach or todo.any():
-                ray, of = np.nonzero(todo)
-                result[ray, of] = self._cast(origins[ray], angles[ray, of], limit)
-            if limit == reach:
-                break
+        # Most rays end soon, where few strips need to be looked at; the others are cast again with more of them.
+        todo = np.ones(angles.shape, dtype=bool)
+        for limit in (*(stage for stage in STAGES if stage < reach), reach):
+            ray, of = np.nonzero(todo)
+            result[ray, of] = self._cast(origins[ray], angles[ray, of], limit)
+            todo = result >= limit
         return result
 
     def _cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:

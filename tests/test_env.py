@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -103,17 +104,19 @@ def test_observations_are_ranges_and_speed(maps: list[Scenario]) -> None:
 def test_the_same_seed_gives_the_same_episodes_alone_and_in_a_batch_of_64(maps: list[Scenario]) -> None:
     actions = np.random.default_rng(0).integers(len(Action), size=(150, 64))
     batch = GridSimVectorEnv(64, maps=maps)
-    first = [batch.reset(seed=100)[0]] + drive(batch, actions)
-    again = [batch.reset(seed=100)[0]] + drive(batch, actions)
-    np.testing.assert_array_equal(first[0], again[0])
-    for a, b in zip(first[1:], again[1:], strict=True):
+    first_seen, _ = batch.reset(seed=100)
+    first = drive(batch, actions)
+    seen_again, _ = batch.reset(seed=100)
+    again = drive(batch, actions)
+    np.testing.assert_array_equal(first_seen, seen_again)
+    for a, b in zip(first, again, strict=True):
         for x, y in zip(a, b, strict=True):
             np.testing.assert_array_equal(x, y)
-    assert sum(term.sum() for _, _, term, _ in first[1:]) > 64  # some cars are in their second episode or later
+    assert sum(term.sum() for _, _, term, _ in first) > 64  # some cars are in their second episode or later
     for car in (0, 7, 63):
         env = GridSimEnv(maps=maps)
         observation, _ = env.reset(seed=100 + car)
-        np.testing.assert_array_equal(observation, first[0][car])
+        np.testing.assert_array_equal(observation, first_seen[car])
         over = False
         for step, row in enumerate(actions):
             if over:
@@ -122,8 +125,8 @@ def test_the_same_seed_gives_the_same_episodes_alone_and_in_a_batch_of_64(maps: 
             else:
                 observation, reward, term, trunc, _ = env.step(row[car])
             over = term or trunc
-            np.testing.assert_array_equal(observation, first[1 + step][0][car])
-            assert (reward, term, trunc) == tuple(x[car] for x in first[1 + step][1:])
+            np.testing.assert_array_equal(observation, first[step][0][car])
+            assert (reward, term, trunc) == tuple(x[car] for x in first[step][1:])
 
 
 def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: list[Scenario]) -> None:
@@ -134,16 +137,16 @@ def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: list[Scen
     assert not np.array_equal(first, second)
     assert not np.array_equal(first, other)
     np.testing.assert_array_equal(env.reset(seed=8)[0], first)
-    unseeded = [GridSimEnv(maps=maps).reset()[0] for _ in range(2)]
-    assert not np.array_equal(*unseeded)
+    assert not np.array_equal(GridSimEnv(maps=maps).reset()[0], GridSimEnv(maps=maps).reset()[0])
 
 
 def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Scenario]) -> None:
-    limits = Limits(120.0, 200)
+    limits = Limits(30.0, 40)
     config = SimConfig(episode=EpisodeConfig(target=limits.target, time_limit=limits.steps / 10))
     episodes = np.zeros(24, dtype=EPISODE)
     episodes["map"] = np.arange(24) % 3
-    episodes["start"] = np.concatenate([sample_starts(maps[m], 1, np.random.default_rng(m)) for m in episodes["map"]])
+    for m in range(3):
+        episodes["start"][m::3] = sample_starts(maps[m], 8, np.random.default_rng(m))
     ends = set()
     for genome in genomes(40):
         results, _ = evaluate(SPEC, genome[None], maps, episodes, limits, config)
@@ -160,7 +163,7 @@ def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Scenario]) ->
             ends |= set(info["end"][running])
             running &= ~(terminations | truncations)
         assert not running.any()
-    assert ends >= {"collision", "time", "running"}
+    assert ends == {"running", "collision", "idle", "success", "time"}
 
 
 def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Scenario]) -> None:
@@ -346,7 +349,7 @@ def test_an_action_that_is_none_is_refused(maps: list[Scenario], n: int, action:
 def test_a_wrong_number_of_actions_is_refused(maps: list[Scenario]) -> None:
     env = GridSimVectorEnv(3, maps=maps)
     env.reset(seed=0)
-    for actions in (np.zeros(2, dtype=int), np.int64(1), np.zeros((3, 1), dtype=int)):
+    for actions in (np.zeros(2, dtype=int), np.array(1), np.zeros((3, 1), dtype=int)):
         with pytest.raises(ValueError, match="3 cars"):
             env.step(actions)
     single = GridSimEnv(maps=maps)
@@ -403,6 +406,6 @@ def test_a_wrong_option_is_refused(options: dict[str, object], text: str) -> Non
         ({"config": SimConfig(episode=EpisodeConfig(target=-1.0))}, "target"),
     ],
 )
-def test_a_wrong_argument_is_refused(arguments: dict[str, object], text: str) -> None:
+def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(text)):
         GridSimVectorEnv(**arguments)

@@ -371,13 +371,16 @@ def test_two_at_once_create_one_database_and_print_nothing(tmp_path):
 
 
 def test_prints_nothing(tmp_path, empty_database):
-    broken = tmp_path / "broken.db"
-    with contextlib.closing(sqlite3.connect(broken)) as database:
+    good, foreign, broken = (tmp_path / name for name in ("good.db", "foreign.db", "broken.db"))
+    with contextlib.closing(sqlite3.connect(foreign)) as database:
         database.execute("CREATE TABLE alembic_version (version_num VARCHAR(32))")
         database.execute("INSERT INTO alembic_version VALUES ('unheard of')")
         database.commit()
-    shutil.copy(empty_database, tmp_path / "good.db")
-    for arguments in ([f"sqlite:///{tmp_path}/good.db", f"{tmp_path}/id"], [f"sqlite:///{broken}"]):
+    shutil.copy(empty_database, good)
+    shutil.copy(empty_database, broken)
+    with contextlib.closing(sqlite3.connect(broken)) as database:
+        database.execute("ALTER TABLE metrics RENAME COLUMN is_nan TO is_gone")  # MLflow logs a traceback
+    for arguments in ([f"sqlite:///{good}", f"{tmp_path}/id"], [f"sqlite:///{foreign}"], [f"sqlite:///{broken}"]):
         done = subprocess.run(
             [sys.executable, "-c", QUIET, *arguments], env=with_path(), capture_output=True, text=True, timeout=60
         )
@@ -440,7 +443,7 @@ def silent():
 
 
 def test_a_server_that_says_nothing_is_waited_for_no_longer_than_allowed(silent, monkeypatch):
-    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "4")
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "2")
     stuck = tracker(silent.uri)
     for step in range(3, 6):
         stuck.log_row(step, row(step))
@@ -449,9 +452,8 @@ def test_a_server_that_says_nothing_is_waited_for_no_longer_than_allowed(silent,
     started = time.perf_counter()
     report = stuck.close("KILLED", timeout_s=1.0)
     assert time.perf_counter() - started < 1.5
-    assert report == (
-        f"not logged to MLflow at {silent.uri}: 3 rows (step 3 to 5), the status KILLED: no answer within 1 s"
-    )
+    start = f"not logged to MLflow at {silent.uri}: 3 rows (step 3 to 5), the status KILLED: no answer "
+    assert report in (start + "within 1 s", start + "in time")
     stuck._thread.join(20)
     assert not stuck._thread.is_alive()
     assert stuck.error == "no answer in time"
@@ -463,7 +465,8 @@ def mlflow_server(folder, port):
     command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1", "--port", str(port)]
     command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
     with open(folder / "server.log", "a") as log:
-        server = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, start_new_session=True)
+        quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+        server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)
     try:
         for _ in range(300):
             with contextlib.suppress(TrackingError):
@@ -478,7 +481,8 @@ def mlflow_server(folder, port):
 
 
 @pytest.mark.e2e
-def test_a_server_that_goes_away_and_comes_back(tmp_path, capfd):
+def test_a_server_that_goes_away_and_comes_back(tmp_path, empty_database, capfd):
+    shutil.copy(empty_database, tmp_path / "served.db")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     (tmp_path / "run").mkdir()

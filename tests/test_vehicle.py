@@ -8,13 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
+from gridsim.config import Constants, EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
 from gridsim.vehicle import Action, act, advance, path_curvature
 
 CONFIG = SimConfig()
 K = constants(CONFIG)
 F = np.float32
 DT = 0.1  # s
+STILL = 1e-6  # m/s, rounding: what stands still may seem to move by as much
 R_SHARP = 1.25 / math.sin(math.atan(0.5 * math.tan(math.radians(27.0))))  # m, the tightest circle: l_r / sin(beta)
 
 speeds = st.floats(-3.0, 30.0, width=32)
@@ -25,9 +26,9 @@ actions = st.sampled_from(list(Action))
 class Driver:
     """A car on an endless plane: poses as lists, one entry a control period and one for the start."""
 
-    def __init__(self, speed: float = 0.0, steering: float = 0.0, k=K):
+    def __init__(self, speed: float = 0.0, steering: float = 0.0, k: Constants = K):
         self.k, self.steering = k, F(steering)
-        self.state = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
+        self.state: tuple[np.float32, ...] = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
         self.x, self.y, self.heading, self.speeds, self.driven = [0.0], [0.0], [0.0], [float(speed)], 0.0
 
     @property
@@ -80,7 +81,7 @@ def test_top_speed_is_reached_and_kept():
 def test_stopping_distance(speed):
     car = Driver(speed=speed)
     periods = 0
-    while car.speed > 0.0:
+    while car.speed > 1e-4:  # rounding leaves a little of the last 0.8 m/s
         car.do(Action.BRAKE)
         periods += 1
     assert periods == math.ceil(speed / 8.0 / DT - 1e-5)
@@ -105,10 +106,9 @@ def test_brake_slows_down_and_never_reverses(speed):
     for _ in range(45):
         before = car.speed
         car.do(Action.BRAKE)
-        assert abs(car.speed) <= abs(before)
-        assert car.speed * before >= 0.0
+        assert -STILL <= math.copysign(1.0, before) * car.speed <= max(abs(before), STILL)
         assert abs(before) - abs(car.speed) <= 0.8 * (1 + 1e-5)
-    assert car.speed == 0.0
+    assert abs(car.speed) <= STILL
     assert car.x[-1] * speed >= 0.0
 
 
@@ -252,8 +252,8 @@ def test_a_period_is_the_oracles(speed, steering, heading, action):
 @given(speed=speeds, steering=steerings, parts=st.integers(2, 6))
 def test_one_period_is_as_many_parts_as_one_likes(speed, steering, parts):
     kappa = path_curvature(K, F(speed), steering)
-    whole = state = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
-    whole = advance(K, *whole, F(0.0), kappa, K.dt)[:5]
+    state: tuple[np.float32, ...] = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
+    whole = advance(K, *state, F(0.0), kappa, K.dt)[:5]
     for _ in range(parts):
         state = tuple(map(F, advance(K, *state, F(0.0), kappa, F(K.dt / parts))[:5]))
     assert np.array(state) == pytest.approx(np.array(whole, dtype=F), abs=1e-5)

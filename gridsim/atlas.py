@@ -1,0 +1,55 @@
+"""Several maps as one set of arrays, so that cars on different maps are one call of a kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.jit import njit
+from gridsim.roads import Road, freeze
+
+
+class Atlas(NamedTuple):
+    """Roads one after another; all arrays read-only and C-contiguous."""
+
+    field: np.ndarray  # as `Road.field`, of all maps
+    start_row: np.ndarray  # as `Road.start_row`
+    start: np.ndarray  # as `Road.start`
+    bounds: np.ndarray  # int64 [maps + 1, 3], where each map's part of these three begins
+    sides: np.ndarray  # uint32 [maps, 2], columns and rows
+    sizes: np.ndarray  # float32 [maps, 4], width and height (m), lower and upper speed (m/s)
+
+
+def make_atlas(roads: Sequence[Road]) -> Atlas:
+    """Lay maps one after another: a copy, unless there is one alone."""
+    parts = [(road.field, road.start_row, road.start) for road in roads]
+    lengths = np.array([[len(array) for array in part] for part in parts], dtype=np.int64)
+    arrays = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
+    field, start_row, start = (freeze(array) for array in arrays)
+    return Atlas(
+        field=field,
+        start_row=start_row,
+        start=start,
+        bounds=freeze(np.concatenate([np.zeros((1, 3), dtype=np.int64), np.cumsum(lengths, axis=0)])),
+        sides=freeze(np.array([[r.columns, r.rows] for r in roads], dtype=np.uint32)),
+        sizes=freeze(np.array([[r.width, r.height, r.speed_low, r.speed_high] for r in roads], dtype=np.float32)),
+    )
+
+
+@njit
+def road_of(atlas: Atlas, m: int) -> Road:
+    """Map m of an atlas."""
+    here, there = atlas.bounds[m], atlas.bounds[m + 1]
+    return Road(
+        atlas.field[here[0] : there[0]],
+        atlas.start_row[here[1] : there[1]],
+        atlas.start[here[2] : there[2]],
+        atlas.sides[m, 0],
+        atlas.sides[m, 1],
+        atlas.sizes[m, 0],
+        atlas.sizes[m, 1],
+        atlas.sizes[m, 2],
+        atlas.sizes[m, 3],
+    )

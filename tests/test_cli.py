@@ -1,0 +1,324 @@
+"""The commands as a user runs them: installed scripts, real Ray workers, real kills."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BIN = Path(sys.executable).parent
+SMALL = ["--population", "48", "--generations", "6", "--seed", "5", "--elites", "4"]
+
+
+def start(*arguments, cwd, **env):
+    """A command, started."""
+    return subprocess.Popen(
+        [str(BIN / arguments[0]), *arguments[1:]],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **env},
+        start_new_session=True,
+    )
+
+
+def evolve(*arguments, cwd, timeout=240, **env):
+    """gridsim-evolve, run to its end."""
+    process = start("gridsim-evolve", *arguments, cwd=cwd, **env)
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def rows(folder):
+    with (folder / "history.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def descendants(pid):
+    """Processes below a process, by /proc."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            except (OSError, IndexError):
+                continue
+    found, queue = [], [pid]
+    while queue:
+        here = queue.pop()
+        children = [p for p, parent in parents.items() if parent == here]
+        found += children
+        queue += children
+    return found
+
+
+def ray_workers(pid):
+    """Actor processes that belong to a command."""
+    names = {}
+    for child in descendants(pid):
+        try:
+            names[child] = Path(f"/proc/{child}/cmdline").read_bytes()
+        except OSError:
+            continue
+    return [child for child, name in names.items() if name.startswith(b"ray::") and b"IDLE" not in name]
+
+
+def wait_until(condition, timeout=120.0):
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.02)
+    raise AssertionError("it did not happen in time")
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """The undisturbed run, in one process."""
+    cwd = tmp_path_factory.mktemp("reference")
+    done = evolve("--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return cwd
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_champion_is_the_same_for_any_number_of_workers(reference, tmp_path, workers):
+    done = evolve("--workers", str(workers), "--name", "w", *SMALL, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""  # no warning of Ray's or MLflow's reaches the user
+    assert summary(tmp_path / "runs/w")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    for mine, theirs in zip(rows(tmp_path / "runs/w"), rows(reference / "runs/ref"), strict=True):
+        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "race/success_rate"):
+            assert mine[name] == theirs[name]
+
+
+@pytest.mark.e2e
+def test_killed_worker_changes_nothing(reference, tmp_path):
+    process = start("gridsim-evolve", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)
+    try:
+        history = tmp_path / "runs/k/history.csv"
+        wait_until(lambda: history.exists() and len(rows(tmp_path / "runs/k")) >= 2)
+        victims = ray_workers(process.pid)
+        assert victims
+        os.kill(victims[0], signal.SIGKILL)
+        out, err = process.communicate(timeout=240)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == 0, err
+    assert summary(tmp_path / "runs/k")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+
+
+@pytest.mark.e2e
+def test_killed_process_resumes_to_the_same_champion(reference, tmp_path):
+    from mlflow.tracking import MlflowClient
+
+    process = start("gridsim-evolve", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)
+    history = tmp_path / "runs/k/history.csv"
+    wait_until(lambda: history.exists() and len(rows(tmp_path / "runs/k")) >= 3)
+    children = descendants(process.pid)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=60)
+    wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 60)  # none is left behind
+    done = evolve("--workers", "0", "--resume", "runs/k", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    resumed = summary(tmp_path / "runs/k")
+    assert resumed["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    assert resumed["car_steps"] == summary(reference / "runs/ref")["car_steps"]
+    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlflow.db")
+    steps = [m.step for m in client.get_metric_history(resumed["mlflow_run_id"], "fitness/best")]
+    assert sorted(steps) == list(range(6))
+    assert client.get_run(resumed["mlflow_run_id"]).info.status == "FINISHED"
+    again = evolve("--workers", "0", "--resume", "runs/k", cwd=tmp_path)
+    assert again.returncode == 0
+    assert "finished" in again.stdout
+
+
+@pytest.mark.e2e
+def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
+    from mlflow.tracking import MlflowClient
+
+    process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
+    history = tmp_path / "runs/c/history.csv"
+    wait_until(lambda: history.exists() and len(rows(tmp_path / "runs/c")) >= 2)
+    children = descendants(process.pid)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "Traceback" not in out + err
+    assert "--resume runs/c" in err
+    wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 30)
+    client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlflow.db")
+    experiment = client.get_experiment_by_name("gridsim")
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert run.info.status == "KILLED"
+    done = evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert summary(tmp_path / "runs/c")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+
+
+@pytest.mark.e2e
+def test_existing_cluster(reference, tmp_path):
+    """As the README says: ray start, then --address."""
+    port = 6399
+    env = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
+    ray = [str(BIN / "ray")]
+    head = ["start", "--head", "--num-cpus", "2", f"--port={port}", "--include-dashboard=false", "--disable-usage-stats"]
+    subprocess.run(
+        [*ray, *head, "--object-store-memory=200000000", f"--temp-dir={tmp_path}/ray"], check=True, capture_output=True,
+        env=env,
+    )  # fmt: skip
+    try:
+        done = evolve("--workers", "2", "--address", f"127.0.0.1:{port}", "--name", "a", *SMALL, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert summary(tmp_path / "runs/a")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+        alive = subprocess.run([*ray, "status", f"--address=127.0.0.1:{port}"], capture_output=True, env=env, check=False)
+        assert alive.returncode == 0  # the run left, the cluster stays
+    finally:
+        subprocess.run([*ray, "stop", "--force"], capture_output=True, env=env, check=False)
+
+
+@pytest.mark.e2e
+def test_run_folder_and_mlflow_keep_their_contracts(reference):
+    from mlflow.tracking import MlflowClient
+
+    folder = reference / "runs/ref"
+    for name in ("config.json", "checkpoint.npz", "champion.npz", "elites.npz", "curves.png", "trajectory.png"):
+        assert (folder / name).stat().st_size > 0
+    figures = summary(folder)
+    with np.load(folder / "champion.npz", allow_pickle=False) as arrays:
+        assert arrays["genome"].dtype == np.float32
+    assert figures["held_out"]["episodes"] == 64
+    assert len(rows(folder)) == figures["generations"] == 6
+    client = MlflowClient(tracking_uri=f"sqlite:///{reference}/mlflow.db")
+    run = client.get_run(figures["mlflow_run_id"])
+    assert run.info.status == "FINISHED"
+    assert run.data.tags["algorithm"] == "evolution"
+    assert run.data.params["population"] == "48"
+    for row in rows(folder):
+        step = int(row["generation"])
+        logged = {m.step: m.value for m in client.get_metric_history(run.info.run_id, "distance_m/best")}
+        assert logged[step] == pytest.approx(float(row["distance_m/best"]))
+    assert run.data.metrics["held_out/success_rate"] == figures["held_out"]["success_rate"]
+    assert {"champion.npz", "summary.json", "curves.png"} <= {f.path for f in client.list_artifacts(run.info.run_id)}
+
+
+@pytest.mark.e2e
+def test_evaluate_says_what_the_run_said(reference):
+    done = subprocess.run(
+        [str(BIN / "gridsim-evaluate"), "runs/ref", "--json"], cwd=reference, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == pytest.approx(summary(reference / "runs/ref")["held_out"])
+
+
+@pytest.mark.e2e
+def test_config_repeats_and_init_continues(reference, tmp_path):
+    config = reference / "runs/ref/config.json"
+    done = evolve("--workers", "0", "--config", str(config), "--name", "again", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert summary(tmp_path / "runs/again")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    champion = reference / "runs/ref/champion.npz"
+    arguments = ["--workers", "0", "--population", "24", "--generations", "1", "--sigma", "0", "--bump-rate", "0"]
+    done = evolve(*arguments, "--init", str(champion), "--name", "warm", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    # Without mutation every member is the one it started from.
+    assert summary(tmp_path / "runs/warm")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+
+
+WRONG = {
+    "unknown scenario": (["--scenario", "moon"], "unknown scenario"),
+    "unknown flag": (["--frobnicate"], "frobnicate"),
+    "not a number": (["--population", "many"], "--population"),
+    "population below elites": (["--population", "8", "--elites", "8"], "larger than"),
+    "negative workers": (["--workers", "-1"], "--workers"),
+    "output that cannot be written": (["--output", "/proc/nowhere"], "cannot be written"),
+    "name that is a path": (["--name", "../up"], "--name"),
+    "resume of no run": (["--resume", "."], "no run's folder"),
+    "config that is none": (["--config", "/etc/hostname"], "config.json"),
+    "init that is missing": (["--init", "nothing.npz"], "nothing.npz"),
+    "policy": (["--policy", "mlp:0"], "policy"),
+    "traffic": (["--traffic", "4"], "--traffic"),
+    "dead cluster": (["--address", "127.0.0.1:1"], "127.0.0.1:1"),
+    "dead MLflow": (["--tracking-uri", "http://127.0.0.1:1"], "127.0.0.1:1"),
+    "MLflow file store": (["--tracking-uri", "file:///tmp/mlruns"], "file"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_use_is_one_clear_line(name, tmp_path):
+    arguments, expected = WRONG[name]
+    if "--workers" not in arguments and "--address" not in arguments:
+        arguments = [*arguments, "--workers", "0"]
+    began = time.monotonic()
+    done = evolve(*arguments, cwd=tmp_path, timeout=60)
+    assert done.returncode == 2, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert lines[0].startswith("gridsim-evolve: error: ")
+    assert 1 <= len(lines) <= 3
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert time.monotonic() - began < 30
+    assert list(tmp_path.iterdir()) == []  # nothing half-written
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [(["--seed", "6"], "--seed"), (["--population", "64"], "--population"), (["--generations", "2"], "--generations")],
+)
+def test_resume_refuses_contradictions(reference, tmp_path, change, expected):
+    done = evolve("--resume", str(reference / "runs/ref"), "--workers", "0", *change, cwd=tmp_path, timeout=60)
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert len(done.stderr.strip().splitlines()) <= 3
+
+
+@pytest.mark.e2e
+def test_resume_refuses_damaged_checkpoints(reference, tmp_path):
+    import shutil
+
+    folder = tmp_path / "runs/ref"
+    shutil.copytree(reference / "runs/ref", folder)
+    whole = (folder / "checkpoint.npz").read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:2000] + b"x" + whole[2001:], b""):
+        (folder / "checkpoint.npz").write_bytes(damaged)
+        done = evolve("--resume", str(folder), "--workers", "0", cwd=tmp_path, timeout=60)
+        assert done.returncode == 2
+        assert re.match(r"gridsim-evolve: error: .*checkpoint.npz", done.stderr)
+    (folder / "checkpoint.npz").write_bytes(whole)
+    config = json.loads((folder / "config.json").read_text())
+    config["settings"]["seed"] = 99
+    (folder / "config.json").write_text(json.dumps(config))
+    done = evolve("--resume", str(folder), "--workers", "0", cwd=tmp_path, timeout=60)
+    assert done.returncode == 2
+    assert "edited" in done.stderr
+
+
+@pytest.mark.e2e
+def test_extending_a_run_equals_a_longer_one(reference, tmp_path):
+    short = [*SMALL]
+    short[short.index("6")] = "3"
+    done = evolve("--workers", "0", "--name", "s", *short, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(rows(tmp_path / "runs/s")) == 6

@@ -1,0 +1,452 @@
+"""The order of events: kernel against oracle through whole episodes, and what must not earn distance."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import oracle
+import pytest
+
+from evolution.policy import PolicySpec
+from evolution.rollout import EPISODE, Limits, evaluate
+from gridsim.config import EpisodeConfig, SimConfig, constants
+from gridsim.roads import Strips, clearance_nodes, make_road
+from gridsim.scenarios import build, sample_starts
+from gridsim.sensors import LANES, fan
+from gridsim.simulator import (
+    COS,
+    DISTANCE,
+    FIELDS,
+    IDLE,
+    ODOMETER,
+    PACED,
+    SIN,
+    SPEED,
+    STEERING,
+    STEPS,
+    End,
+    Simulator,
+    X,
+    Y,
+    collides,
+    drive,
+    look,
+    place,
+)
+from gridsim.vehicle import Action
+
+F = np.float32
+CONFIG = SimConfig()
+K = constants(CONFIG)
+RAYS = fan(31, K.ray_first, K.ray_step)
+SIDE = 256.0
+INTERVAL = (5.0, 12.0)  # m/s
+
+Choose = Callable[[int, np.ndarray, np.ndarray], int]  # (step, ranges, car) -> action
+
+
+@dataclass
+class Run:
+    """An episode by the kernels: actions [n], states after each step [n, FIELDS], how it ended."""
+
+    start: np.ndarray
+    actions: np.ndarray
+    states: np.ndarray
+    end: str
+
+
+def run(road, start, choose: Choose, target: float = 2000.0, max_steps: int = 4000, k=K) -> Run:  # type: ignore[no-untyped-def]
+    start = np.asarray(start, dtype=F)
+    car, visits = np.zeros(FIELDS, dtype=F), np.zeros(int(road.width) // 4 * int(road.height) // 4, dtype=F)
+    beams, ranges = np.empty((3, LANES), dtype=F), np.empty(31, dtype=F)
+    place(road, start, car, visits)
+    actions, states, end = [], [], 0
+    while end == 0:
+        look(road, k, RAYS, car, beams, ranges)
+        actions.append(int(choose(len(actions), ranges, car)))
+        end = drive(road, k, car, visits, actions[-1])
+        states.append(car.copy())
+        if end == 0 and car[DISTANCE] >= target:
+            end = End.SUCCESS
+        elif end == 0 and len(actions) >= max_steps:
+            end = End.TIME
+    return Run(start, np.array(actions), np.array(states), End(end).name)
+
+
+def at_random(rng) -> Choose:
+    """Actions at random, each kept for a while; accelerating more often than not, so that it goes somewhere."""
+    chances = np.array([6, 2, 2, 1, 2, 3, 3, 1]) / 20
+    kept = [0, 4]
+
+    def choose(step, ranges, car):
+        if step >= kept[0]:
+            kept[:] = step + rng.integers(1, 9), rng.choice(8, p=chances)
+        return kept[1]
+
+    return choose
+
+
+def by_sight(rng) -> Choose:
+    """A simple driver: to where there is more room, no faster than the view ahead allows."""
+
+    def choose(step, ranges, car):
+        left, right = ranges[16:26].sum(), ranges[5:15].sum()
+        wanted = np.clip(1.2 * ((left - right) / (left + right) + 0.03 * rng.normal()), -0.45, 0.45)
+        pace = np.clip(0.6 * ranges[13:18].min(), 3.0, 9.0)
+        turn = int(np.sign(wanted - car[STEERING])) if abs(wanted - car[STEERING]) > 0.05 else 0
+        if car[SPEED] > pace + 0.3:
+            return Action.BRAKE
+        if car[SPEED] < pace:
+            return (Action.ACCELERATE, Action.ACCELERATE_LEFT, Action.ACCELERATE_RIGHT)[turn]
+        return (Action.NONE, Action.LEFT, Action.RIGHT)[turn]
+
+    return choose
+
+
+def always(action: Action) -> Choose:
+    return lambda step, ranges, car: action
+
+
+@pytest.fixture(scope="module")
+def scenarios():
+    return [build("seamless", seed) for seed in (0, 11)]
+
+
+@pytest.fixture(scope="module")
+def exact(scenarios):
+    return [oracle.ExactRoad(s.strips, SIDE, SIDE) for s in scenarios]
+
+
+@pytest.fixture(scope="module")
+def episodes(scenarios):
+    """(index of the map, Run): 80 episodes at random and 30 of a driver, from lanes, at any speed."""
+    rng = np.random.default_rng(21)
+    found = []
+    for k in range(110):
+        m = k % 2
+        start = sample_starts(scenarios[m], 1, rng)[0]
+        start[3] = rng.uniform(-1.0, 12.0)
+        choose = at_random(rng) if k < 80 else by_sight(rng)
+        found.append((m, run(scenarios[m].road, start, choose, target=400.0, max_steps=450)))
+    return found
+
+
+def on_torus(away):
+    return np.abs((away + SIDE / 2) % SIDE - SIDE / 2)
+
+
+# --- Kernel against oracle -------------------------------------------------------------------------------------------
+
+
+def test_the_episodes_are_worth_comparing(episodes):
+    ends = [r.end for _, r in episodes]
+    assert {"COLLISION", "IDLE", "SUCCESS", "TIME"} == set(ends)
+    assert sum(len(r.actions) for _, r in episodes) > 5000
+    assert {int(a) for _, r in episodes for a in r.actions} == set(range(8))
+    assert min(r.states[:, SPEED].min() for _, r in episodes) == -3.0
+    assert max(r.states[:, SPEED].max() for _, r in episodes) > 15.0
+
+
+def test_whole_episodes_are_the_oracles(episodes, exact):
+    """The oracle drives by itself from start to end, never set right: same path, same distance, same end."""
+    furthest, odd = 0.0, []
+    for k, (m, r) in enumerate(episodes):
+        o = oracle.drive(CONFIG, exact[m], INTERVAL, r.start, r.actions, 400.0, 450)
+        n = min(len(o.pose), len(r.states))
+        same = o.end == r.end and len(o.pose) == len(r.states)
+        # Where one of the two saw a collision that the other did not, the last step cannot be compared.
+        upto = n if same else n - 1
+        s, pose = r.states[:upto].astype(float), o.pose[:upto]
+        away = np.maximum(on_torus(s[:, X] - pose[:, 0]), on_torus(s[:, Y] - pose[:, 1]))
+        furthest = max(furthest, away.max(initial=0.0))
+        assert away.max(initial=0.0) < 5e-3
+        assert np.abs(s[:, COS] - np.cos(pose[:, 2])).max(initial=0.0) < 1e-3
+        assert np.abs(s[:, SIN] - np.sin(pose[:, 2])).max(initial=0.0) < 1e-3
+        assert np.abs(s[:, SPEED] - o.speed[:upto]).max(initial=0.0) < 1e-3
+        assert np.abs(s[:, STEERING] - o.steering[:upto]).max(initial=0.0) < 1e-4
+        assert np.abs(s[:, DISTANCE] - o.distance[:upto]).max(initial=0.0) < 0.1
+        assert np.abs(s[:, PACED] - o.paced[:upto]).max(initial=0.0) < 0.1
+        if not same:
+            odd.append(k)
+            # The kernel looks at points of the outline, the oracle at all of it: a matter of some cm at an edge.
+            last = o.pose[-1:] if len(o.pose) <= len(r.states) else states_poses(r.states[-1:])
+            assert "COLLISION" in (o.end, r.end)
+            assert exact[m].widened(0.25).outline_on_road(last, 2.0, 1.0)[0]
+            assert not exact[m].widened(-0.05).outline_on_road(last, 2.0, 1.0)[0]
+    print(f"{len(episodes)} episodes: poses within {furthest * 1000:.2f} mm, {len(odd)} ended by a graze of one alone")
+    assert len(odd) <= 0.05 * len(episodes)
+
+
+def states_poses(states):
+    states = states.astype(float)
+    return np.stack([states[:, X], states[:, Y], np.arctan2(states[:, SIN], states[:, COS])], axis=1)
+
+
+def test_every_step_is_the_oracles(episodes):
+    """The oracle is set right after each step: what a single step does, to float32's rounding."""
+    worst = 0.0
+    for _, r in episodes:
+        before = np.zeros(FIELDS)
+        before[[X, Y, SPEED, STEERING]] = r.start[[0, 1, 3, 4]]
+        before[COS], before[SIN] = math.cos(r.start[2]), math.sin(r.start[2])
+        crash = r.end == "COLLISION"
+        for action, after in zip(r.actions[: -1 if crash else None], r.states.astype(float), strict=False):
+            acceleration, steering = oracle.act(CONFIG, int(action), before[SPEED], before[STEERING])
+            heading = math.atan2(before[SIN], before[COS])
+            car, poses, _ = oracle.advance(
+                CONFIG, oracle.Car(before[X], before[Y], heading, before[SPEED], steering), acceleration
+            )
+            away = max(on_torus(after[X] - poses[-1, 0]), on_torus(after[Y] - poses[-1, 1]))
+            # At a speed limit the kernel's mean speed is that of the ends of its sub-step.
+            limited = car.speed in (30.0, -3.0) and before[SPEED] != car.speed
+            assert away < (5e-3 if limited else 6e-5)
+            worst = max(worst, 0.0 if limited else away)
+            assert abs(after[SPEED] - car.speed) < 1e-5
+            assert abs(after[STEERING] - steering) < 1e-6
+            assert abs(after[COS] - math.cos(car.heading)) < (3e-3 if limited else 2e-6)
+            assert abs(after[SIN] - math.sin(car.heading)) < (3e-3 if limited else 2e-6)
+            before = after
+    print(f"a step is the oracle's within {worst * 1000:.3f} mm")
+
+
+def test_the_books_are_the_oracles(episodes):
+    """New ground and idleness, counted by the oracle along the kernel's own poses."""
+    for _, r in episodes:
+        books = oracle.Books(CONFIG, SIDE, SIDE, INTERVAL, 400.0, 450)
+        books.begin(float(r.start[0]), float(r.start[1]))
+        odometer, speed, ends = 0.0, float(r.start[3]), []
+        for k, after in enumerate(r.states.astype(float)):
+            # The odometer counts either way; a step goes backwards if its mean speed does.
+            forward = speed + after[SPEED] >= 0.0
+            moved = (after[ODOMETER] - odometer) * (1 if forward else -1)
+            crashed = r.end == "COLLISION" and k == len(r.states) - 1
+            ends.append(books.enter(after[X], after[Y], after[SPEED], moved, crashed))
+            assert after[DISTANCE] == pytest.approx(books.distance, abs=2e-3)
+            assert after[PACED] == pytest.approx(books.paced, abs=2e-3)
+            assert after[IDLE] == books.idle
+            assert after[STEPS] == books.steps
+            odometer, speed = after[ODOMETER], after[SPEED]
+        assert ends[:-1] == [""] * (len(ends) - 1)
+        assert ends[-1] == r.end
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0.0, SIDE, (40_000, 2))
+    points = points[exact[seed].clearance(points) > 0.8][:5000]
+    poses = np.column_stack([points, rng.uniform(-math.pi, math.pi, len(points))]).astype(F).astype(float)
+    hit = np.array([collides(scenarios[seed].road, K, F(x), F(y), F(math.cos(h)), F(math.sin(h))) for x, y, h in poses])
+    assert 0.1 < hit.mean() < 0.5
+
+    def on_road(margin):
+        return exact[seed].widened(margin).outline_on_road(poses, 2.0, 1.0)
+
+    assert (hit == on_road(0.0)).mean() < 0.003
+    assert not (hit & on_road(-0.03)).any()  # no false alarm with more than 3 cm to spare
+    missed = ~hit & ~on_road(0.05)  # a pointed corner may reach in between the points that are looked at
+    assert missed.mean() < 0.001
+    assert not (~hit & ~on_road(0.4)).any()
+
+
+def test_a_batch_is_its_cars(scenarios, episodes):
+    """`Simulator` and the bare kernels are bit-identical, whatever the other cars of the batch do."""
+    chosen = [(m, r) for m, r in episodes if len(r.actions) > 20][:12]
+    batch = Simulator(scenarios, len(chosen), CONFIG, target=400.0, max_steps=450)
+    batch.reset(np.stack([r.start for _, r in chosen]), np.array([m for m, _ in chosen]))
+    for step in range(max(len(r.actions) for _, r in chosen)):
+        actions = np.array([r.actions[min(step, len(r.actions) - 1)] for _, r in chosen])
+        batch.step(actions)
+        for k, (_, r) in enumerate(chosen):
+            assert batch.state.cars[k].tobytes() == r.states[min(step, len(r.states) - 1)].tobytes()
+    assert [End(e).name for e in batch.state.ends] == [r.end for _, r in chosen]
+
+
+# --- What earns nothing ----------------------------------------------------------------------------------------------
+
+
+def small_road(lines=(), arcs=(), side=128.0):
+    strips = Strips(np.array(lines, dtype=float).reshape(-1, 5), np.array(arcs, dtype=float).reshape(-1, 6))
+    return make_road(clearance_nodes(strips, side, side), INTERVAL, 50.0)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    """Road everywhere: a torus of 128 m without an edge."""
+    return small_road([[0, y, 128, y, 40.0] for y in (0, 40, 80)])
+
+
+@pytest.fixture(scope="module")
+def straight():
+    """A road of 8 m round a torus of 1,024 m, along x."""
+    strips = Strips(np.array([[0, 32.0, 1024, 32.0, 4.0]]), np.zeros((0, 6)))
+    return make_road(clearance_nodes(strips, 1024.0, 64.0), INTERVAL, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("speed", "radius"),
+    [(4.0, 5.06), (4.9, 5.06), (7.0, 49 / 4.9), (9.9, 9.9**2 / 4.9), (11.5, 11.5**2 / 4.9)],  # v^2 / 4.9 when faster
+)
+@pytest.mark.parametrize("side", [1, -1])
+def test_circling_on_the_spot_earns_one_round(plain, speed, radius, side):
+    start = [64, 64, 0.3, speed, side * math.radians(27.0)]
+    r = run(plain, start, always(Action.LEFT if side > 0 else Action.RIGHT))
+    rnd = 2 * math.pi * radius
+    assert rnd < 200.0
+    assert r.end == "IDLE"
+    # A square's length more or less where the circle closes, and then 15 steps.
+    assert r.states[-1, DISTANCE] == pytest.approx(rnd, abs=6.0)
+    assert r.states[-1, ODOMETER] < rnd + 15 * speed * 0.1 + 6.0
+
+
+def test_a_round_longer_than_200_m_is_new_ground_again(plain):
+    speed = 13.0
+    assert 2 * math.pi * speed**2 / 4.9 > 200.0 + 12.0
+    r = run(plain, [64, 64, 0.0, speed, math.radians(27.0)], always(Action.LEFT), target=600.0)
+    assert r.end == "SUCCESS"
+    assert r.states[-1, ODOMETER] == pytest.approx(r.states[-1, DISTANCE], abs=1.0)
+
+
+def test_circling_in_a_roundabout_earns_one_round():
+    road = small_road(arcs=[[32, 32, 10, 0.0, 2 * math.pi, 3.5]], side=64.0)
+
+    def round_and_round(step, ranges, car):
+        # Left where it drifts outwards of the ring's centre line, straight on where it drifts inwards.
+        return Action.LEFT if math.hypot(car[X] - 32, car[Y] - 32) > 10.0 else Action.NONE
+
+    r = run(road, [42, 32, math.pi / 2, 5.5, 0.2], round_and_round)
+    assert r.end == "IDLE"
+    assert r.states[-1, DISTANCE] == pytest.approx(2 * math.pi * 10, abs=8.0)
+    assert r.states[-1, ODOMETER] > r.states[-1, DISTANCE] + 14 * 0.55
+
+
+def test_standing_still_ends_after_15_steps(straight):
+    r = run(straight, [100, 32, 0, 0, 0], always(Action.NONE))
+    assert (r.end, len(r.actions), r.states[-1, DISTANCE]) == ("IDLE", 15, 0.0)
+
+
+@pytest.mark.parametrize(("speed", "ends"), [(0.49, True), (0.51, False)])
+def test_progress_is_5_cm_a_step(straight, speed, ends):
+    r = run(straight, [100, 32, 0, speed, 0], always(Action.NONE), max_steps=100)
+    assert (r.end, len(r.actions)) == (("IDLE", 15) if ends else ("TIME", 100))
+
+
+def test_reversing_earns_nothing(straight):
+    r = run(straight, [100, 32, 0, -3.0, 0], always(Action.REVERSE))
+    assert (r.end, len(r.actions)) == ("IDLE", 15)
+    assert r.states[-1, DISTANCE] == 0.0
+    assert r.states[-1, PACED] == 0.0
+    assert r.states[-1, X] == pytest.approx(100 - 15 * 0.3, abs=1e-3)
+
+
+def test_back_and_forth_earns_the_furthest_point(straight):
+    """The classic cheat: ground is made good before anything counts again."""
+    plan = [Action.ACCELERATE] * 15 + [Action.BRAKE] * 6 + [Action.REVERSE] * 7 + [Action.ACCELERATE] * 13
+
+    def choose(step, ranges, car):
+        return plan[step % len(plan)]
+
+    patient = constants(SimConfig(episode=EpisodeConfig(patience=100)))
+    r = run(straight, [100, 32, 0, 0, 0], choose, max_steps=10 * len(plan), k=patient)
+    assert r.end == "TIME"
+    furthest = np.maximum.accumulate(r.states[:, X].astype(float)) - 100
+    assert (np.diff(r.states[:, X]) < -0.01).sum() > 30
+    assert r.states[:, DISTANCE] == pytest.approx(furthest, abs=0.02)
+
+
+def test_only_a_bounded_speed_is_paced(straight):
+    r = run(straight, [100, 32, 0, 0, 0], always(Action.ACCELERATE), max_steps=80)  # 0 to 24 m/s
+    v = r.states[:, SPEED].astype(float)
+    within = (v >= INTERVAL[0]) & (v <= INTERVAL[1])
+    gained = np.diff(r.states[:, DISTANCE].astype(float), prepend=0.0)
+    assert 0 < within.sum() < 80
+    assert r.states[-1, PACED] == pytest.approx(gained[within].sum(), abs=1e-3)
+
+
+def test_distance_is_the_way_along_the_road(straight):
+    """20 m/s for 2 s, over the border of the torus: 40 m of new ground."""
+    r = run(straight, [1010, 32, 0, 20.0, 0], always(Action.NONE), max_steps=20)
+    assert r.states[-1, DISTANCE] == pytest.approx(40.0, abs=1e-3)
+    assert r.states[-1, X] == pytest.approx(26.0, abs=1e-3)
+    assert r.states[-1, PACED] == 0.0
+
+
+# --- Collisions ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wall", [1.0, 2.0])
+@pytest.mark.parametrize("heading", [0.0, 0.02, math.pi])
+def test_nothing_tunnels_through_a_thin_wall(wall, heading):
+    """30 m/s at a wall across the road, from starts 10 cm apart: 3 m a step, and never beyond it."""
+    road = small_road([[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]])
+    backwards = heading > 1.0
+    for k in range(32):
+        x = 40 + 0.1 * k if not backwards else 120 - 0.1 * k
+        r = run(road, [x, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)
+        assert r.end == "COLLISION"
+        front = r.states[-1, X] + 2.0 * (-1 if backwards else 1)
+        edge = 80.0 if not backwards else 80 + wall
+        into = (front - edge) * (-1 if backwards else 1)
+        assert -0.1 < into < 1.0 + 0.1  # m: what a sub-step covers, at most
+
+
+def test_a_crash_ends_where_it_happens(straight):
+    r = run(straight, [100, 32, math.pi / 2, 10.0, 0], always(Action.NONE))
+    # 4 m of road less half the car's length: 2 m, that is two whole steps of 1 m and the next one's first metre at most.
+    assert r.end == "COLLISION"
+    assert r.states[-1, Y] - 34.0 == pytest.approx(r.states[-1, DISTANCE] - 2.0, abs=1e-3)
+    assert 0.0 <= r.states[-1, Y] - 34.0 + 0.02 <= 1.02
+
+
+def test_a_start_is_taken_onto_the_torus(straight):
+    car, visits = np.ones(FIELDS, dtype=F), np.ones(1024 * 64 // 16, dtype=F)
+    place(straight, np.array([-4.0, 32.0 + 128.0, math.pi / 2, 7.0, 0.1], dtype=F), car, visits)
+    assert (car[X], car[Y]) == (1020.0, 32.0)
+    assert (car[COS], car[SIN]) == pytest.approx((0.0, 1.0), abs=1e-6)
+    assert (car[SPEED], car[STEERING]) == (7.0, F(0.1))
+    assert not car[[DISTANCE, PACED, ODOMETER, IDLE, STEPS]].any()
+
+
+# --- Whole populations -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def task(scenarios):
+    rng = np.random.default_rng(8)
+    spec = PolicySpec.parse("mlp:6,7")
+    genomes = rng.normal(size=(6, spec.size)).astype(F) * F(0.5)
+    starts = np.zeros(4, dtype=EPISODE)
+    starts["map"] = [0, 1, 0, 1]
+    starts["start"] = [sample_starts(scenarios[m], 1, rng)[0] for m in starts["map"]]
+    return spec, genomes, starts
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+def test_a_bad_genome_loses_and_spoils_nothing(scenarios, task, poison):
+    spec, genomes, starts = task
+    limits = Limits(500.0, 800)
+    clean, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
+    assert (clean["distance"] > 1.0).any()
+    for gene in (0, spec.size // 2, spec.size - 1):
+        spoilt = genomes.copy()
+        spoilt[1, gene] = poison
+        spoilt[4] = math.nan
+        results, _ = evaluate(spec, spoilt, scenarios, starts, limits, CONFIG)
+        others = [0, 2, 3, 5]
+        assert results[others].tobytes() == clean[others].tobytes()
+        assert (results["distance"][4] == 0.0).all()
+        assert (results["end"][4] == End.IDLE).all()
+        assert np.isfinite(results["distance"]).all()
+        if math.isnan(poison):
+            assert (results["distance"][1] == 0.0).all()
+
+
+def test_results_do_not_depend_on_the_company(scenarios, task):
+    spec, genomes, starts = task
+    limits = Limits(500.0, 800)
+    together, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
+    for i in range(len(genomes)):
+        for e in range(len(starts)):
+            alone, _ = evaluate(spec, genomes[i : i + 1], scenarios, starts[e : e + 1], limits, CONFIG)
+            assert alone[0, 0].tobytes() == together[i, e].tobytes()
