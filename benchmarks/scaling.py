@@ -80,7 +80,11 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dic
 
 
 def last_generations(
-    folder: Path, settings: EvolveSettings, maps: Maps, state: tuple[dict[str, np.ndarray], dict[str, Any]], workers: int
+    folder: Path,
+    settings: EvolveSettings,
+    maps: Maps,
+    state: tuple[dict[str, np.ndarray], dict[str, Any]],
+    workers: int,
 ) -> dict[str, list[float]]:
     """Evolve LAST generations from a state. Returns figures of each."""
     pool = RayPool(workers, maps.build)
@@ -137,7 +141,9 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
-    parser.add_argument("--generations", type=int, default=EvolveSettings().generations, help="of the default run, at most")
+    parser.add_argument(
+        "--generations", type=int, default=EvolveSettings().generations, help="of the default run, at most"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the default run")
     options = parser.parse_args()
     settings = EvolveSettings(generations=options.generations, seed=options.seed)

@@ -1,4 +1,6 @@
-"""Car-steps per second on one pinned core, and what surrounds them: `python benchmarks/throughput.py [--json] [--peers]`.
+"""Car-steps per second on one pinned core, and what surrounds them.
+
+    python benchmarks/throughput.py [--json] [--peers]
 
 Ego cars only, resets included, a trained policy at the wheel over several maps, medians of several runs:
 
@@ -7,8 +9,9 @@ Ego cars only, resets included, a trained policy at the wheel over several maps,
     breed_512x1000_ms    512 children of about 1,000 genes, half of them of two parents, 3 % of the genes mutated
     map_ms               a new map from its seed
 
-`--json` prints these and the speeds driven as one flat object of numbers. `--peers` adds steps per second of other
-environments on the same core, with random actions, where they are installed (`pip install highway-env "gymnasium[box2d]"`).
+`--json` prints these and the speeds driven as one flat object of numbers. `--peers` adds the steps per second of other
+environments on the same core under random actions, where they are installed beside this project
+(`pip install highway-env "gymnasium[box2d]"`); they are no dependencies.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -41,13 +45,10 @@ MAPS = 8
 EPISODES = 16  # of the rollout, over all maps
 CARS = 1024  # of the vector environment
 SPEED = 6.0  # m/s, that the policy must drive at: crashing and parked cars are cheap
-PEERS = {  # what a peer is called here: the module it needs, its id and arguments
-    "highway_env": ("highway_env", "highway-v0", {}),
-    "highway_env_grid": (
-        "highway_env",
-        "highway-v0",
-        {"config": {"observation": {"type": "OccupancyGrid"}, "action": {"type": "DiscreteMetaAction"}}},
-    ),
+# What a peer is called here: the module it needs, its id and its arguments.
+PEERS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "highway_env_grid": ("highway_env", "highway-v0", {"config": {"observation": {"type": "OccupancyGrid"}}}),
+    "highway_env_lidar": ("highway_env", "highway-v0", {"config": {"observation": {"type": "LidarObservation"}}}),
     "car_racing": ("Box2D", "CarRacing-v3", {"continuous": False}),
 }
 
@@ -87,7 +88,7 @@ def _actions(packed, layers, ranges, speeds, actions):
 
 
 def vector_env_rays(champion: Champion, maps: list[Scenario], runs: int, steps: int = 200) -> tuple[float, float]:
-    """(car-steps/s, m/s driven) of `env.step`; the network's own time is left out, steps that only reset do not count."""
+    """(car-steps/s, m/s driven) of `env.step`: without the network's own time; a step that only resets is none."""
     env = gridsim.env.GridSimVectorEnv(CARS, maps=maps, config=champion.sim)
     layers = PolicySpec.parse(champion.policy).layers
     packed = np.empty(packed_size(layers), dtype=np.float32)
@@ -115,7 +116,7 @@ def vector_env_rays(champion: Champion, maps: list[Scenario], runs: int, steps: 
 
 
 def breed_ms(runs: int) -> float:
-    """Milliseconds to breed 512 children of 1,011 genes from a mating pool of 64."""
+    """Milliseconds to breed 512 children of 1,011 genes from a mating pool of 64 parents."""
     spec = PolicySpec.parse("mlp:17,17")
     rng = np.random.default_rng(0)
     parents = rng.normal(size=(64, spec.size)).astype(np.float32)

@@ -21,8 +21,10 @@ from rich.console import Console
 from cluster.settings import EvolveSettings, SettingsError
 
 if TYPE_CHECKING:
+    from cluster.coordinator import Maps
     from cluster.pool import WorkerPool
     from cluster.run import RunFolder, Session
+    from cluster.tracking import Tracker
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
@@ -321,17 +323,14 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
 
 
 def _run(
-    console: Console, run: RunFolder, pool: WorkerPool, maps: object, tracker: object, flags: EvolveFlags, started: float
+    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: EvolveFlags, started: float
 ) -> str:  # fmt: skip
     """Evolve and finish. Returns the closing words."""
     from cluster import progress, report
     from cluster.champion import load_champion
-    from cluster.coordinator import Maps
     from cluster.run import Session
-    from cluster.tracking import Tracker, TrackingError
+    from cluster.tracking import TrackingError
 
-    assert isinstance(maps, Maps)
-    assert isinstance(tracker, Tracker)
     initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
     session = Session(run, pool, maps, tracker, started, initial)
     maps.ahead(session.evolution.curriculum.map_seeds[:3])

@@ -207,9 +207,10 @@ class Evolution:
         best = np.argsort(-np.nan_to_num(rank, nan=-np.inf), kind="stable")[: curriculum.config.racers]
         race_maps, race_episodes = curriculum.race(generation)
         racers = self.genetic.genomes(best)
-        raced = self.drive("race", racers, race_maps, race_episodes, limits, curriculum.config.rewind)
+        race_limits = curriculum.race_limits()
+        raced = self.drive("race", racers, race_maps, race_episodes, race_limits, curriculum.config.rewind)
         n, m = len(episodes), len(race_episodes)
-        race_score = (n * score[best] + m * self._score(raced, limits.target)) / (n + m)
+        race_score = (n * score[best] + m * self._score(raced, race_limits.target)) / (n + m)
         order = np.argsort(-race_score, kind="stable")
         total = rank - rank.max() - 1.0  # below 0
         total[best[order]] = np.arange(len(order), 0, -1)

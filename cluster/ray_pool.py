@@ -27,6 +27,7 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,7 @@ _OWN_ENVIRONMENT = {
     "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it just misses its object store, and then sleeps 1 s
     "RAY_raylet_client_num_connect_attempts": "500",
     "RAY_prestart_worker_first_driver": "0",  # with it, init waits for ever where a worker dies as it starts
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "10",  # so long its agents outlive a Ray that was killed
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
 }
@@ -143,7 +145,6 @@ class RayPool:
         for name, value in _ENVIRONMENT.items():
             os.environ.setdefault(name, value)
         self.address = None if address is None else check_address(address)
-        self._auto = address == "auto"
         self._asked = workers
         self._build_map = build_map
         self._factory = worker_factory
@@ -255,6 +256,7 @@ class RayPool:
 
             if ray.is_initialized():
                 raise PoolError("Ray is in use in this process already; close the other pool first")
+            logging.getLogger("ray").setLevel(logging.CRITICAL)
             ray_worker: Any = importlib.import_module("ray._private.worker")
             ray_worker._worker_logs_enabled = False  # else it prints each worker's death, `log_to_driver` or not
             if self.address is None:
@@ -262,7 +264,7 @@ class RayPool:
                 self._map_bytes = store * MAP_BYTES // STORE_BYTES
                 self._session = _start_own(self._asked, store)
             else:
-                _join(self.address, self._auto)
+                _join(self.address)
             self._connected = True
             self._actor_class = ray.remote(num_cpus=1)(_Actor)
             for number in range(self._asked):
@@ -342,10 +344,11 @@ class RayPool:
 def check_address(address: str) -> str:
     """The `host:port` of the Ray cluster meant by `address` (`host:port`, or `auto`: RAY_ADDRESS, else this machine's).
 
-    Raises PoolError, one line, within some seconds where no Ray can be there. (Unprobed, Ray hangs for minutes.)
+    Raises PoolError, one line, within 3 s where no Ray answers or it would not let us in. (Ray itself would try for
+    20 s to minutes, and print a warning for each second.)
     """
     if address == "auto":
-        address = os.environ.get("RAY_ADDRESS", "auto")
+        address = os.environ.get("RAY_ADDRESS") or "auto"
     if address == "auto":
         logging.getLogger("ray").setLevel(logging.CRITICAL)
         services = importlib.import_module("ray._private.services")
@@ -361,17 +364,59 @@ def check_address(address: str) -> str:
     try:
         with socket.create_connection((host.strip("[]"), int(port)), PROBE_S) as connection:
             if os.environ.get("RAY_USE_TLS", "0") in ("", "0"):
-                # Ray speaks gRPC: HTTP/2's preface with empty settings is answered by settings (a frame of type 4).
-                connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0")
-                answer = connection.recv(9)
-                if answer[3:4] != b"\4":
+                answer = _ask_for_cluster_id(connection)
+                if b"InvalidAuthToken" in answer and not _has_token(host):
                     raise PoolError(
-                        f"what answers at {address} is no Ray cluster; is this the port of `ray start --head`?"
+                        f"the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to "
+                        "what `ray get-auth-token` says on its head"
                     )
+                if b"grpc-status" not in answer:
+                    raise PoolError(f"what answers at {address} is no Ray cluster; is that its head's port?")
     except OSError as error:
-        reason = "no answer within 3 s" if isinstance(error, TimeoutError) else error.strerror or str(error)
+        reason = f"no answer within {PROBE_S:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
         raise PoolError(f"no Ray cluster answers at {address}: {reason}; is `ray start --head` up?") from None
     return address
+
+
+def _ask_for_cluster_id(connection: socket.socket) -> bytes:
+    """Ray's simplest request (gRPC over HTTP/2) written by hand, without a token; returns all of the answer."""
+
+    def frame(kind: int, flags: int, stream: int, body: bytes = b"") -> bytes:
+        return len(body).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + body
+
+    headers = {
+        ":method": "POST",
+        ":scheme": "http",
+        ":path": "/ray.rpc.NodeInfoGcsService/GetClusterId",
+        ":authority": "ray",
+        "te": "trailers",
+        "content-type": "application/grpc",
+    }
+    literal = b"".join(bytes([0, len(k)]) + k.encode() + bytes([len(v)]) + v.encode() for k, v in headers.items())
+    message = frame(4, 0, 0) + frame(1, 4, 1, literal) + frame(0, 1, 1, bytes(5))  # settings, headers, an empty message
+    connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + message)
+    answer, until = b"", time.monotonic() + PROBE_S
+    with contextlib.suppress(TimeoutError):
+        while b"grpc-status" not in answer and (left := until - time.monotonic()) > 0:
+            connection.settimeout(left)
+            part = connection.recv(4096)
+            if not part:
+                break
+            answer += part
+    return answer
+
+
+def _has_token(host: str) -> bool:
+    """Whether Ray has a token to show there. It looks for one by itself on the own machine only, and so do we."""
+    if "RAY_AUTH_MODE" in os.environ:
+        return os.environ["RAY_AUTH_MODE"].lower() == "token"
+    family, kind, _, _, name = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind) as probe:
+        try:
+            probe.bind(name)  # possible for an address of this machine alone
+        except OSError:
+            return False
+    return any(name in os.environ for name in _AUTH_ENVIRONMENT) or (Path.home() / ".ray/auth_token").exists()
 
 
 def _start_own(workers: int, store_bytes: int) -> str:
@@ -395,11 +440,15 @@ def _start_own(workers: int, store_bytes: int) -> str:
     return context.address_info["session_dir"]
 
 
-def _join(address: str, auto: bool) -> None:
-    """Connect to a cluster. Ray looks for its token by itself only where it is asked to look for the cluster too."""
+def _join(address: str) -> None:
+    """Connect to a cluster that was found to let us in."""
     import ray
 
-    ray.init(address="auto" if auto else address, log_to_driver=False, logging_level=logging.CRITICAL)
+    if _has_token(address.rpartition(":")[0]):
+        with contextlib.suppress(ImportError, AttributeError):  # what Ray does where it is asked to find the cluster
+            setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
+            setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
+    ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """A run's folder and its life: prepare or resume, evolve, save after every generation, close.
 
 The order of saving, after each generation: the checkpoint (which holds the history), history.csv made from it, the
-MLflow row. Whatever kills the process, the folder holds the last whole generation, and a resumed run gives the same champion.
+MLflow row. Whatever kills the process, the folder holds the last whole generation, and a resumed run gives the same
+champion.
 """
 
 from __future__ import annotations

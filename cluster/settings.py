@@ -53,7 +53,7 @@ class EvolveSettings:
     """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
-    until: float = 0.98
+    until: float = 0.97
     """Stop when the champion succeeds in this share of validation episodes; above 1: never."""
 
     def curriculum(self) -> CurriculumConfig:

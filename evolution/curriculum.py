@@ -31,25 +31,25 @@ class CurriculumConfig:
     """The curriculum's parameters."""
 
     maps: int = 16  # training maps
-    starts: int = 2  # new episodes a generation
+    starts: int = 6  # new episodes a generation
     crash_starts: int = 6  # short episodes a generation that start before a crash of a recent leader
-    crash_target: float = 150.0  # m, their length
+    crash_target: float = 120.0  # m, their length
     crash_memory: int = 64  # crashes that are remembered
     rewind: int = 64  # control steps before the crash
     racers: int = 24  # members raced on more episodes
-    race_episodes: int = 8
+    race_episodes: int = 16
     leaders: int = 4  # racers whose crashes are remembered
     first_target: float = 150.0  # m, length of the first episodes
-    last_target: float = 1000.0  # m
-    growth: float = 0.5  # share of the race's episodes in which the best 8 must come far before the target doubles
-    far: float = 0.85  # of the target
-    pace: float = 6.5  # m/s that the time limit of a training episode allows for
+    last_target: float = 400.0  # m; what is learned further on is learned as well from another start
+    race_stretch: float = 2.5  # length of a race's episodes, in targets
+    growth: float = 0.6  # share of the race's episodes in which the best 8 must reach the target before it doubles
+    pace: float = 7.0  # m/s that the time limit of a training episode allows for
     slack: float = 3.0  # s, added to it
     validation_target: float = 300.0  # m, from which on champions are looked for
     contenders: int = 4  # racers that are validated each generation
     first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
-    champion_pace: float = 5.75  # m/s, below which a validation episode is no success
+    champion_pace: float = 5.6  # m/s, below which a validation episode is no success
 
 
 def spread_starts(
@@ -93,6 +93,11 @@ class Curriculum:
     def limits(self) -> Limits:
         """Of training episodes."""
         return Limits(self.target, self._steps(self.target))
+
+    def race_limits(self) -> Limits:
+        """Of a race's episodes: longer, so that they tell the best from the good."""
+        target = min(self.config.race_stretch * self.target, self.goal)
+        return Limits(target, self._steps(target))
 
     def _steps(self, target: float) -> int:
         """Control steps that a training episode of so many m is given."""
@@ -164,7 +169,7 @@ class Curriculum:
         if new:
             self.crashes = np.concatenate([self.crashes, np.array(new, dtype=EPISODE)])[-self.config.crash_memory :]
         best = results[order[:8]]
-        if (best["distance"] >= self.config.far * self.target).mean() >= self.config.growth:
+        if (best["distance"] >= self.target).mean() >= self.config.growth:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
     def validation(self) -> tuple[list[int], np.ndarray]:

@@ -1,15 +1,15 @@
 """The two elements of fitness, their bounds, and how members are ranked by them.
 
 Element one is the distance travelled; element two the distance travelled at a forward speed within the scenario's
-interval, so that speed counts only where it is bounded. Both are shares of the episode's target, mostly logarithmic (the first
-bend is worth as much as the last kilometre) and in part linear (so that the last kilometre is worth driving well).
+interval, so that speed counts only where it is bounded. Both are shares of the episode's target, mostly logarithmic
+(the first bend is worth as much as the last kilometre) and in part linear (the last kilometre is worth driving well).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-LINEAR_SHARE = 0.3  # of an element; without it, who crawls through the last kilometre has nearly all
+LINEAR_SHARE = 0.4  # of an element; without it, who crawls through the last kilometre has nearly all
 PACED_SHARE = 0.7  # of the scalar's distance that must be driven at a speed within the interval
 
 

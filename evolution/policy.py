@@ -70,7 +70,7 @@ def encode(ranges, speed, inputs):
 
 @njit
 def squash(x):
-    """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere and exact in its limits."""
+    """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere."""
     x = min(max(x, _F(-4.97)), _F(4.97))
     s = x * x
     return (
@@ -96,8 +96,8 @@ def packed_size(layers):
 def pack(genome, layers, packed):
     """Lay a genome out for `forward`.
 
-    A layer's outputs stand in blocks of 8; in each block come first the biases, then a row for each input. Missing units
-    have weight 0.
+    A layer's outputs stand in blocks of 8; in each block come first the biases, then a row for each input. Missing
+    units have weight 0.
     """
     packed[:] = _F(0.0)
     at, to = 0, 0

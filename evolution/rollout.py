@@ -58,7 +58,7 @@ class Limits:
 
 @njit
 def _run(road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring):
-    """One episode of one car. ring float32 [n, FIELDS] is left holding its last n states: that of step k in row k % n."""
+    """One episode of one car. ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n."""
     place(road, start, car, visits)
     keep = ring.shape[0]
     end = 0

@@ -1,7 +1,7 @@
 """Numba, configured once: where compiled kernels are cached and how they are compiled.
 
 Numba's own on-disk cache does not notice that a function in *another* file changed. So the cache lives in a folder
-whose name is a digest of every kernel source, of the constants and of the versions: an edit anywhere means a new folder.
+whose name is a digest of every kernel source, of the constants and of the versions: an edit anywhere, a new folder.
 `NUMBA_DISABLE_JIT=1` runs every kernel as plain Python.
 """
 

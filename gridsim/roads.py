@@ -80,7 +80,7 @@ class Lanes:
 
 @njit(nogil=True)
 def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
-    """Greatest (half width - distance) at each node of the grid, floor FIELD_FLOOR; each strip touches its band only."""
+    """Greatest (half width - distance) at each node, FIELD_FLOOR at least; each strip touches its band only."""
     field = np.full((rows, columns), _F(FIELD_FLOOR), dtype=np.float32)
     reach = -FIELD_FLOOR
     for k in range(lines.shape[0] + arcs.shape[0]):

@@ -163,13 +163,13 @@ def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, flo
                 if exit != entry:
                     ways.setdefault((tile, entry), []).append(len(points))
                     leads.append((_neighbour(tile, exit), (exit + 2) % 4))
-                    points.append((_around if roundabout else _through)(entry, exit) + [x, y])
+                    points.append((_around if roundabout else _through)(entry, exit) + np.array([x, y]))
     successors = np.full((len(points), 3), -1, dtype=np.int32)
     for k, lead in enumerate(leads):
         successors[k, : len(ways[lead])] = ways[lead]
     lanes = Lanes(
         points=np.concatenate(points).astype(np.float32),
-        offsets=np.cumsum([0] + [len(p) for p in points]).astype(np.int32),
+        offsets=np.cumsum([0, *map(len, points)]).astype(np.int32),
         successors=successors,
     )
     strips = Strips(np.array(lines, dtype=np.float64).reshape(-1, 5), np.array(arcs, dtype=np.float64).reshape(-1, 6))

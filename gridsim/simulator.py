@@ -193,33 +193,28 @@ def control(road, constants, car, visits, action, target, max_steps):
     return end
 
 
-@njit(nogil=True)
-def _place_all(atlas, constants, fan, order, which, rows, starts, cars, visits, ranges):
-    """Put cars `which` [k] on maps `rows` [k] of the atlas at `starts` [k, 5]; `ranges` [k, rays] is what they see."""
-    beams = np.empty((3, LANES), dtype=np.float32)
-    here = rows[order[0]]
-    road = road_of(atlas, here)
+@njit
+def _place_some(road, constants, fan, order, which, starts, cars, visits, beams, ranges):
     for k in order:
-        if rows[k] != here:
-            here = rows[k]
-            road = road_of(atlas, here)
         i = which[k]
         place(road, starts[k], cars[i], visits[i])
         look(road, constants, fan, cars[i], beams, ranges[k])
 
 
 @njit(nogil=True)
-def _control_all(
-    atlas, constants, fan, order, rows, actions, target, max_steps, cars, visits, ends, ranges, speeds, progress
-):
-    """One control period of every car, taken in `order`, which is by map. Who has ended stands still."""
+def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, ranges):
+    """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
     beams = np.empty((3, LANES), dtype=np.float32)
-    here = rows[order[0]]
-    road = road_of(atlas, here)
+    for row, first, last in runs:
+        road = road_of(atlas, row)
+        _place_some(road, constants, fan, order[first:last], which, starts, cars, visits, beams, ranges)
+
+
+@njit
+def _control_some(
+    road, constants, fan, order, actions, target, max_steps, cars, visits, ends, beams, ranges, speeds, progress
+):
     for i in order:
-        if rows[i] != here:
-            here = rows[i]
-            road = road_of(atlas, here)
         car = cars[i]
         progress[i] = _ZERO
         if ends[i] == 0:
@@ -228,6 +223,29 @@ def _control_all(
             progress[i] = car[DISTANCE] - before
         look(road, constants, fan, car, beams, ranges[i])
         speeds[i] = car[SPEED]
+
+
+@njit(nogil=True)
+def _control_all(
+    atlas, constants, fan, order, runs, actions, target, max_steps, cars, visits, ends, ranges, speeds, progress
+):
+    """One control period of every car; who has ended stands still.
+
+    Cars are taken in `order`; runs int64 [maps, 3] says which map of the atlas a stretch of it is on: row, from, to.
+    """
+    beams = np.empty((3, LANES), dtype=np.float32)
+    for row, first, last in runs:
+        _control_some(
+            road_of(atlas, row), constants, fan, order[first:last], actions, target, max_steps, cars, visits, ends,
+            beams, ranges, speeds, progress,
+        )
+
+
+def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cars sorted by their maps `rows` [n]: (order int64 [n], runs int64 [maps, 3]), as `_control_all` reads them."""
+    order = np.argsort(rows, kind="stable")
+    names, first = np.unique(rows[order], return_index=True)
+    return order, np.stack([names, first, np.append(first[1:], len(rows))], axis=1).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -286,8 +304,8 @@ class Simulator:
         )
         self._atlas: Atlas | None = None  # maps that cars are on; None before the first reset
         self._shown: list[Scenario] = []  # what the atlas shows
-        self._rows = np.full(cars, -1, dtype=np.int32)  # each car's map in the atlas, -1 before its first reset
-        self._order = np.arange(cars)  # the cars, sorted by map
+        self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
+        self._order, self._runs = _by_map(self._rows)
 
     def __len__(self) -> int:
         return len(self.state.ends)
@@ -329,9 +347,8 @@ class Simulator:
             self._atlas,
             self._constants,
             self._fan,
-            np.argsort(rows, kind="stable"),
+            *_by_map(rows),
             cars,
-            rows,
             starts,
             state.cars,
             state.visits,
@@ -341,11 +358,11 @@ class Simulator:
         state.ends[cars] = End.RUNNING
         if (self._rows[cars] != rows).any():
             self._rows[cars] = rows
-            self._order = np.argsort(self._rows, kind="stable")
+            self._order, self._runs = _by_map(self._rows)
         return ranges, starts[:, 3].copy()
 
     def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:
-        """Rows int32 [k] in the atlas of maps [k]. It is made anew if one is missing, of these alone for `everyone`.
+        """Rows int64 [k] in the atlas of maps [k]. It is made anew if one is missing, of these alone for `everyone`.
 
         One car alone is always on an atlas of one map, which is no copy.
         """
@@ -356,7 +373,7 @@ class Simulator:
             self._shown = list(wanted.values()) if everyone else shown + missing
             self._atlas = make_atlas([scenario.road for scenario in self._shown])
         row = {id(scenario): k for k, scenario in enumerate(self._shown)}
-        return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int32)
+        return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int64)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
@@ -367,7 +384,7 @@ class Simulator:
         Raises: ValueError with one line for anything but an action for each car; RuntimeError before the first reset.
         """
         n = len(self)
-        if self._rows.min() < 0:
+        if self._runs[0, 0] < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
         actions = checked_actions(actions, n)
         state = self.state
@@ -378,7 +395,7 @@ class Simulator:
             self._constants,
             self._fan,
             self._order,
-            self._rows,
+            self._runs,
             actions,
             self._limit,
             self.max_steps,

@@ -1,7 +1,7 @@
 """Vector code for `sensors.march`: 32 rays in lockstep, emitted as LLVM vectors.
 
-Same arithmetic as the plain kernel beside it in `sensors`, lane by lane; tests hold one against the other. LLVM turns the
-vectors of 32 into whatever the machine has.
+Same arithmetic as the plain kernel in `sensors`, lane by lane; tests hold one against the other. LLVM turns the vectors
+of 32 into whatever the machine has.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -246,7 +246,7 @@ def _in_annular_sector(p: np.ndarray, d: np.ndarray, arcs: np.ndarray) -> list[t
 # --- The car ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass
+@dataclass(frozen=True)
 class Car:
     """A car and its books."""
 
@@ -302,23 +302,21 @@ def on_arc(config: SimConfig, x: float, y: float, heading: float, kappa: float, 
     )
 
 
-def advance(config: SimConfig, car: Car, acceleration: float) -> tuple[Car, np.ndarray, np.ndarray]:
+def advance(config: SimConfig, car: Car, acceleration: float) -> tuple[Car, np.ndarray]:
     """One control period with the car's present steering.
 
-    Returns: (car afterwards, poses [n, 3] at which its outline is looked at, m driven up to each [n]); the last pose is
-    that at the period's end.
+    Returns: (car afterwards, the moments at which its outline is looked at, [n, 5]: x, y, heading, speed, m driven);
+    the last of them is the end of the period.
     """
     dt = config.episode.control_period
     kappa = curvature(config, car.speed, car.steering)
     fastest = max(abs(car.speed), abs(car.speed + acceleration * dt))
-    looks = math.floor(fastest * dt / CHECK_EVERY) + 1
-    poses, driven = [], []
-    speed = car.speed
-    for k in range(1, looks + 1):
-        s, speed = path_length(config, car.speed, acceleration, dt * k / looks)
-        driven.append(s)
-        poses.append(on_arc(config, car.x, car.y, car.heading, kappa, s))
-    return Car(*poses[-1], speed, car.steering), np.array(poses), np.array(driven)
+    n = math.floor(fastest * dt / CHECK_EVERY) + 1
+    looks = []
+    for k in range(1, n + 1):
+        s, speed = path_length(config, car.speed, acceleration, dt * k / n)
+        looks.append((*on_arc(config, car.x, car.y, car.heading, kappa, s), speed, s))
+    return Car(*looks[-1][:4], car.steering), np.array(looks)
 
 
 # --- The episode -----------------------------------------------------------------------------------------------------
@@ -412,23 +410,23 @@ def drive(
 ) -> Drive:
     """Drive a whole episode from start (x, y, heading, speed, steering) under given actions."""
     car = Car(*map(float, start))
-    cars, looks, driven = [], [], []
+    steps, steering = [], []
     for action in actions:
-        acceleration, car.steering = act(config, int(action), car.speed, car.steering)
-        car, poses, lengths = advance(config, car, acceleration)
-        cars.append(car)
-        looks.append(poses)
-        driven.append(lengths)
-    on_road = road.outline_on_road(np.concatenate(looks), config.vehicle.length / 2, config.vehicle.width / 2)
+        acceleration, angle = act(config, int(action), car.speed, car.steering)
+        car, looks = advance(config, replace(car, steering=angle), acceleration)
+        steps.append(looks)
+        steering.append(angle)
+    every = np.concatenate(steps)
+    on_road = road.outline_on_road(every[:, :3], config.vehicle.length / 2, config.vehicle.width / 2)
     books = Books(config, road.width, road.height, interval, target, max_steps)
     books.begin(float(start[0]), float(start[1]))
     rows, end, at = [], "", 0
-    for car, poses, lengths in zip(cars, looks, driven, strict=True):
-        off = np.flatnonzero(~on_road[at : at + len(poses)])
-        at += len(poses)
-        last = off[0] if off.size else len(poses) - 1
-        end = books.enter(poses[last, 0], poses[last, 1], car.speed, float(lengths[last]), bool(off.size))
-        rows.append((*poses[last], car.speed, car.steering, books.distance, books.paced))
+    for looks, angle in zip(steps, steering, strict=True):
+        off = np.flatnonzero(~on_road[at : at + len(looks)])
+        at += len(looks)
+        x, y, heading, speed, driven = looks[off[0] if off.size else -1]
+        end = books.enter(x, y, speed, driven, bool(off.size))
+        rows.append((x, y, heading, speed, angle, books.distance, books.paced))
         if end:
             break
     table = np.array(rows)

@@ -180,7 +180,15 @@ def test_existing_cluster(reference, tmp_path):
     port = 6399
     env = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
     ray = [str(BIN / "ray")]
-    head = ["start", "--head", "--num-cpus", "2", f"--port={port}", "--include-dashboard=false", "--disable-usage-stats"]
+    head = [
+        "start",
+        "--head",
+        "--num-cpus",
+        "2",
+        f"--port={port}",
+        "--include-dashboard=false",
+        "--disable-usage-stats",
+    ]
     subprocess.run(
         [*ray, *head, "--object-store-memory=200000000", f"--temp-dir={tmp_path}/ray"], check=True, capture_output=True,
         env=env,
@@ -189,7 +197,9 @@ def test_existing_cluster(reference, tmp_path):
         done = evolve("--workers", "2", "--address", f"127.0.0.1:{port}", "--name", "a", *SMALL, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         assert summary(tmp_path / "runs/a")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
-        alive = subprocess.run([*ray, "status", f"--address=127.0.0.1:{port}"], capture_output=True, env=env, check=False)
+        alive = subprocess.run(
+            [*ray, "status", f"--address=127.0.0.1:{port}"], capture_output=True, env=env, check=False
+        )
         assert alive.returncode == 0  # the run left, the cluster stays
     finally:
         subprocess.run([*ray, "stop", "--force"], capture_output=True, env=env, check=False)
@@ -223,7 +233,11 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
 @pytest.mark.e2e
 def test_evaluate_says_what_the_run_said(reference):
     done = subprocess.run(
-        [str(BIN / "gridsim-evaluate"), "runs/ref", "--json"], cwd=reference, capture_output=True, text=True, check=False
+        [str(BIN / "gridsim-evaluate"), "runs/ref", "--json"],
+        cwd=reference,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == pytest.approx(summary(reference / "runs/ref")["held_out"])

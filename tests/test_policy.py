@@ -1,0 +1,172 @@
+"""Networks against NumPy in float64, and what a policy's text may be."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from evolution.policy import ACTIONS, BLOCK, INPUTS, PolicySpec, decide, encode, forward, pack, packed_size, squash
+
+F = np.float32
+TEXTS = ["mlp:6,7", "mlp:3", "mlp:16,16", "mlp:9,1,20", "mlp:8", "mlp:17,5,3,11", "mlp:1"]
+
+
+def kernel_outputs(spec, genome, inputs, junk=0.0):
+    packed = np.full(packed_size(spec.layers), junk, dtype=F)
+    pack(genome, spec.layers, packed)
+    scratch = np.full(2 * (spec.layers.max() + BLOCK), junk, dtype=F)
+    scratch[: spec.inputs] = inputs
+    at = int(forward(packed, spec.layers, scratch))
+    outputs = scratch[at : at + spec.outputs].copy()
+    scratch[:] = junk
+    scratch[: spec.inputs] = inputs
+    return outputs, decide(packed, spec.layers, scratch)
+
+
+def lambert(x):
+    """Lambert's continued fraction of tanh, seven levels: x / (1 + x2 / (3 + x2 / (5 + ... / 13)))."""
+    x = np.clip(x, -4.97, 4.97)
+    below = 13.0
+    for odd in (11.0, 9.0, 7.0, 5.0, 3.0, 1.0):
+        below = odd + x * x / below
+    return x / below
+
+
+def reference(spec, genome, inputs, activation):
+    """The textbook: for each layer weights [inputs, outputs], then biases [outputs]; float64."""
+    genome, x = genome.astype(float), inputs.astype(float)
+    sizes = [spec.inputs, *spec.hidden, spec.outputs]
+    for k, (n, m) in enumerate(itertools.pairwise(sizes)):
+        weights, biases, genome = genome[: n * m].reshape(n, m), genome[n * m : n * m + m], genome[n * m + m :]
+        x = x @ weights + biases
+        if k < len(spec.hidden):
+            x = activation(x)
+    assert genome.size == 0
+    return x
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_forward_is_numpys(text):
+    spec = PolicySpec.parse(text)
+    rng = np.random.default_rng(1)
+    worst = 0.0
+    for _ in range(50):
+        genome, inputs = rng.normal(size=spec.size).astype(F), rng.uniform(-1, 1, INPUTS).astype(F)
+        outputs, action = kernel_outputs(spec, genome, inputs)
+        expected = reference(spec, genome, inputs, lambert)
+        assert outputs == pytest.approx(expected, abs=3e-5)
+        assert action == int(outputs.argmax())
+        # The rational function stands for tanh: 2e-4 a unit, and what the layers after it make of that.
+        worst = max(worst, np.abs(outputs - reference(spec, genome, inputs, np.tanh)).max())
+    assert worst < 0.02
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_what_was_in_memory_before_does_not_matter(text):
+    """One member's not-a-numbers stay out of the next one's drive."""
+    spec = PolicySpec.parse(text)
+    rng = np.random.default_rng(2)
+    genome, inputs = rng.normal(size=spec.size).astype(F), rng.uniform(-1, 1, INPUTS).astype(F)
+    clean, spoilt = kernel_outputs(spec, genome, inputs), kernel_outputs(spec, genome, inputs, junk=math.nan)
+    assert clean[0].tobytes() == spoilt[0].tobytes()
+    assert clean[1] == spoilt[1] >= 0
+
+
+@pytest.mark.parametrize("text", ["mlp:6,7", "mlp:9,1,20"])
+def test_a_gene_that_is_not_a_number_is_no_action(text):
+    spec = PolicySpec.parse(text)
+    rng = np.random.default_rng(3)
+    genome, inputs = rng.normal(size=spec.size).astype(F), rng.uniform(0.1, 1, INPUTS).astype(F)
+    let_through = []
+    for gene in range(spec.size):
+        spoilt = genome.copy()
+        spoilt[gene] = math.nan
+        if kernel_outputs(spec, spoilt, inputs)[1] != -1:
+            let_through.append(gene)
+    assert let_through == []
+
+
+def test_the_first_of_equal_outputs_acts():
+    spec = PolicySpec.parse("mlp:3")
+    genome = np.zeros(spec.size, dtype=F)
+    inputs = np.zeros(INPUTS, dtype=F)
+    assert kernel_outputs(spec, genome, inputs)[1] == 0
+    for action in range(ACTIONS):
+        biased = genome.copy()
+        biased[-ACTIONS + action :] = 1.0
+        assert kernel_outputs(spec, biased, inputs)[1] == action
+
+
+@given(x=st.floats(-50, 50, width=32))
+def test_squash_is_nearly_tanh(x):
+    assert float(squash(F(x))) == pytest.approx(math.tanh(x), abs=2e-4)
+    assert float(squash(F(-x))) == -float(squash(F(x)))
+    assert abs(float(squash(F(x)))) <= 1.0
+
+
+def test_squash_never_falls():
+    x = np.linspace(-6, 6, 4001).astype(F)
+    y = np.array([squash(v) for v in x], dtype=float)
+    assert np.diff(y).min() > -2e-7
+    assert squash(F(math.inf)) == -squash(F(-math.inf)) == y[-1]
+    assert math.isnan(squash(F(math.nan)))
+    assert squash(F(0.0)) == 0.0
+
+
+def test_what_the_network_sees():
+    inputs = np.zeros(INPUTS, dtype=F)
+    ranges = np.linspace(0, 50, 31).astype(F)
+    encode(ranges, F(12.5), inputs)
+    r = ranges.astype(float)
+    assert inputs[:31] == pytest.approx(2 * r / (r + 8) - 1, abs=1e-6)
+    assert inputs[31] == pytest.approx(0.25, abs=1e-6)
+    assert inputs.min() == -1.0
+
+
+def test_sizes():
+    spec = PolicySpec.parse("mlp:6,7")
+    assert spec == PolicySpec()
+    assert spec.size == 311
+    assert spec.layers.tolist() == [32, 6, 7, 8]
+    assert spec.layers.dtype == np.int32
+    assert PolicySpec.parse("mlp:3").size == 33 * 3 + 4 * 8
+
+
+@given(hidden=st.lists(st.integers(1, 40), min_size=1, max_size=4))
+def test_text_and_back(hidden):
+    text = "mlp:" + ",".join(map(str, hidden))
+    spec = PolicySpec.parse(text)
+    assert str(spec) == text
+    assert spec.hidden == tuple(hidden)
+    sizes = [INPUTS, *hidden, ACTIONS]
+    assert spec.size == sum((n + 1) * m for n, m in itertools.pairwise(sizes))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "mlp",
+        "mlp:",
+        "mlp:0",
+        "mlp:6,0",
+        "mlp:-3",
+        "mlp:6,",
+        "mlp:,6",
+        "mlp:6 7",
+        "mlp:6.5",
+        "mlp:6,7\n",
+        "MLP:6",
+        "cnn",
+        "rnn:3",
+        "mlp:99999,99999",
+        "mlp:1000000",
+        " mlp:6",
+    ],
+)
+def test_other_texts_are_refused_in_one_line(text):
+    with pytest.raises(ValueError, match=r"^[^\n]+$"):
+        PolicySpec.parse(text)
