@@ -61,7 +61,7 @@ class Champion:
         """A Gymnasium environment on the champion's scenario, or another."""
         from gridsim.env import GridSimEnv
 
-        return GridSimEnv(scenario or self.scenario, config=self.sim, **options)
+        return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if that cannot be done."""

@@ -144,7 +144,8 @@ class Evolution:
         score = np.asarray(self.score(results, target), dtype=np.float64)
         if score.shape != (len(results),):
             raise ValueError(f"a fitness returns one number a member, [{len(results)}], not {score.shape}")
-        return np.where(np.isfinite(score), score, -1e300)
+        finite = np.isfinite(score)
+        return np.where(finite, score, score[finite].min(initial=0.0) - 1.0)
 
     def _mutation(self) -> Mutation:
         s = self.settings

@@ -58,7 +58,6 @@ _OWN_ENVIRONMENT = {
     "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it just misses its object store, and then sleeps 1 s
     "RAY_raylet_client_num_connect_attempts": "500",
     "RAY_prestart_worker_first_driver": "0",  # with it, init waits for ever where a worker dies as it starts
-    "RAY_gcs_rpc_server_reconnect_timeout_s": "10",  # so long its agents outlive a Ray that was killed
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
 }

@@ -177,7 +177,7 @@ def everything(given):
         "breed": lambda: have_children(given["genomes"]),
         "road": lay_a_road,
     }
-    done = {}
+    done: dict[str, np.ndarray] = {}
     for name, part in parts.items():
         try:
             done |= {f"{name}_{key}": value for key, value in part().items()}
@@ -196,7 +196,7 @@ def both(root, tmp_path_factory):
     given["start"] = sample_starts(scenario, 1, rng)[0]
     given["actions"] = np.array([0, 0, 4, 1, 5, 2, 2, 6, 4, 3, 0, 7, 7, 0, 5, 1, 4, 2, 0, 3, 0, 4, 4, 0, 1])
     given["genomes"] = rng.normal(size=(3, SPEC.size)).astype(F)
-    np.savez(folder / "given.npz", **given)
+    np.savez(folder / "given.npz", allow_pickle=False, **given)
     code = (
         "import sys, json, numpy as np; import numba; assert numba.config.DISABLE_JIT\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_jit\n"

@@ -1,0 +1,105 @@
+"""GridSim from Python: the three lines, evaluate, and a fitness of one's own."""
+
+import numpy as np
+import pytest
+
+from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
+from cluster.checkpoint import CheckpointError, save
+from cluster.settings import SettingsError
+from evolution.policy import PolicySpec
+from evolution.rollout import Limits, trajectory
+from gridsim.scenarios import build
+
+SMALL = EvolveSettings(population=32, generations=2, elites=2, seed=3)
+
+
+@pytest.fixture(scope="module")
+def champion():
+    return evolve(SMALL)[0]
+
+
+def test_load_drive_evaluate(champion, tmp_path):
+    champion.save(tmp_path / "champion.npz")
+    loaded = load_champion(tmp_path / "champion.npz")
+    assert loaded.genome.tobytes() == champion.genome.tobytes()
+    assert loaded.sim == champion.sim
+    env = loaded.make_env()
+    observation, _ = env.reset(seed=1)
+    for _ in range(20):
+        observation, _, terminated, truncated, _ = env.step(loaded.act(observation))
+        if terminated or truncated:
+            break
+    env.close()
+    figures = evaluate(loaded, episodes=8)
+    assert figures == evaluate(champion, "seamless", episodes=8)
+    assert figures["episodes"] == 8
+    assert figures["distance_m"] > 0.0
+
+
+def test_environment_and_rollout_drive_alike(champion):
+    """What a person sees in the environment is what evolution saw."""
+    scenario = build("seamless", 12)
+    env = champion.make_env()
+    start = np.array([*scenario.lanes.points[3], 0.0, 5.0, 0.0], dtype=np.float32)
+    direction = scenario.lanes.points[4] - scenario.lanes.points[3]
+    start[2] = np.arctan2(direction[1], direction[0])
+    spec = PolicySpec.parse(champion.policy)
+    result, _ = trajectory(spec, champion.genome, scenario, start, Limits(2000.0, 4000), champion.sim)
+    observation, _ = env.reset(seed=1, options={"map_seed": 12, "start": start})
+    steps, over, info = 0, False, {}
+    while not over:
+        observation, _, terminated, truncated, info = env.step(champion.act(observation))
+        steps, over = steps + 1, terminated or truncated
+    assert steps == int(result["steps"])
+    assert info["distance_m"] == pytest.approx(float(result["distance"]), abs=1e-3)
+
+
+def test_own_fitness_decides(champion):
+    """A fitness that rewards ending early breeds another champion, and is handed what it was promised."""
+    seen = []
+
+    def early(results, targets):
+        seen.append((results.dtype.names, results.shape, np.shape(targets)))
+        return -results["steps"].mean(axis=1).astype(float)
+
+    other, history = evolve(SMALL, fitness=early)
+    assert {"distance", "paced", "steps", "end"} <= set(seen[0][0])
+    assert seen[0][1][0] == 32
+    assert len(history) == 2
+    assert history[-1]["fitness/best"] < 0
+    assert other.genome.tobytes() != champion.genome.tobytes()
+
+
+def test_fitness_of_the_wrong_shape_is_said():
+    with pytest.raises(ValueError, match="one number a member"):
+        evolve(SMALL, fitness=lambda results, targets: results["steps"])
+
+
+def test_not_a_number_fitness_loses():
+    def some(results, targets):
+        score = results["distance"].mean(axis=1).astype(float)
+        score[::2] = np.nan
+        return score
+
+    champion, history = evolve(SMALL, fitness=some)
+    assert np.isfinite(champion.genome).all()
+    assert np.isfinite([row["fitness/best"] for row in history]).all()
+
+
+def test_bad_champions_are_refused(champion, tmp_path):
+    with pytest.raises(CheckpointError):
+        load_champion(tmp_path / "none.npz")
+    save(tmp_path / "short.npz", {"genome": champion.genome[:10]}, {"policy": "mlp:6,7", "scenario": "seamless"})
+    with pytest.raises(CheckpointError):
+        load_champion(tmp_path / "short.npz")
+    with pytest.raises(ValueError, match="unknown scenario"):
+        evaluate(champion, "moon")
+    with pytest.raises(ValueError, match="1 or more"):
+        evaluate(champion, episodes=0)
+    with pytest.raises(SettingsError):
+        evolve(EvolveSettings(population=4, elites=8))
+
+
+def test_champion_class_is_what_is_returned(champion):
+    assert isinstance(champion, Champion)
+    assert len(champion.sha256) == 64
