@@ -16,7 +16,7 @@ from gridsim.scenarios import Scenario
 BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
 Progress = Callable[[int, int], None]  # (members done, members in all)
 
-SMALLEST_CHUNK = 4  # members; below that the sending costs more than the waiting for the slowest
+SMALLEST_CHUNK = 4  # members
 
 
 class PoolError(Exception):
@@ -98,7 +98,7 @@ def new_outcome(task: Task, recipes: np.ndarray) -> Outcome:
     return Outcome(np.zeros((len(recipes), len(task.episodes)), dtype=task.row))
 
 
-def chunks(n: int, workers: int) -> list[slice]:
+def chunks(n: int, workers: int, smallest: int = SMALLEST_CHUNK) -> list[slice]:
     """Cut n members into chunks, about 8 for each worker at 512 members: large ones first, small ones last.
 
     Each takes half of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
@@ -107,7 +107,7 @@ def chunks(n: int, workers: int) -> list[slice]:
     cut: list[slice] = []
     at = 0
     while at < n:
-        size = max((n - at) // (2 * workers), SMALLEST_CHUNK)
+        size = max((n - at) // (2 * workers), smallest)
         cut.append(slice(at, min(at + size, n)))
         at += size
     return cut

@@ -32,7 +32,9 @@ from typing import Any
 
 import numpy as np
 
-from cluster.pool import BuildMap, Outcome, PoolError, Progress, chunks, describe, last_line, new_outcome
+from cluster.pool import (
+    SMALLEST_CHUNK, BuildMap, Outcome, PoolError, Progress, chunks, describe, last_line, new_outcome,
+)
 from cluster.worker import Task, Worker
 from evolution.breeding import RECIPE
 from gridsim.roads import freeze
@@ -41,6 +43,7 @@ from gridsim.scenarios import Scenario
 PROBE_S = 3.0
 CONNECT_S = 60.0
 QUEUE = 2  # chunks that a worker holds: one that it works on, one so that it need not wait for us
+WORTH_SENDING_S = 0.01  # of evaluation: ten times what it costs to send a chunk and to take in its results
 MAX_KILLS = 3  # workers that one chunk may cost
 MAX_FAILED_STARTS = 3  # in a row
 STORE_BYTES = 256 << 20  # of shared memory, taken page by page as it is used
@@ -153,6 +156,7 @@ class RayPool:
         self._map_bytes = MAP_BYTES
         self._serial = 0
         self._failed_starts = 0
+        self._smallest = SMALLEST_CHUNK
         self._session: str | None = None  # folder of our own Ray's logs
         self._failure: BaseException | None = None
         self._connected = self._troubled = False
@@ -174,7 +178,7 @@ class RayPool:
         self._wait_for_ray()
         recipes = freeze(recipes)
         outcome = new_outcome(task, recipes)
-        cut = chunks(len(recipes), self._asked)
+        cut = chunks(len(recipes), self._asked, self._smallest)
         todo = deque(range(len(cut)))
         kills: Counter[int] = Counter()
         done = 0
@@ -227,6 +231,9 @@ class RayPool:
                 nobody_since = time.monotonic()
             elif time.monotonic() - nobody_since > self._start_timeout_s:
                 raise PoolError(f"no worker came up within {self._start_timeout_s:g} s: {_capacity()}")
+        if done:  # where members are cheap, sending many small chunks costs more than waiting for a larger one
+            member_s = sum(outcome.busy_s.values()) / done
+            self._smallest = int(np.clip(WORTH_SENDING_S / max(member_s, 1e-9), SMALLEST_CHUNK, 8 * SMALLEST_CHUNK))
         outcome.wall_s = time.perf_counter() - started
         return outcome
 

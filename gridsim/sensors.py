@@ -23,7 +23,7 @@ from gridsim.roads import (
 )
 from gridsim.vector import LANES, march_intrinsic
 
-_F, _I, _U = np.float32, np.int32, np.uint32
+_F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
 _SCALE = _F(CELLS_PER_M)
 _UNIT = _F(1.0 / FIELD_UNITS)
 _FLOOR = _F(FIELD_FLOOR)
@@ -124,13 +124,16 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
     base = max(row, _I(0)) * _STRIDE
     known = _F(1.0 / START_UNITS) if row >= 0 else _F(0.0)
     rays = ranges.shape[0]
+    # Unsigned indices: a signed one might count from the end, and that check would keep this from being vector code.
+    zero, one, two, lanes = _N(0), _N(1), _N(2), _N(LANES)
     for block in range(0, fan.shape[1], LANES):
-        for r in range(LANES):
-            beams[0, r] = cosine * fan[0, block + r] - sine * fan[1, block + r]
-        for r in range(LANES):
-            beams[1, r] = sine * fan[0, block + r] + cosine * fan[1, block + r]
-        for r in range(LANES):
-            beams[2, r] = _F(road.start[_U(base + _I(bin0 + fan[2, block + r]))]) * known
+        at = _N(block)
+        for r in range(lanes):
+            beams[zero, r] = cosine * fan[zero, at + r] - sine * fan[one, at + r]
+        for r in range(lanes):
+            beams[one, r] = sine * fan[zero, at + r] + cosine * fan[one, at + r]
+        for r in range(lanes):
+            beams[two, r] = _F(road.start[_N(base) + _N(_I(bin0 + fan[two, at + r]))]) * known
         fast_march(road.field, columns, road.rows, px0, py0, reach, beams)
         for r in range(min(rays - block, LANES)):
             ranges[block + r] = beams[2, r]

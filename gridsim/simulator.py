@@ -236,8 +236,20 @@ def _control_all(
     beams = np.empty((3, LANES), dtype=np.float32)
     for row, first, last in runs:
         _control_some(
-            road_of(atlas, row), constants, fan, order[first:last], actions, target, max_steps, cars, visits, ends,
-            beams, ranges, speeds, progress,
+            road_of(atlas, row),
+            constants,
+            fan,
+            order[first:last],
+            actions,
+            target,
+            max_steps,
+            cars,
+            visits,
+            ends,
+            beams,
+            ranges,
+            speeds,
+            progress,
         )
 
 

@@ -73,7 +73,7 @@ def drive_task() -> tuple[Task, list[Scenario]]:
 
 
 @given(st.integers(0, 3000), st.integers(1, 64))
-def test_chunks_cover_all_members_once(n: int, workers: int):
+def test_chunks_cover_all_members_once(n: int, workers: int) -> None:
     cut = chunks(n, workers)
     assert [i for rows in cut for i in range(n)[rows]] == list(range(n))
     sizes = [rows.stop - rows.start for rows in cut]
@@ -82,7 +82,7 @@ def test_chunks_cover_all_members_once(n: int, workers: int):
 
 
 @pytest.mark.parametrize("workers", [1, 2, 4, 16])
-def test_chunks_let_nobody_wait_for_the_slowest(workers: int):
+def test_chunks_let_nobody_wait_for_the_slowest(workers: int) -> None:
     """Simulated with equal members: from the first worker that runs out to the last, at most two small chunks pass."""
     busy = [0] * workers
     for rows in chunks(512, workers):
@@ -91,12 +91,12 @@ def test_chunks_let_nobody_wait_for_the_slowest(workers: int):
     assert max(busy) - min(busy) <= 2 * SMALLEST_CHUNK
 
 
-def test_no_members_no_results():
+def test_no_members_no_results() -> None:
     outcome = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(0))
     assert outcome.results.shape == (0, 2)
 
 
-def test_results_are_in_the_recipes_order_and_progress_is_told():
+def test_results_are_in_the_recipes_order_and_progress_is_told() -> None:
     told: list[tuple[int, int]] = []
     pool = SerialPool(never_built, Answering)
     recipes = make_recipes(512)
@@ -109,7 +109,7 @@ def test_results_are_in_the_recipes_order_and_progress_is_told():
     assert 0 < sum(outcome.busy_s.values()) <= outcome.wall_s
 
 
-def test_a_failing_worker_ends_in_one_line_that_names_the_chunk():
+def test_a_failing_worker_ends_in_one_line_that_names_the_chunk() -> None:
     pool = SerialPool(never_built, Failing)
     with pytest.raises(PoolError) as caught:
         pool.evaluate(make_task(), make_recipes(512))
@@ -129,11 +129,11 @@ def test_a_failing_worker_ends_in_one_line_that_names_the_chunk():
         (MemoryError(), "MemoryError"),
     ],
 )
-def test_last_line(error: Exception, line: str):
+def test_last_line(error: Exception, line: str) -> None:
     assert last_line(error) == line
 
 
-def test_chunks_change_nothing_for_the_real_worker():
+def test_chunks_change_nothing_for_the_real_worker() -> None:
     """All at once, in the pool's chunks, and member by member: the same bits."""
     task, scenarios = drive_task()
     recipes = make_recipes(40)
@@ -147,7 +147,7 @@ def test_chunks_change_nothing_for_the_real_worker():
     assert seconds > 0
 
 
-def test_every_input_of_the_kernels_is_read_only():
+def test_every_input_of_the_kernels_is_read_only() -> None:
     """As it is when it comes out of an object store: Numba would compile once more for anything else."""
     seen: list[np.ndarray] = []
 
@@ -162,14 +162,14 @@ def test_every_input_of_the_kernels_is_read_only():
     assert all(not array.flags.writeable and array.flags.c_contiguous for array in seen)
 
 
-def test_closing_twice_is_fine():
+def test_closing_twice_is_fine() -> None:
     pool = SerialPool(never_built, Answering)
     assert pool.workers() == 1
     pool.close()
     pool.close()
 
 
-def test_the_serial_pool_needs_no_ray(root: os.PathLike):
+def test_the_serial_pool_needs_no_ray(root: os.PathLike) -> None:
     code = "import sys, cluster.pool; print('ray' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60)
     assert done.stdout == "False\n"

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import sysconfig
 import textwrap
 import threading
 import time
@@ -14,14 +15,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import psutil
+import psutil  # type: ignore[import-untyped]
 import pytest
+from test_pool import MAPS, Answering, drive_task, make_recipes, make_task, never_built
 
 from cluster.pool import PoolError, SerialPool, chunks
 from cluster.ray_pool import RayPool, check_address
 from cluster.worker import Task
 from gridsim.scenarios import Scenario
-from test_pool import MAPS, Answering, drive_task, make_recipes, make_task, never_built
 
 pytestmark = pytest.mark.e2e
 
@@ -84,19 +85,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("orders")
 
 
-@pytest.fixture(scope="module")
-def _pool(folder: Path) -> Iterator[RayPool]:
-    pool = RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder))
-    yield pool
-    pool.close()
-
-
-@pytest.fixture
-def pool(_pool: RayPool, folder: Path) -> RayPool:
-    """One pool for many tests (a start takes seconds), without orders."""
-    for path in folder.iterdir():
-        path.unlink()
-    return _pool
+class TestOnePool:
 
 
 def expected(n: int) -> bytes:
@@ -109,7 +98,7 @@ def gone(processes: list[psutil.Process], within_s: float = 10.0) -> list[psutil
     return alive
 
 
-def test_results_progress_and_what_is_sent(pool: RayPool):
+def test_results_progress_and_what_is_sent(pool: RayPool) -> None:
     told: list[tuple[int, int]] = []
     recipes = make_recipes(512)
     outcome = pool.evaluate(make_task(), recipes, lambda done, of: told.append((done, of)))
@@ -124,7 +113,7 @@ def test_results_progress_and_what_is_sent(pool: RayPool):
     assert len(set(pool.pids())) == pool.workers() <= 2
 
 
-def test_a_killed_worker_is_replaced_and_its_chunks_are_sent_again(pool: RayPool, folder: Path):
+def test_a_killed_worker_is_replaced_and_its_chunks_are_sent_again(pool: RayPool, folder: Path) -> None:
     (folder / "sleep-0").write_text("0.7")  # an elite's: in the first chunk
     pool.evaluate(make_task(), make_recipes(4))  # both have been up by now
     before = pool.pids()
@@ -147,16 +136,18 @@ def test_a_killed_worker_is_replaced_and_its_chunks_are_sent_again(pool: RayPool
     assert before[0] not in pool.pids()
 
 
-def test_a_member_that_kills_twice_is_sent_a_third_time(pool: RayPool, folder: Path):
+def test_a_member_that_kills_twice_is_sent_a_third_time(pool: RayPool, folder: Path) -> None:
     (folder / "kill-300").write_text("2")
     outcome = pool.evaluate(make_task(), make_recipes(512))
     assert outcome.results.tobytes() == expected(512)
     assert outcome.retries >= 2
 
 
-def test_a_chunk_that_kills_three_workers_ends_the_run(pool: RayPool, folder: Path):
+def test_a_chunk_that_kills_three_workers_ends_the_run(pool: RayPool, folder: Path) -> None:
     (folder / "kill-300").write_text("100")
-    with pytest.raises(PoolError, match=r"^chunk \d+ \(members \d+ to \d+\) killed its worker 3 times; .*died") as caught:
+    with pytest.raises(
+        PoolError, match=r"^chunk \d+ \(members \d+ to \d+\) killed its worker 3 times; .*died"
+    ) as caught:
         pool.evaluate(make_task(), make_recipes(512))
     assert "\n" not in str(caught.value)
     assert (folder / "kill-300").read_text() == "97"
@@ -164,9 +155,11 @@ def test_a_chunk_that_kills_three_workers_ends_the_run(pool: RayPool, folder: Pa
     assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512), "the pool goes on"
 
 
-def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayPool, folder: Path):
+def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayPool, folder: Path) -> None:
     (folder / "raise-100").touch()
-    with pytest.raises(PoolError, match=r"^a worker failed on chunk \d+ \(members \d+ to \d+\): ValueError: is not to be"):
+    with pytest.raises(
+        PoolError, match=r"^a worker failed on chunk \d+ \(members \d+ to \d+\): ValueError: is not to be"
+    ):
         pool.evaluate(make_task(), make_recipes(512))
     assert (folder / "calls").read_text().splitlines() == ["raise-100"]
     (folder / "raise-100").unlink()
@@ -175,10 +168,279 @@ def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayP
     assert outcome.retries == 0
 
 
-def test_only_one_pool_at_a_time(pool: RayPool):
+def test_only_one_pool_at_a_time(pool: RayPool) -> None:
     pool.evaluate(make_task(), make_recipes(4))
     second = RayPool(1, never_built, worker_factory=Answering)
     with pytest.raises(PoolError, match="in use in this process already"):
         second.evaluate(make_task(), make_recipes(4))
     second.close()
     assert pool.evaluate(make_task(), make_recipes(9)).results.tobytes() == expected(9)
+
+
+def test_any_number_of_workers_gives_the_serial_pools_bits() -> None:
+    """With the real worker on real maps, one of four killed on the way; and what its process holds."""
+    task, scenarios = drive_task()
+    recipes = make_recipes(200)
+    known = dict(zip(MAPS, scenarios, strict=True))
+    serial = SerialPool(lambda *name: known[name]).evaluate(task, recipes).results.tobytes()
+    for workers in (1, 2, 4):
+        pool = RayPool(workers, lambda *name: known[name])
+        try:
+            first = pool.evaluate(task, recipes)
+            assert first.results.tobytes() == serial
+            assert first.broadcast_bytes > sum(array.nbytes for s in scenarios for array in s.arrays().values())
+            if workers == 4:
+                os.kill(pool.pids()[0], signal.SIGKILL)
+            again = pool.evaluate(task, recipes)
+            assert again.results.tobytes() == serial
+            assert again.broadcast_bytes < task.parents.nbytes + 2000, "maps are sent once"
+            for pid in pool.pids():
+                assert psutil.Process(pid).memory_full_info().uss <= 220 << 20
+        finally:
+            processes = psutil.Process().children(recursive=True)
+            pool.close()
+        assert gone(processes) == []
+
+
+def test_what_a_worker_is_given_and_what_it_has_loaded() -> None:
+    task, scenarios = drive_task()
+    known = dict(zip(MAPS, scenarios, strict=True))
+    pool = RayPool(1, lambda *name: known[name], worker_factory=Inspecting)
+    try:
+        results = pool.evaluate(task, make_recipes(50)).results
+    finally:
+        pool.close()
+    assert (results["distance"] == 0).all(), f"a worker carries one of {BANNED}"
+    assert (results["paced"] == 0).all(), "an input is writable or not aligned"
+    assert (results["end"] == 1).all(), "Ctrl-C would reach a worker"
+    assert (results["steps"] == 1).all(), "a worker has more than one thread"
+
+
+def test_workers_that_cannot_start_are_given_up() -> None:
+    pool = RayPool(2, never_built, worker_factory=Unfit)
+    with pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: in this state"):
+        pool.evaluate(make_task(), make_recipes(20))
+    pool.close()
+
+
+def test_the_store_keeps_a_bounded_number_of_maps(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[int] = []
+
+    class Map:
+        def __init__(self, seed: int):
+            built.append(seed)
+            self.seed = seed
+
+        def arrays(self) -> dict[str, np.ndarray]:
+            return {"field": np.zeros(1 << 20, dtype=np.uint8)}
+
+    monkeypatch.setattr(pool, "_build_map", lambda _name, seed: Map(seed))
+    monkeypatch.setattr(pool, "_map_bytes", 3 << 20)
+    outcome = pool.evaluate(make_task(), make_recipes(0))
+    for seeds in ([0, 1, 2], [0, 1, 2], [3], [0, 1], [4, 5, 6, 7], [7]):
+        task = make_task(tuple(("seamless", seed) for seed in seeds))
+        pool._broadcast(task, outcome)
+        assert len(pool._maps) <= max(3, len(seeds))
+    assert built == [0, 1, 2, 3, 0, 1, 4, 5, 6, 7], "the one that was used longest ago goes first"
+
+
+RAY = Path(sysconfig.get_path("scripts")) / "ray"
+START = [RAY, "start", "--head", "--block", "--num-cpus=2", "--include-dashboard=false", "--object-store-memory=100000000"]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Callable[..., str]]:
+    """Start Ray as its users do, with two CPUs and nobody's token at hand; returns its address."""
+    heads: list[subprocess.Popen[bytes]] = []
+
+    def start(**environment: str) -> str:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        heads.append(
+            subprocess.Popen(
+                [*START, f"--port={port}"],
+                env=os.environ | {"HOME": str(tmp_path), "RAY_USAGE_STATS_ENABLED": "0"} | environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+        for _ in range(600):
+            time.sleep(0.1)
+            try:
+                check_address(f"127.0.0.1:{port}")
+            except PoolError as error:
+                if "wants its token" not in str(error):
+                    continue
+            break
+        return f"127.0.0.1:{port}"
+
+    yield start
+    for head in heads:
+        processes = [psutil.Process(head.pid), *psutil.Process(head.pid).children(recursive=True)]
+        head.terminate()
+        for process in gone(processes, 20):
+            process.kill()
+
+
+def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
+    cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    address = cluster(PYTHONPATH=str(Path(__file__).parent))
+    for name in (address, "auto"):
+        monkeypatch.setenv("RAY_ADDRESS", address)
+        pool = RayPool(4, never_built, name, worker_factory=Answering)
+        assert pool.address == address
+        outcome = pool.evaluate(make_task(), make_recipes(512))
+        assert outcome.results.tobytes() == expected(512)
+        while pool.workers() < 2:
+            assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
+        processes = [psutil.Process(pid) for pid in pool.pids()]
+        assert len(processes) == 2, "there are two CPUs"
+        pool.close()
+        assert gone(processes) == []
+        check_address(address)
+
+
+def test_a_cluster_that_wants_a_token(
+    cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    address = cluster(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0123456789abcdef" * 4)
+    with pytest.raises(
+        PoolError, match=rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
+    ):
+        check_address(address)
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    assert check_address(address) == address
+
+
+SCRIPT = """
+    import sys
+    from cluster.ray_pool import RayPool
+    from test_pool import make_recipes, make_task, never_built
+    from test_ray_pool import Slow
+
+    if __name__ == "__main__":
+        pool = RayPool(2, never_built, worker_factory=Slow)
+        try:
+            if sys.argv[1] == "busy":
+                pool.evaluate(make_task(), make_recipes(8))
+            sys.stdout.write("ready\\n")
+            sys.stdout.flush()
+            pool.evaluate(make_task(), make_recipes(int(sys.argv[2])))
+        except KeyboardInterrupt:
+            sys.exit(130)
+        finally:
+            pool.close()
+"""
+
+
+class Slow(Answering):
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        time.sleep(0.001 * len(recipes))
+        return super().evaluate(task, maps, recipes)
+
+
+@pytest.fixture
+def script(tmp_path: Path, root: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start a process of its own that holds a pool; returns when it says so."""
+    path = tmp_path / "holds_a_pool.py"
+    path.write_text(textwrap.dedent(SCRIPT))
+    started: list[subprocess.Popen[str]] = []
+
+    def start(when: str, members: int) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, path, when, str(members)],
+            env=os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{root / 'tests'}"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        started.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize(("when", "after_s"), [("busy", 0.5), ("starting", 0.1), ("starting", 1.5)])
+def test_ctrl_c_leaves_nothing_behind(script: Callable[..., subprocess.Popen[str]], when: str, after_s: float) -> None:
+    """As the terminal does it: to every process of the foreground, and once more by an impatient user."""
+    process = script(when, 100_000)
+    time.sleep(after_s)
+    children = psutil.Process(process.pid).children(recursive=True)
+    for child in children:
+        child.send_signal(signal.SIGINT)
+    os.killpg(process.pid, signal.SIGINT)
+    time.sleep(0.2)
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, "", "")
+    assert gone(children) == []
+
+
+def test_a_killed_coordinator_takes_its_workers_along(script: Callable[..., subprocess.Popen[str]]) -> None:
+    process = script("busy", 100_000)
+    children = psutil.Process(process.pid).children(recursive=True)
+    process.kill()
+    # Two idle helpers of Ray's look for it for another minute; they do nothing and hold no port that is needed.
+    assert {child.name() for child in gone(children)} <= {"ray::DashboardAgent", "ray::RuntimeEnvAgent"}
+
+
+def test_a_run_says_nothing_even_where_a_worker_dies(script: Callable[..., subprocess.Popen[str]]) -> None:
+    process = script("busy", 2_000)
+    workers = [p for p in psutil.Process(process.pid).children(recursive=True) if p.name().startswith("ray::_Actor")]
+    assert len(workers) in (1, 2)
+    workers[0].kill()
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (0, "", "")
+
+
+@pytest.mark.parametrize("address", ["nowhere", "host:0", "host:99999", ":6379", "ray://127.0.0.1:10001", "a/b:1"])
+def test_what_is_no_address(address: str) -> None:
+    with pytest.raises(PoolError, match="is no address of a Ray cluster; give host:port"):
+        RayPool(2, never_built, address)
+
+
+def test_an_address_where_nothing_answers() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    started = time.perf_counter()
+    with pytest.raises(PoolError, match=rf"^no Ray cluster answers at {address}: Connection refused; is `ray start"):
+        RayPool(2, never_built, address)
+    assert time.perf_counter() - started < 2
+
+
+def test_an_address_where_something_else_answers() -> None:
+    class Quiet(http.server.BaseHTTPRequestHandler):
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with pytest.raises(PoolError, match="is no Ray cluster; is that its head's port"):
+            check_address(f"127.0.0.1:{server.server_port}")
+        server.shutdown()
+
+
+def test_an_address_that_accepts_and_says_nothing() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        started = time.perf_counter()
+        with pytest.raises(PoolError, match="is no Ray cluster"):
+            check_address(f"127.0.0.1:{server.getsockname()[1]}")
+        assert time.perf_counter() - started < 5
+
+
+@pytest.mark.parametrize("workers", [0, -1])
+def test_a_pool_needs_workers(workers: int) -> None:
+    with pytest.raises(ValueError, match="1 worker or more"):
+        RayPool(workers, never_built)

@@ -115,6 +115,19 @@ def test_nodes_are_exact_for_any_strips(strips):
     assert nodes[::3, ::3].ravel() == pytest.approx(np.maximum(expected, FIELD_FLOOR), abs=1e-4)
 
 
+@pytest.mark.parametrize("sweep", [-90.0, -45.0, 30.0, 60.0, 90.0, 100.0])
+def test_nodes_are_exact_for_arcs_turned_any_way(sweep):
+    """The band of nodes that an arc is written to has to hold its bulge between its ends and its middle."""
+    for first in np.arange(0.0, 360.0, 11.25):
+        arc = np.array([[32.3, 31.8, 24.0, math.radians(first), math.radians(sweep), 1.0]])
+        nodes = clearance_nodes(Strips(np.zeros((0, 5)), arc), SIDE, SIDE)
+        n = np.arange(0, round(SIDE * CELLS_PER_M), 2)
+        x, y = np.meshgrid(n / CELLS_PER_M, n / CELLS_PER_M)
+        exact = oracle.ExactRoad(Strips(np.zeros((0, 5)), arc), SIDE, SIDE)
+        expected = exact.clearance(np.stack([x.ravel(), y.ravel()], axis=1), deepest=-FIELD_FLOOR)
+        assert nodes[::2, ::2].ravel() == pytest.approx(expected, abs=1e-4)
+
+
 def test_without_a_torus_the_sides_are_not_joined():
     strips = Strips(np.array([[2.0, 32.0, 20.0, 32.0, 4.0]]), np.zeros((0, 6)))
     joined, apart = clearance_nodes(strips, SIDE, SIDE), clearance_nodes(strips, SIDE, SIDE, torus=False)
@@ -220,6 +233,14 @@ def test_no_start_range_exceeds_the_true_range(seed):
     share = start[inner].sum() / true[inner].sum()
     print(f"start table, seed {seed}: {share:.2f} of the way, worst excess {(start - true).max():.3f} m")
     assert share > 0.35
+
+
+def test_no_start_range_exceeds_the_true_range_on_a_wide_road():
+    road, exact = small_road(lines=[[0, 32, 64, 32, 16.0]])
+    rng = np.random.default_rng(1)
+    points = np.stack([rng.uniform(0.0, 64.0, 10_000), rng.uniform(16.0, 48.0, 10_000)], axis=1)
+    angles = rng.uniform(-math.pi, math.pi, len(points))
+    assert (start_ranges(road, points, angles) - exact.cast(points, angles[:, None], 50.0)[:, 0]).max() < 0.05
 
 
 def test_the_table_repeats_its_first_bins_behind_the_last(scenario):

@@ -8,7 +8,7 @@ import oracle
 import pytest
 
 from gridsim.config import SensorConfig, SimConfig, constants
-from gridsim.roads import Strips, clearance_nodes, make_road
+from gridsim.roads import HEADING_BINS, Strips, clearance_nodes, make_road
 from gridsim.scenarios import build
 from gridsim.sensors import fan, fast_march, march, sense
 from gridsim.vector import LANES
@@ -233,6 +233,17 @@ def test_both_marches_take_a_start_and_stay_within_reach(scenario, start):
     if start >= REACH:
         assert (plain == REACH).all()
         assert (vector == REACH).all()
+
+
+@pytest.mark.parametrize("view", [120.0, 240.0, 300.0, 360.0])
+def test_the_start_table_holds_the_widest_fan_that_is_allowed(scenario, view):
+    """A fan never wraps: the bins repeated behind the last are as many as any fan needs, or it is refused."""
+    try:
+        k = constants(SimConfig(sensors=SensorConfig(rays=64, field_of_view=view)))
+    except ValueError:
+        pytest.skip(f"{view:.0f} degrees are refused")
+    stride = scenario.road.start.size // (int(scenario.road.start_row.max()) + 1)
+    assert stride >= HEADING_BINS + math.ceil(fan(64, k.ray_first, k.ray_step)[2].max())
 
 
 def test_the_fan_pads_to_whole_blocks():

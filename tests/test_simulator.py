@@ -210,25 +210,28 @@ def test_every_step_is_the_oracles(episodes):
     print(f"a step is the oracle's within {worst * 1000:.3f} mm")
 
 
-def test_the_books_are_the_oracles(episodes):
+def check_books(r, side, target, max_steps):
     """New ground and idleness, counted by the oracle along the kernel's own poses."""
+    books = oracle.Books(CONFIG, side, side, INTERVAL, target, max_steps)
+    books.begin(float(r.start[0]), float(r.start[1]))
+    odometer, speed, ends = 0.0, float(r.start[3]), []
+    for k, after in enumerate(r.states.astype(float)):
+        # The odometer counts either way; a step goes backwards if its mean speed does.
+        moved = (after[ODOMETER] - odometer) * (1 if speed + after[SPEED] >= 0.0 else -1)
+        crashed = r.end == "COLLISION" and k == len(r.states) - 1
+        ends.append(books.enter(after[X], after[Y], after[SPEED], moved, crashed))
+        assert after[DISTANCE] == pytest.approx(books.distance, abs=2e-3)
+        assert after[PACED] == pytest.approx(books.paced, abs=2e-3)
+        assert after[IDLE] == books.idle
+        assert after[STEPS] == books.steps
+        odometer, speed = after[ODOMETER], after[SPEED]
+    assert ends[:-1] == [""] * (len(ends) - 1)
+    assert ends[-1] == r.end
+
+
+def test_the_books_are_the_oracles(episodes):
     for _, r in episodes:
-        books = oracle.Books(CONFIG, SIDE, SIDE, INTERVAL, 400.0, 450)
-        books.begin(float(r.start[0]), float(r.start[1]))
-        odometer, speed, ends = 0.0, float(r.start[3]), []
-        for k, after in enumerate(r.states.astype(float)):
-            # The odometer counts either way; a step goes backwards if its mean speed does.
-            forward = speed + after[SPEED] >= 0.0
-            moved = (after[ODOMETER] - odometer) * (1 if forward else -1)
-            crashed = r.end == "COLLISION" and k == len(r.states) - 1
-            ends.append(books.enter(after[X], after[Y], after[SPEED], moved, crashed))
-            assert after[DISTANCE] == pytest.approx(books.distance, abs=2e-3)
-            assert after[PACED] == pytest.approx(books.paced, abs=2e-3)
-            assert after[IDLE] == books.idle
-            assert after[STEPS] == books.steps
-            odometer, speed = after[ODOMETER], after[SPEED]
-        assert ends[:-1] == [""] * (len(ends) - 1)
-        assert ends[-1] == r.end
+        check_books(r, SIDE, 400.0, 450)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -298,6 +301,8 @@ def test_circling_on_the_spot_earns_one_round(plain, speed, radius, side):
     # A square's length more or less where the circle closes, and then 15 steps.
     assert r.states[-1, DISTANCE] == pytest.approx(rnd, abs=6.0)
     assert r.states[-1, ODOMETER] < rnd + 15 * speed * 0.1 + 6.0
+    assert r.states[-1, PACED] == pytest.approx(r.states[-1, DISTANCE] if speed >= INTERVAL[0] else 0.0, abs=1e-3)
+    check_books(r, 128.0, 2000.0, 4000)
 
 
 def test_a_round_longer_than_200_m_is_new_ground_again(plain):
@@ -306,6 +311,7 @@ def test_a_round_longer_than_200_m_is_new_ground_again(plain):
     r = run(plain, [64, 64, 0.0, speed, math.radians(27.0)], always(Action.LEFT), target=600.0)
     assert r.end == "SUCCESS"
     assert r.states[-1, ODOMETER] == pytest.approx(r.states[-1, DISTANCE], abs=1.0)
+    check_books(r, 128.0, 600.0, 4000)
 
 
 def test_circling_in_a_roundabout_earns_one_round():
