@@ -33,7 +33,15 @@ from typing import Any
 import numpy as np
 
 from cluster.pool import (
-    SMALLEST_CHUNK, BuildMap, Outcome, PoolError, Progress, chunks, describe, last_line, new_outcome,
+    SMALLEST_CHUNK,
+    BuildMap,
+    Outcome,
+    PoolError,
+    Progress,
+    chunks,
+    describe,
+    last_line,
+    new_outcome,
 )
 from cluster.worker import Task, Worker
 from evolution.breeding import RECIPE
@@ -213,8 +221,9 @@ class RayPool:
                     kills[chunk] += 1
                     if kills[chunk] >= MAX_KILLS:
                         raise PoolError(
-                            f"{describe(chunk, rows)} killed its worker {MAX_KILLS} times; the last time: "
+                            f"{describe(chunk, rows)} killed its worker {MAX_KILLS} times; the last time "
                             + _reason(error)
+                            + self._logs()
                         ) from error
                     todo.extendleft(index for index, _ in reversed(slot.sent))
                     outcome.retries += len(slot.sent)
@@ -313,11 +322,14 @@ class RayPool:
         except ray.exceptions.RayError as error:
             self._failed_starts += 1
             if self._failed_starts >= MAX_FAILED_STARTS:
-                raise PoolError(f"no worker can be started: {_reason(error)}") from error
+                raise PoolError(f"no worker can be started: {_reason(error)}{self._logs()}") from error
             self._replace(slot)
         else:
             slot.hello = None
             self._failed_starts = 0
+
+    def _logs(self) -> str:
+        return f" (logs: {self._session}/logs)" if self._session else ""
 
     def _free(self, todo: deque[int]) -> Iterator[_Slot]:
         """Whom to give the next chunk, as long as there is one. The last ones only go to who has nothing to do."""
@@ -538,4 +550,6 @@ def _reason(error: BaseException) -> str:
     text = last_line(error)
     if "Worker exit detail: " in text:
         text = text.split("Worker exit detail: ")[1].split(". Some common causes")[0]
+        if "connection error" in text:
+            text = "its process was killed, crashed, or ran out of memory"
     return text[:300]

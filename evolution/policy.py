@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import leaf, njit
 
 INPUTS = 32  # 31 rays and the speed
 ACTIONS = 8
@@ -59,7 +59,7 @@ class PolicySpec:
         return int(((layers[:-1] + 1) * layers[1:]).sum())
 
 
-@njit
+@leaf
 def encode(ranges, speed, inputs):
     """What the network sees: float32 [rays + 1]. Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out."""
     rays = ranges.shape[0]
@@ -68,10 +68,11 @@ def encode(ranges, speed, inputs):
     inputs[rays] = speed / SPEED_SCALE - _F(1.0)
 
 
-@njit
+@leaf
 def squash(x):
     """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere."""
-    x = min(max(x, _F(-4.97)), _F(4.97))
+    x = _F(4.97) if x > _F(4.97) else x  # so written, not a number stays one
+    x = _F(-4.97) if x < _F(-4.97) else x
     s = x * x
     return (
         x
@@ -112,7 +113,7 @@ def pack(genome, layers, packed):
         at += (n + 1) * m
 
 
-@njit
+@leaf
 def forward(packed, layers, scratch):
     """Outputs of the network in scratch[return value: + outputs].
 
@@ -151,7 +152,7 @@ def forward(packed, layers, scratch):
     return source
 
 
-@njit
+@leaf
 def decide(packed, layers, scratch):
     """Index of the greatest output, the first of equals; -1 where an output is not a number."""
     at = forward(packed, layers, scratch)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import leaf, njit
 
 CELLS_PER_M = 2  # nodes of the clearance field per metre
 FIELD_FLOOR = -2.0  # m, clearance of byte 0: deeper inside a wall is all the same
@@ -207,7 +207,7 @@ def _ray_starts(nodes, columns, rows, ray_range):
     return row_of, ranges
 
 
-@njit
+@leaf
 def clearance(road, x, y):
     """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, any tile of the torus."""
     px, py = x * _F(CELLS_PER_M), y * _F(CELLS_PER_M)

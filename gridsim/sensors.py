@@ -11,7 +11,7 @@ import math
 import numba.core.config as numba_config
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import leaf
 from gridsim.roads import (
     CELLS_PER_M,
     FIELD_FLOOR,
@@ -53,7 +53,7 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
     return table
 
 
-@njit
+@leaf
 def march(field, columns, rows, px0, py0, reach, beams):
     """Move each of LANES rays from its start range to the edge of the road.
 
@@ -104,7 +104,7 @@ fast_march = (
 )
 
 
-@njit
+@leaf
 def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
     """Ranges of all rays from a point, in m.
 

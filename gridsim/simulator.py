@@ -15,7 +15,7 @@ import numpy as np
 
 from gridsim.atlas import Atlas, make_atlas, road_of
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import leaf, njit
 from gridsim.roads import VISIT_CELL, Road, clearance
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan, sense
@@ -65,7 +65,7 @@ _OUTLINE = np.array(
 _OUTLINE.setflags(write=False)
 
 
-@njit
+@leaf
 def collides(road, constants, x, y, cosine, sine):
     """Whether any part of the car's outline is off the road."""
     length, width = constants.half_length, constants.half_width
@@ -85,7 +85,7 @@ def collides(road, constants, x, y, cosine, sine):
     return False
 
 
-@njit
+@leaf
 def visit_cell(road, x, y):
     """Index of the visit cell that holds a point of the torus."""
     columns = _I(road.width * _VISIT_SCALE)
@@ -95,7 +95,7 @@ def visit_cell(road, x, y):
     return row * columns + column
 
 
-@njit
+@leaf
 def place(road, start, car, visits):
     """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
     car[:] = _ZERO
@@ -109,7 +109,7 @@ def place(road, start, car, visits):
     visits[cell] = _ZERO
 
 
-@njit
+@leaf
 def look(road, constants, fan, car, beams, ranges):
     """Ranges (m) of the car's sensor, from the middle of its front axle."""
     x = car[X] + constants.front_axle * car[COS]
@@ -117,7 +117,7 @@ def look(road, constants, fan, car, beams, ranges):
     sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
 
 
-@njit
+@leaf
 def drive(road, constants, car, visits, action):
     """One control period of one car under one of the eight actions. Returns RUNNING, COLLISION or IDLE."""
     acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
@@ -125,7 +125,7 @@ def drive(road, constants, car, visits, action):
     return move(road, constants, car, visits, acceleration)
 
 
-@njit
+@leaf
 def move(road, constants, car, visits, acceleration):
     """One control period with the car's present steering and an acceleration in m/s2."""
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
@@ -181,7 +181,7 @@ def move(road, constants, car, visits, acceleration):
     return 0
 
 
-@njit
+@leaf
 def control(road, constants, car, visits, action, target, max_steps):
     """`drive`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
     end = drive(road, constants, car, visits, action)

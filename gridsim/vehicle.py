@@ -13,7 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import leaf
 
 _F = np.float32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
@@ -32,7 +32,7 @@ class Action(IntEnum):
     REVERSE = 7
 
 
-@njit
+@leaf
 def act(constants, action, speed, steering):
     """What an action asks of the car in one control period.
 
@@ -57,7 +57,7 @@ def act(constants, action, speed, steering):
     return acceleration, steering
 
 
-@njit
+@leaf
 def path_curvature(constants, speed, steering):
     """Curvature (1/m, left positive) of the centre of mass's path: the bicycle's, bounded by lateral grip."""
     tangent = constants.rear_share * math.tan(steering)  # of the slip angle
@@ -66,7 +66,7 @@ def path_curvature(constants, speed, steering):
     return min(max(curvature, -bound), bound)
 
 
-@njit
+@leaf
 def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
     """Move on an arc of constant curvature for dt seconds: exact for constant speed and steering.
 

@@ -85,7 +85,30 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("orders")
 
 
-class TestOnePool:
+@pytest.fixture(scope="module")
+def held() -> Iterator[list[RayPool]]:
+    """The pool that is shared by tests, or none. There can only be one in a process."""
+    pools: list[RayPool] = []
+    yield pools
+    for pool in pools:
+        pool.close()
+
+
+@pytest.fixture
+def pool(held: list[RayPool], folder: Path) -> RayPool:
+    """One pool for many tests (a start takes seconds), without orders."""
+    for path in folder.iterdir():
+        path.unlink()
+    if not held:
+        held.append(RayPool(2, never_built, worker_factory=functools.partial(Obeying, folder)))
+    return held[0]
+
+
+@pytest.fixture
+def no_pool(held: list[RayPool]) -> None:
+    """For tests that bring their own."""
+    while held:
+        held.pop().close()
 
 
 def expected(n: int) -> bytes:
@@ -146,7 +169,7 @@ def test_a_member_that_kills_twice_is_sent_a_third_time(pool: RayPool, folder: P
 def test_a_chunk_that_kills_three_workers_ends_the_run(pool: RayPool, folder: Path) -> None:
     (folder / "kill-300").write_text("100")
     with pytest.raises(
-        PoolError, match=r"^chunk \d+ \(members \d+ to \d+\) killed its worker 3 times; .*died"
+        PoolError, match=r"^chunk \d+ \(members \d+ to \d+\) killed its worker 3 times; the last time its process was"
     ) as caught:
         pool.evaluate(make_task(), make_recipes(512))
     assert "\n" not in str(caught.value)
@@ -177,6 +200,28 @@ def test_only_one_pool_at_a_time(pool: RayPool) -> None:
     assert pool.evaluate(make_task(), make_recipes(9)).results.tobytes() == expected(9)
 
 
+def test_the_store_keeps_a_bounded_number_of_maps(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[int] = []
+
+    class Map:
+        def __init__(self, seed: int):
+            built.append(seed)
+            self.seed = seed
+
+        def arrays(self) -> dict[str, np.ndarray]:
+            return {"field": np.zeros(1 << 20, dtype=np.uint8)}
+
+    monkeypatch.setattr(pool, "_build_map", lambda _name, seed: Map(seed))
+    monkeypatch.setattr(pool, "_map_bytes", 3 << 20)
+    outcome = pool.evaluate(make_task(), make_recipes(0))
+    for seeds in ([0, 1, 2], [0, 1, 2], [3], [0, 1], [4, 5, 6, 7], [7]):
+        task = make_task(tuple(("seamless", seed) for seed in seeds))
+        pool._broadcast(task, outcome)
+        assert len(pool._maps) <= max(3, len(seeds))
+    assert built == [0, 1, 2, 3, 0, 1, 4, 5, 6, 7], "the one that was used longest ago goes first"
+
+
+@pytest.mark.usefixtures("no_pool")
 def test_any_number_of_workers_gives_the_serial_pools_bits() -> None:
     """With the real worker on real maps, one of four killed on the way; and what its process holds."""
     task, scenarios = drive_task()
@@ -202,6 +247,7 @@ def test_any_number_of_workers_gives_the_serial_pools_bits() -> None:
         assert gone(processes) == []
 
 
+@pytest.mark.usefixtures("no_pool")
 def test_what_a_worker_is_given_and_what_it_has_loaded() -> None:
     task, scenarios = drive_task()
     known = dict(zip(MAPS, scenarios, strict=True))
@@ -216,6 +262,7 @@ def test_what_a_worker_is_given_and_what_it_has_loaded() -> None:
     assert (results["steps"] == 1).all(), "a worker has more than one thread"
 
 
+@pytest.mark.usefixtures("no_pool")
 def test_workers_that_cannot_start_are_given_up() -> None:
     pool = RayPool(2, never_built, worker_factory=Unfit)
     with pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: in this state"):
@@ -223,29 +270,16 @@ def test_workers_that_cannot_start_are_given_up() -> None:
     pool.close()
 
 
-def test_the_store_keeps_a_bounded_number_of_maps(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
-    built: list[int] = []
-
-    class Map:
-        def __init__(self, seed: int):
-            built.append(seed)
-            self.seed = seed
-
-        def arrays(self) -> dict[str, np.ndarray]:
-            return {"field": np.zeros(1 << 20, dtype=np.uint8)}
-
-    monkeypatch.setattr(pool, "_build_map", lambda _name, seed: Map(seed))
-    monkeypatch.setattr(pool, "_map_bytes", 3 << 20)
-    outcome = pool.evaluate(make_task(), make_recipes(0))
-    for seeds in ([0, 1, 2], [0, 1, 2], [3], [0, 1], [4, 5, 6, 7], [7]):
-        task = make_task(tuple(("seamless", seed) for seed in seeds))
-        pool._broadcast(task, outcome)
-        assert len(pool._maps) <= max(3, len(seeds))
-    assert built == [0, 1, 2, 3, 0, 1, 4, 5, 6, 7], "the one that was used longest ago goes first"
-
-
 RAY = Path(sysconfig.get_path("scripts")) / "ray"
-START = [RAY, "start", "--head", "--block", "--num-cpus=2", "--include-dashboard=false", "--object-store-memory=100000000"]
+START = [
+    RAY,
+    "start",
+    "--head",
+    "--block",
+    "--num-cpus=2",
+    "--include-dashboard=false",
+    "--object-store-memory=100000000",
+]
 
 
 @pytest.fixture
@@ -283,6 +317,7 @@ def cluster(tmp_path: Path) -> Iterator[Callable[..., str]]:
             process.kill()
 
 
+@pytest.mark.usefixtures("no_pool")
 def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
     cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
