@@ -248,11 +248,12 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
 
 
 def _evolve(arguments: Sequence[str], started: float) -> int:
+    from cluster import tracking
+
     prog = "gridsim-evolve"
     console = Console()
     try:
         flags, run = _prepare(arguments)
-        from cluster import tracking
         from cluster.coordinator import Maps
         from cluster.pool import PoolError, SerialPool
         from cluster.run import is_finished, make_tracker
@@ -270,6 +271,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
     except tracking.TrackingError as error:
         fail(prog, str(error))
 
+    made = _make_folder(prog, run)
     maps = Maps(run.settings.scenario, SimConfig())
     pool: WorkerPool
     try:
@@ -281,6 +283,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
             pool = RayPool(flags.workers, maps.build, flags.address or os.environ.get("RAY_ADDRESS") or None)
     except PoolError as error:
         maps.close()
+        _discard(made)
         fail(prog, str(error))
 
     tracker = make_tracker(run, uri, flags.experiment)
@@ -314,8 +317,10 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
         where = f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "no generation was done yet"
         print(f"{prog}: stopped; {where}", file=sys.stderr)
         if not resumable:
-            _discard(run)
+            _discard(made)
     elif status == "FAILED":
+        if not resumable:
+            _discard(made)
         fail(prog, message, f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "", FAILED)
     else:
         console.print(message)
@@ -335,7 +340,6 @@ def _run(
     session = Session(run, pool, maps, tracker, started, initial)
     maps.ahead(session.evolution.curriculum.map_seeds[:3])
     compile_kernels(session)  # here, before the workers need them: so they are compiled once, and cached
-    run.path.mkdir(parents=True, exist_ok=True)
     run.write_config()
     with progress.Progress(console, session, _shown(run.path)) as shown:
         session.on_row = shown.row
@@ -385,11 +389,24 @@ def compile_kernels(session: Session) -> None:
     Worker().evaluate(task, [session.maps.get(seed) for seed in maps], recipes)
 
 
-def _discard(run: RunFolder) -> None:
-    """Remove a folder in which nothing was done."""
+def _make_folder(prog: str, run: RunFolder) -> list[Path]:
+    """Make a run's folder. Returns the folders that were made for it, the innermost first."""
+    made = [path for path in (run.path, *run.path.parents) if not path.exists()]
+    try:
+        run.path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        _discard(made)
+        fail(prog, f"{run.path} cannot be made: {error.strerror}; choose another --output")
+    return made
+
+
+def _discard(made: list[Path]) -> None:
+    """Remove the folders of a run in which nothing was done."""
     with contextlib.suppress(OSError):
-        (run.path / "config.json").unlink()
-        run.path.rmdir()
+        for path in made:
+            if path == made[0]:
+                (path / "config.json").unlink(missing_ok=True)
+            path.rmdir()
 
 
 def _shown(path: Path) -> str:

@@ -189,6 +189,7 @@ class RayPool:
         cut = chunks(len(recipes), self._asked, self._smallest)
         todo = deque(range(len(cut)))
         kills: Counter[int] = Counter()
+        suspects: set[int] = set()
         done = 0
         self._serial += 1
         for slot in self._slots:
@@ -197,7 +198,7 @@ class RayPool:
         nobody_since = time.monotonic()
 
         while done < len(recipes):
-            for slot in self._free(todo):
+            for slot in self._free(todo, suspects):
                 chunk = todo.popleft()
                 raw = recipes[cut[chunk]].tobytes()
                 known = slot.serial == self._serial
@@ -225,6 +226,7 @@ class RayPool:
                             + _reason(error)
                             + self._logs()
                         ) from error
+                    suspects.update(index for index, _ in slot.sent)
                     todo.extendleft(index for index, _ in reversed(slot.sent))
                     outcome.retries += len(slot.sent)
                     self._replace(slot)
@@ -331,13 +333,19 @@ class RayPool:
     def _logs(self) -> str:
         return f" (logs: {self._session}/logs)" if self._session else ""
 
-    def _free(self, todo: deque[int]) -> Iterator[_Slot]:
-        """Whom to give the next chunk, as long as there is one. The last ones only go to who has nothing to do."""
+    def _free(self, todo: deque[int], suspects: set[int]) -> Iterator[_Slot]:
+        """Whom to give the next chunk, as long as there is one.
+
+        The last ones only go to who has nothing to do. So do suspects, which were lost with a worker, and nothing is
+        queued behind them: the next time it is clear which one it was.
+        """
         up = [slot for slot in self._slots if slot.pid]
-        for depth in range(QUEUE):
-            for slot in up:
-                if len(slot.sent) == depth and len(todo) > (len(up) if depth else 0):
-                    yield slot
+        for slot in up:
+            if todo and not slot.sent:
+                yield slot
+        for slot in up:
+            if len(todo) > len(up) and 0 < len(slot.sent) < QUEUE and suspects.isdisjoint([todo[0], slot.sent[0][0]]):
+                yield slot
 
     def _broadcast(self, task: Task, outcome: Outcome) -> tuple[Any, list[Any]]:
         """Put the task, and those of its maps that are not there yet, into the object store."""
@@ -547,7 +555,7 @@ def _capacity() -> str:
 
 def _reason(error: BaseException) -> str:
     """What matters in Ray's long messages, in one short line."""
-    text = last_line(error)
+    text = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
     if "Worker exit detail: " in text:
         text = text.split("Worker exit detail: ")[1].split(". Some common causes")[0]
         if "connection error" in text:

@@ -94,12 +94,12 @@ def _breed(parents, recipes, key, layers, rate, sigma, bump_rate, bump_width, sc
     for n in range(recipes.shape[0]):
         recipe = recipes[n]
         child = children[n]
-        stream = mix(key ^ mix(_U(recipe.seed) + GOLDEN))
-        if recipe.a == FRESH:
+        stream = mix(key ^ mix(_U(recipe["seed"]) + GOLDEN))
+        if recipe["a"] == FRESH:
             _fresh(child, layers, stream, scale)
             continue
-        a, b = parents[recipe.a], parents[recipe.b]
-        if recipe.seed == 0:
+        a, b = parents[recipe["a"]], parents[recipe["b"]]
+        if recipe["seed"] == 0:
             for i in range(genes):
                 child[i] = a[i]
             continue

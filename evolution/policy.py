@@ -157,15 +157,13 @@ def decide(packed, layers, scratch):
     """Index of the greatest output, the first of equals; -1 where an output is not a number."""
     at = forward(packed, layers, scratch)
     best, action = scratch[at], 0
-    total = best
+    number = best == best
     for k in range(1, layers[layers.shape[0] - 1]):
         value = scratch[at + k]
-        total += value - value  # nan or infinity leaves its mark
+        number &= value == value
         if value > best:
             best, action = value, k
-    if total != total:
-        return -1
-    return action
+    return action if number else -1
 
 
 @njit

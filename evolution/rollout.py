@@ -64,14 +64,14 @@ def _run(road, constants, fan, packed, layers, start, target, max_steps, car, vi
     end = 0
     steps = 0
     while end == 0:
-        if keep > 0:
-            ring[steps % keep] = car
         look(road, constants, fan, car, beams, ranges)
         encode(ranges, car[SPEED], scratch)
         action = decide(packed, layers, scratch)
         if action < 0:  # not a number: the genome loses what is left
             end = 2
             break
+        if keep > 0:
+            ring[steps % keep] = car
         end = drive(road, constants, car, visits, action)
         steps += 1
         if end == 0:
@@ -99,10 +99,10 @@ def _rollout(road, constants, fan, genomes, layers, start, target, max_steps, re
             road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring
         )
         row = results[i, column]
-        row.distance = car[DISTANCE]
-        row.paced = car[PACED]
-        row.steps = car[STEPS]
-        row.end = end
+        row["distance"] = car[DISTANCE]
+        row["paced"] = car[PACED]
+        row["steps"] = car[STEPS]
+        row["end"] = end
         if rewind > 0:
             back = ring[max(int(car[STEPS]) - rewind, 0) % rewind]
             rewound[i, column, 0] = back[X]

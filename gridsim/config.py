@@ -96,8 +96,8 @@ def constants(config: SimConfig) -> Constants:
     ):
         if not value > 0.0:
             raise ValueError(f"{name} must be above 0, not {value}")
-    if sensors.rays < 2 or not 0.0 < sensors.field_of_view <= 360.0:
-        raise ValueError("the sensor needs two rays or more and a field of view within 360 degrees")
+    if sensors.rays < 2 or not 0.0 < sensors.field_of_view <= 240.0 or sensors.range > 63.0:
+        raise ValueError("the sensor needs 2 rays or more, a field of view within 240 degrees and a range within 63 m")
     if not 0.0 < vehicle.rear_axle < vehicle.wheelbase:
         raise ValueError("the centre of mass must lie between the axles")
     view = math.radians(sensors.field_of_view)

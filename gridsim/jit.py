@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numba
-import numba.core.config as numba_config
 
 # Packages whose files may hold kernels; all their sources count, so that nobody has to keep a list in step.
 KERNEL_PACKAGES = ("gridsim", "evolution")
@@ -53,6 +52,7 @@ def cache_folder() -> Path:
     return folder
 
 
+CONFIG: Any = numba.config  # its attributes are made when it is imported
 CACHE_FOLDER = cache_folder()
 
 
@@ -64,20 +64,20 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     """
     if function is None:
         return lambda f: njit(f, **options)
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(CACHE_FOLDER)
+    before = CONFIG.CACHE_DIR
+    CONFIG.CACHE_DIR = str(CACHE_FOLDER)
     try:
         return numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"}, **options)(
             function
         )
     finally:
-        numba_config.CACHE_DIR = before
+        CONFIG.CACHE_DIR = before
 
 
 def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
     """`njit` for small kernels that return numbers only: inlined into their callers, without reference counting.
 
-    Passing a road and its constants costs some 60 arguments and the counting of its arrays: a third of a step's time. Not
-    for a kernel that returns or stores an array.
+    Passing a road and its constants costs some 60 arguments and the counting of its arrays: a third of a step's time.
+    Not for a kernel that returns or stores an array.
     """
     return njit(function, forceinline=True, _nrt=False)

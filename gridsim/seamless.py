@@ -2,8 +2,8 @@
 
 Every tile is read off the edges its node has in the graph: two opposite ones make a straight, two others a curve, three
 a T, four a crossing; now and then a T or crossing is built as a roundabout. No node has one edge alone, so every open
-edge meets an open edge and every lane has a successor. No block of the network has fewer than eight tiles around it:
-driving round one is more than the 200 m within which a stretch counts once.
+edge meets an open edge and every lane has a successor. No block of the network has fewer than eight tiles around it,
+about the 200 m within which a stretch that is driven again counts nothing.
 """
 
 from __future__ import annotations

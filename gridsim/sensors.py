@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 
-import numba.core.config as numba_config
 import numpy as np
 
-from gridsim.jit import leaf
+from gridsim.jit import CONFIG, leaf
 from gridsim.roads import (
     CELLS_PER_M,
     FIELD_FLOOR,
@@ -85,10 +84,11 @@ def march(field, columns, rows, px0, py0, reach, beams):
         beams[2, r] = min(max(t, _F(0.0)), reach)
 
 
-# Compiled, the same marching runs as vector code; `NUMBA_DISABLE_JIT=1` takes the plain kernel above.
+# Compiled, the marching runs as vector code, all lanes until the last has arrived; with
+# `NUMBA_DISABLE_JIT=1` the plain kernel above is taken.
 fast_march = (
     march
-    if numba_config.DISABLE_JIT
+    if CONFIG.DISABLE_JIT
     else march_intrinsic(
         _STEPS,
         float(_SCALE),

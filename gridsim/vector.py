@@ -1,7 +1,8 @@
 """Vector code for `sensors.march`: 32 rays in lockstep, emitted as LLVM vectors.
 
-Same arithmetic as the plain kernel in `sensors`, lane by lane; tests hold one against the other. LLVM turns the vectors
-of 32 into whatever the machine has.
+The arithmetic of the plain kernel in `sensors`; tests hold one against the other. The lanes go in lockstep: one that
+has arrived goes on refining while others march, which the plain kernel's do not. LLVM turns the vectors of 32
+into whatever the machine has.
 """
 
 from __future__ import annotations

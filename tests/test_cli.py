@@ -118,7 +118,7 @@ def test_killed_worker_changes_nothing(reference, tmp_path):
         victims = ray_workers(process.pid)
         assert victims
         os.kill(victims[0], signal.SIGKILL)
-        out, err = process.communicate(timeout=240)
+        _, err = process.communicate(timeout=240)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -167,6 +167,7 @@ def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
     wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 30)
     client = MlflowClient(tracking_uri=f"sqlite:///{tmp_path}/mlflow.db")
     experiment = client.get_experiment_by_name("gridsim")
+    assert experiment is not None
     (run,) = client.search_runs([experiment.experiment_id])
     assert run.info.status == "KILLED"
     done = evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
@@ -263,7 +264,7 @@ WRONG = {
     "not a number": (["--population", "many"], "--population"),
     "population below elites": (["--population", "8", "--elites", "8"], "larger than"),
     "negative workers": (["--workers", "-1"], "--workers"),
-    "output that cannot be written": (["--output", "/proc/nowhere"], "cannot be written"),
+    "output that cannot be written": (["--output", "/proc/nowhere"], "--output"),
     "name that is a path": (["--name", "../up"], "--name"),
     "resume of no run": (["--resume", "."], "no run's folder"),
     "config that is none": (["--config", "/etc/hostname"], "config.json"),

@@ -1,5 +1,6 @@
 """RayPool with real Ray processes: the same bits from any number of workers, and what happens when workers die."""
 
+import contextlib
 import functools
 import http.server
 import os
@@ -69,7 +70,7 @@ class Inspecting(Answering):
 
 class Unfit(Answering):
     def __init__(self) -> None:
-        raise RuntimeError("no worker\nin this state")
+        raise RuntimeError("not in this state")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -173,7 +174,10 @@ def test_a_chunk_that_kills_three_workers_ends_the_run(pool: RayPool, folder: Pa
     ) as caught:
         pool.evaluate(make_task(), make_recipes(512))
     assert "\n" not in str(caught.value)
-    assert (folder / "kill-300").read_text() == "97"
+    first, last = (int(word.strip(")")) for word in str(caught.value).split("members ")[1].split()[:3:2])
+    assert first <= 300 <= last
+    # One more than three where the first time the chunk before it was still suspected.
+    assert (folder / "kill-300").read_text() in ("97", "96")
     (folder / "kill-300").unlink()
     assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512), "the pool goes on"
 
@@ -218,7 +222,7 @@ def test_the_store_keeps_a_bounded_number_of_maps(pool: RayPool, monkeypatch: py
         task = make_task(tuple(("seamless", seed) for seed in seeds))
         pool._broadcast(task, outcome)
         assert len(pool._maps) <= max(3, len(seeds))
-    assert built == [0, 1, 2, 3, 0, 1, 4, 5, 6, 7], "the one that was used longest ago goes first"
+    assert built == [0, 1, 2, 3, 0, 4, 5, 6, 7], "the one that was used longest ago goes first"
 
 
 @pytest.mark.usefixtures("no_pool")
@@ -251,11 +255,8 @@ def test_any_number_of_workers_gives_the_serial_pools_bits() -> None:
 def test_what_a_worker_is_given_and_what_it_has_loaded() -> None:
     task, scenarios = drive_task()
     known = dict(zip(MAPS, scenarios, strict=True))
-    pool = RayPool(1, lambda *name: known[name], worker_factory=Inspecting)
-    try:
+    with contextlib.closing(RayPool(1, lambda *name: known[name], worker_factory=Inspecting)) as pool:
         results = pool.evaluate(task, make_recipes(50)).results
-    finally:
-        pool.close()
     assert (results["distance"] == 0).all(), f"a worker carries one of {BANNED}"
     assert (results["paced"] == 0).all(), "an input is writable or not aligned"
     assert (results["end"] == 1).all(), "Ctrl-C would reach a worker"
@@ -265,9 +266,11 @@ def test_what_a_worker_is_given_and_what_it_has_loaded() -> None:
 @pytest.mark.usefixtures("no_pool")
 def test_workers_that_cannot_start_are_given_up() -> None:
     pool = RayPool(2, never_built, worker_factory=Unfit)
-    with pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: in this state"):
+    with (
+        contextlib.closing(pool),
+        pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: not in this state"),
+    ):
         pool.evaluate(make_task(), make_recipes(20))
-    pool.close()
 
 
 RAY = Path(sysconfig.get_path("scripts")) / "ray"
@@ -315,6 +318,7 @@ def cluster(tmp_path: Path) -> Iterator[Callable[..., str]]:
         head.terminate()
         for process in gone(processes, 20):
             process.kill()
+        head.wait()
 
 
 @pytest.mark.usefixtures("no_pool")
@@ -325,15 +329,14 @@ def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
     address = cluster(PYTHONPATH=str(Path(__file__).parent))
     for name in (address, "auto"):
         monkeypatch.setenv("RAY_ADDRESS", address)
-        pool = RayPool(4, never_built, name, worker_factory=Answering)
-        assert pool.address == address
-        outcome = pool.evaluate(make_task(), make_recipes(512))
-        assert outcome.results.tobytes() == expected(512)
-        while pool.workers() < 2:
-            assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
-        processes = [psutil.Process(pid) for pid in pool.pids()]
-        assert len(processes) == 2, "there are two CPUs"
-        pool.close()
+        with contextlib.closing(RayPool(4, never_built, name, worker_factory=Answering)) as pool:
+            assert pool.address == address
+            outcome = pool.evaluate(make_task(), make_recipes(512))
+            assert outcome.results.tobytes() == expected(512)
+            while pool.workers() < 2:
+                assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
+            processes = [psutil.Process(pid) for pid in pool.pids()]
+            assert len(processes) == 2, "there are two CPUs"
         assert gone(processes) == []
         check_address(address)
 
@@ -347,7 +350,7 @@ def test_a_cluster_that_wants_a_token(
         PoolError, match=rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
     ):
         check_address(address)
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # somebody's; Ray will tell
     assert check_address(address) == address
 
 
