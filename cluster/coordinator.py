@@ -189,7 +189,13 @@ class Evolution:
 
     def done(self) -> bool:
         """Whether there is nothing left to evolve."""
-        return self.solved or self.generation >= self.settings.generations
+        limit = self.settings.car_steps
+        return self.solved or self.generation >= self.settings.generations or 0 < limit <= self.car_steps
+
+    def _is_last(self, generation: int) -> bool:
+        """Whether an unsolved run ends with this generation."""
+        limit = self.settings.car_steps
+        return generation + 1 >= self.settings.generations or 0 < limit <= self.car_steps
 
     def step(self) -> dict[str, float]:
         """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
@@ -221,7 +227,7 @@ class Evolution:
         if self.champion is not None:
             self.genetic.readmit(self.champion.genome)
 
-        if limits.target >= curriculum.config.validation_target or generation + 1 >= s.generations:
+        if limits.target >= curriculum.config.validation_target or self._is_last(generation):
             self._validate(racers[order[: curriculum.config.contenders]])
         self.elites.append(racers[order[0]])
         top = order[0]

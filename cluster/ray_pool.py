@@ -92,7 +92,7 @@ class _Actor:
         return os.getpid()
 
     def run(self, serial: int, recipes: bytes, news: tuple[Any, list[Any]] | None) -> bytes:
-        """A chunk's seconds as float64, then its RESULT [n, episodes], as bytes: a fifth of what pickled arrays take.
+        """A chunk's seconds as float64, then its results [n, episodes], as bytes: a fifth of what pickled arrays take.
 
         `news` holds references to the generation's task and maps, for a worker that does not have them yet.
         """
@@ -530,10 +530,14 @@ def _no_interrupt() -> Iterator[None]:
 
 
 def _forget_token() -> None:
-    """Leave the environment as it was, so that a cluster can be joined afterwards."""
+    """Leave Ray and the environment as they were: with our token, a cluster that is joined next could not call us."""
     if os.environ.get("RAY_AUTH_TOKEN") == _TOKEN:
         del os.environ["RAY_AUTH_TOKEN"]
         os.environ.pop("RAY_AUTH_MODE", None)  # Ray's own doing
+        with contextlib.suppress(ImportError, AttributeError):
+            raylet = importlib.import_module("ray._raylet")
+            raylet.Config.initialize("")
+            raylet.AuthenticationTokenLoader.instance().reset_cache()
 
 
 def _store_bytes() -> int:

@@ -155,7 +155,12 @@ def is_finished(run: RunFolder) -> bool:
     if run.saved is None or not (run.path / SUMMARY).is_file():
         return False
     meta = run.saved[1]
-    return bool(meta["solved"]) or int(meta["generation"]) >= run.settings.generations
+    limit = run.settings.car_steps
+    return (
+        bool(meta["solved"])
+        or int(meta["generation"]) >= run.settings.generations
+        or 0 < limit <= int(meta["car_steps"])
+    )
 
 
 @dataclass

@@ -33,8 +33,10 @@ class EvolveSettings:
     """Network: mlp: and the sizes of its hidden layers."""
     population: int = 512
     """Members of a generation."""
-    generations: int = 100
+    generations: int = 80
     """Generations at most; a run whose champion is solved stops earlier."""
+    car_steps: int = 0
+    """Car-steps at most, checked after each generation; 0: any number."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8
@@ -68,6 +70,8 @@ class EvolveSettings:
             raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no traffic yet; use --traffic 0")
         if not 0 <= self.seed < 1 << 63:
             raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
+        if self.car_steps < 0:
+            raise SettingsError(f"--car-steps must be 0 or more, not {self.car_steps}")
         if self.generations < 1:
             raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
         if self.population > MAX_POPULATION:
