@@ -84,13 +84,15 @@ class Champion:
 
     Attributes:
         genome: float32 [genes].
-        success_rate: of all validation episodes; -1 where it was never validated whole.
+        score: of all validation episodes (`Curriculum.validation_score`).
+        success_rate: of the same.
         distance_m: its mean distance there.
         generation: in which it was found.
     """
 
     genome: np.ndarray
-    success_rate: float = -1.0
+    score: float = 0.0
+    success_rate: float = 0.0
     distance_m: float = 0.0
     generation: int = -1
 
@@ -243,7 +245,7 @@ class Evolution:
             "speed_mps/mean": float(speed.mean()),
             "target_m": limits.target,
             "race/success_rate": race_success,
-            "validation/success_rate": max(self.champion.success_rate, 0.0) if self.champion else 0.0,
+            "validation/success_rate": self.champion.success_rate if self.champion else 0.0,
             "car_steps": float(self.car_steps),
         }
         self.history.append(row)
@@ -252,19 +254,20 @@ class Evolution:
     def _validate(self, contenders: np.ndarray) -> None:
         """Find out whether one of [n, genes] beats the champion; only who passes a first stage is tried whole."""
         maps, episodes = self.curriculum.validation()
-        limits = self.curriculum.validation_limits()
+        limits = self.curriculum.goal_limits()
         first = self.curriculum.config.first_validation
         trial = self.drive("validate", contenders, maps, episodes[:first], limits)
-        k = _best(trial)
-        if self.champion is not None and success_rate(trial)[k] < self.champion.success_rate - 0.02:
+        score = self.curriculum.validation_score(trial)
+        k = int(np.lexsort((trial["distance"].mean(axis=1), score))[-1])
+        if self.champion is not None and score[k] < self.champion.score - 0.02:
             return
         rest = self.drive("validate", contenders[k : k + 1], maps, episodes[first:], limits)
         whole = np.concatenate([trial[k : k + 1], rest], axis=1)
-        rate, distance = float(success_rate(whole)[0]), float(whole["distance"].mean())
-        now = self.champion
-        if now is None or (rate, distance) > (now.success_rate, now.distance_m):
-            self.champion = Champion(contenders[k].copy(), rate, distance, self.generation - 1)
-        self.solved = self.champion is not None and self.champion.success_rate >= self.settings.until
+        total, distance = float(self.curriculum.validation_score(whole)[0]), float(whole["distance"].mean())
+        if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
+            rate = float(success_rate(whole)[0])
+            self.champion = Champion(contenders[k].copy(), total, rate, distance, self.generation - 1)
+        self.solved = self.champion.score >= self.settings.until
 
     def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
         """Add the wall clock's columns to a row."""
@@ -304,7 +307,9 @@ class Evolution:
             "car_steps": self.car_steps,
             "solved": self.solved,
             "columns": list(COLUMNS),
-            "champion": [champion.success_rate, champion.distance_m, champion.generation] if champion else [],
+            "champion": [champion.score, champion.success_rate, champion.distance_m, champion.generation]
+            if champion
+            else [],
         }
         return arrays, meta
 
@@ -337,8 +342,8 @@ class Evolution:
             self.history = [dict(zip(COLUMNS, row.tolist(), strict=True)) for row in history]
             self.elites = list(elites)
             if meta["champion"]:
-                rate, distance, found = meta["champion"]
-                self.champion = Champion(arrays["champion"], float(rate), float(distance), int(found))
+                score, rate, distance, found = meta["champion"]
+                self.champion = Champion(arrays["champion"], float(score), float(rate), float(distance), int(found))
             self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
@@ -373,11 +378,6 @@ def _speed(results: np.ndarray, period_s: float) -> float:
     """Mean over episodes of the speed made good: new ground over time, in m/s."""
     seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
     return float((results["distance"] / seconds).mean())
-
-
-def _best(results: np.ndarray) -> int:
-    """Index of the member with the most successes, the greater distance among equals."""
-    return int(np.lexsort((results["distance"].mean(axis=1), success_rate(results)))[-1])
 
 
 def _plain(episodes: np.ndarray) -> np.ndarray:

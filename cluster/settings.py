@@ -56,7 +56,7 @@ class EvolveSettings:
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
     until: float = 0.97
-    """Stop when the champion succeeds in this share of validation episodes; above 1: never."""
+    """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""

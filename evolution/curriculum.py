@@ -49,7 +49,7 @@ class CurriculumConfig:
     contenders: int = 4  # racers that are validated each generation
     first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
-    champion_pace: float = 5.6  # m/s, below which a validation episode is no success
+    champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
 
 
 def spread_starts(
@@ -103,13 +103,8 @@ class Curriculum:
         """Control steps that a training episode of so many m is given."""
         return math.ceil((target / self.config.pace + self.config.slack) / self.period)
 
-    def validation_limits(self) -> Limits:
-        """Of validation: the goal at the champion's pace or faster."""
-        seconds = self.goal / self.config.champion_pace
-        return Limits(self.goal, min(self.goal_steps, math.ceil(seconds / self.period)))
-
     def goal_limits(self) -> Limits:
-        """Of a full episode, as held-out ones are."""
+        """Of a full episode, as those of validation and the held-out ones are."""
         return Limits(self.goal, self.goal_steps)
 
     def sigma(self, sigma: float) -> float:
@@ -175,6 +170,12 @@ class Curriculum:
     def validation(self) -> tuple[list[int], np.ndarray]:
         """Map seeds and EPISODE [validation], the same for every run of the scenario."""
         return spread_starts(self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation)
+
+    def validation_score(self, results: np.ndarray) -> np.ndarray:
+        """How good members are, in [0, 1], by results [n, e] of validation: success, worth less below the pace."""
+        metres = results["distance"].astype(np.float64).sum(axis=1)
+        speed = metres / np.maximum(results["steps"].sum(axis=1) * self.period, 1e-9)
+        return success_rate(results) * np.minimum(speed / self.config.champion_pace, 1.0)
 
 
 def success_rate(results: np.ndarray) -> np.ndarray:
