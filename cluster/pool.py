@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,11 +17,19 @@ from gridsim.scenarios import Scenario
 BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
 Progress = Callable[[int, int], None]  # (members done, members in all)
 
+SHARES = 8  # chunks for each worker, at least, where there is enough to do
 SMALLEST_CHUNK = 4  # members
 
 
 class PoolError(Exception):
     """No result can be had from the workers; the message is one line for the user."""
+
+
+class Chunk(NamedTuple):
+    """What is sent to a worker at once: some members, on some of the task's episodes."""
+
+    rows: slice
+    columns: slice
 
 
 @dataclass
@@ -44,10 +53,20 @@ class Outcome:
     bytes_down: int = 0
     bytes_up: int = 0
     broadcast_bytes: int = 0
+    _done: int = 0
 
-    def add(self, worker: int, rows: slice, results: np.ndarray, seconds: float) -> None:
-        """Take in a chunk's results [rows, episodes] and the time that they took."""
-        self.results[rows] = results
+    def members(self) -> int:
+        """Members that are done, counting the parts of those that are done in part."""
+        return len(self.results) * self._done // self.results.size if self.results.size else 0
+
+    def whole(self) -> bool:
+        """Whether every result is there."""
+        return self._done >= self.results.size
+
+    def add(self, worker: int, chunk: Chunk, results: np.ndarray, seconds: float) -> None:
+        """Take in a chunk's results [rows, columns] and the time that they took."""
+        self.results[chunk.rows, chunk.columns] = results
+        self._done += results.size
         self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
 
 
@@ -79,13 +98,14 @@ class SerialPool:
         recipes = freeze(recipes)
         outcome = new_outcome(task, recipes)
         maps = [self._build_map(*name) for name in task.maps]
-        for index, rows in enumerate(chunks(len(recipes), 1)):
+        for index, chunk in enumerate(cut(len(recipes), len(task.episodes), 1)):
             try:
-                outcome.add(0, rows, *self._worker.evaluate(task, maps, recipes[rows]))
+                part = of_episodes(task, chunk.columns.start, chunk.columns.stop)
+                outcome.add(0, chunk, *self._worker.evaluate(part, maps, recipes[chunk.rows]))
             except Exception as error:
-                raise PoolError(f"a worker failed on {describe(index, rows)}: {last_line(error)}") from error
+                raise PoolError(f"a worker failed on {describe(index, chunk)}: {last_line(error)}") from error
             if on_progress:
-                on_progress(rows.stop, len(recipes))
+                on_progress(outcome.members(), len(recipes))
         outcome.wall_s = time.perf_counter() - started
         return outcome
 
@@ -113,9 +133,32 @@ def chunks(n: int, workers: int, smallest: int = SMALLEST_CHUNK) -> list[slice]:
     return cut
 
 
-def describe(index: int, rows: slice) -> str:
+def cut(n: int, episodes: int, workers: int, smallest: int = SMALLEST_CHUNK) -> list[Chunk]:
+    """Cut n members on so many episodes into chunks. Depends on the arguments alone.
+
+    Many members are cut into groups that drive all episodes; few, as in a race or in validation, one by one and
+    across the episodes as well, so that every worker has its share even of one member.
+    """
+    wanted = SHARES * workers
+    if n >= wanted * smallest:
+        return [Chunk(rows, slice(0, episodes)) for rows in chunks(n, workers, smallest)]
+    size = max(n // wanted, 1)
+    rows_of = [slice(at, min(at + size, n)) for at in range(0, n, size)]
+    parts = min(-(-wanted // max(len(rows_of), 1)), episodes)
+    edges = [episodes * k // parts for k in range(parts + 1)] if parts else []
+    return [Chunk(rows, slice(a, b)) for rows in rows_of for a, b in itertools.pairwise(edges)]
+
+
+def of_episodes(task: Task, first: int, stop: int) -> Task:
+    """The task with only some of its episodes."""
+    if stop - first == len(task.episodes):
+        return task
+    return replace(task, episodes=task.episodes[first:stop])
+
+
+def describe(index: int, chunk: Chunk) -> str:
     """A chunk in words."""
-    return f"chunk {index} (members {rows.start} to {rows.stop - 1})"
+    return f"chunk {index} (members {chunk.rows.start} to {chunk.rows.stop - 1})"
 
 
 def last_line(error: BaseException) -> str:

@@ -38,10 +38,11 @@ from cluster.pool import (
     Outcome,
     PoolError,
     Progress,
-    chunks,
+    cut,
     describe,
     last_line,
     new_outcome,
+    of_episodes,
 )
 from cluster.worker import Task, Worker
 from evolution.breeding import RECIPE
@@ -51,6 +52,7 @@ from gridsim.scenarios import Scenario
 PROBE_S = 3.0
 CONNECT_S = 60.0
 QUEUE = 2  # chunks that a worker holds: one that it works on, one so that it need not wait for us
+MANY = 256  # members, from which on a call tells what members cost
 WORTH_SENDING_S = 0.01  # of evaluation: ten times what it costs to send a chunk and to take in its results
 MAX_KILLS = 3  # workers that one chunk may cost
 MAX_FAILED_STARTS = 3  # in a row
@@ -91,17 +93,19 @@ class _Actor:
     def hello(self) -> int:
         return os.getpid()
 
-    def run(self, serial: int, recipes: bytes, news: tuple[Any, list[Any]] | None) -> bytes:
+    def run(self, serial: int, recipes: bytes, first: int, stop: int, news: tuple[Any, list[Any]] | None) -> bytes:
         """A chunk's seconds as float64, then its results [n, episodes], as bytes: a fifth of what pickled arrays take.
 
-        `news` holds references to the generation's task and maps, for a worker that does not have them yet.
+        `first` and `stop` say which of the task's episodes; `news` holds references to the task and its maps, for a
+        worker that does not have them yet.
         """
         if news:
             self._take_up(serial, *news)
         if self._task is None or serial != self._serial:
             raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
         maps = [self._maps[name] for name in self._task.maps]
-        results, seconds = self._worker.evaluate(self._task, maps, np.frombuffer(recipes, RECIPE))
+        part = of_episodes(self._task, first, stop)
+        results, seconds = self._worker.evaluate(part, maps, np.frombuffer(recipes, RECIPE))
         return np.float64(seconds).tobytes() + results.tobytes()
 
     def _take_up(self, serial: int, task_ref: Any, map_refs: list[Any]) -> None:
@@ -186,23 +190,24 @@ class RayPool:
         self._wait_for_ray()
         recipes = freeze(recipes)
         outcome = new_outcome(task, recipes)
-        cut = chunks(len(recipes), self._asked, self._smallest)
-        todo = deque(range(len(cut)))
+        parts = cut(len(recipes), len(task.episodes), self._asked, self._smallest)
+        todo = deque(range(len(parts)))
         kills: Counter[int] = Counter()
         suspects: set[int] = set()
-        done = 0
         self._serial += 1
         for slot in self._slots:
             slot.sent.clear()  # left over where the last call was interrupted
         news = self._broadcast(task, outcome)
         nobody_since = time.monotonic()
 
-        while done < len(recipes):
+        while not outcome.whole():
             for slot in self._free(todo, suspects):
                 chunk = todo.popleft()
-                raw = recipes[cut[chunk]].tobytes()
-                known = slot.serial == self._serial
-                slot.sent.append((chunk, slot.actor.run.remote(self._serial, raw, None if known else news)))
+                rows, columns = parts[chunk]
+                raw = recipes[rows].tobytes()
+                what = None if slot.serial == self._serial else news
+                answer = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, what)
+                slot.sent.append((chunk, answer))
                 slot.serial = self._serial
                 outcome.bytes_down += len(raw)
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
@@ -212,17 +217,17 @@ class RayPool:
                     self._greet(slot)
                     continue
                 chunk = slot.sent[0][0]
-                rows = cut[chunk]
+                part = parts[chunk]
                 try:
                     raw = ray.get(ref)
                 except ray.exceptions.RayTaskError as error:
                     cause = error.cause if isinstance(error.cause, BaseException) else error
-                    raise PoolError(f"a worker failed on {describe(chunk, rows)}: {last_line(cause)}") from error
+                    raise PoolError(f"a worker failed on {describe(chunk, part)}: {last_line(cause)}") from error
                 except ray.exceptions.RayError as error:
                     kills[chunk] += 1
                     if kills[chunk] >= MAX_KILLS:
                         raise PoolError(
-                            f"{describe(chunk, rows)} killed its worker {MAX_KILLS} times; the last time "
+                            f"{describe(chunk, part)} killed its worker {MAX_KILLS} times; the last time "
                             + _reason(error)
                             + self._logs()
                         ) from error
@@ -232,18 +237,19 @@ class RayPool:
                     self._replace(slot)
                     continue
                 slot.sent.popleft()
-                results = np.frombuffer(raw, task.row, offset=8).reshape(-1, len(task.episodes))
-                outcome.add(slot.number, rows, results, float(np.frombuffer(raw, np.float64, 1)[0]))
+                results = np.frombuffer(raw, task.row, offset=8).reshape(-1, part.columns.stop - part.columns.start)
+                outcome.add(slot.number, part, results, float(np.frombuffer(raw, np.float64, 1)[0]))
                 outcome.bytes_up += len(raw)
-                done += rows.stop - rows.start
                 if on_progress:
-                    on_progress(done, len(recipes))
+                    on_progress(outcome.members(), len(recipes))
             if self.pids():
                 nobody_since = time.monotonic()
             elif time.monotonic() - nobody_since > self._start_timeout_s:
                 raise PoolError(f"no worker came up within {self._start_timeout_s:g} s: {_capacity()}")
-        if done:  # where members are cheap, sending many small chunks costs more than waiting for a larger one
-            member_s = sum(outcome.busy_s.values()) / done
+        if (
+            len(recipes) >= MANY
+        ):  # where members are cheap, sending many small chunks costs more than waiting for a larger one
+            member_s = sum(outcome.busy_s.values()) / len(recipes)
             self._smallest = int(np.clip(WORTH_SENDING_S / max(member_s, 1e-9), SMALLEST_CHUNK, 8 * SMALLEST_CHUNK))
         outcome.wall_s = time.perf_counter() - started
         return outcome

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.pool import SMALLEST_CHUNK, PoolError, SerialPool, chunks, last_line
+from cluster.pool import SMALLEST_CHUNK, PoolError, SerialPool, chunks, cut, last_line
 from cluster.worker import Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.episodes import lane_starts
@@ -28,7 +28,7 @@ class Answering(Worker):
     def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
         started = time.perf_counter()
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
-        results["distance"] = recipes["seed"][:, None] * 16.0 + np.arange(len(task.episodes))
+        results["distance"] = recipes["seed"][:, None] * 16.0 + task.episodes["start"][:, 4]
         results["paced"] = task.parents[recipes["a"], 0][:, None]
         results["steps"] = sum(m.seed for m in maps)
         return results, time.perf_counter() - started
@@ -47,6 +47,7 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
     parents = np.random.default_rng(0).standard_normal((8, 311)).astype(np.float32)
     if episodes is None:
         episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
+        episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
     return Task("mlp:6,7", parents, 12345, Mutation(), episodes, maps, Limits(150.0, 300), SimConfig())
 
 
@@ -89,6 +90,23 @@ def test_chunks_let_nobody_wait_for_the_slowest(workers: int) -> None:
         k = busy.index(min(busy))
         busy[k] += rows.stop - rows.start
     assert max(busy) - min(busy) <= 2 * SMALLEST_CHUNK
+
+
+@given(st.integers(0, 600), st.integers(1, 300), st.integers(1, 16))
+def test_cut_covers_every_episode_of_every_member_once(n: int, episodes: int, workers: int) -> None:
+    seen = np.zeros((n, episodes), dtype=int)
+    for rows, columns in cut(n, episodes, workers):
+        assert rows.stop > rows.start
+        assert columns.stop > columns.start
+        seen[rows, columns] += 1
+    assert (seen == 1).all()
+
+
+@pytest.mark.parametrize(("n", "episodes"), [(1, 208), (4, 48), (24, 16)])
+def test_few_members_keep_all_workers_busy(n: int, episodes: int) -> None:
+    parts = cut(n, episodes, 2)
+    largest = max((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in parts)
+    assert largest <= n * episodes / 12
 
 
 def test_no_members_no_results() -> None:
