@@ -17,7 +17,7 @@ from gridsim.scenarios import Scenario
 BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
 Progress = Callable[[int, int], None]  # (members done, members in all)
 
-SHARES = 8  # chunks for each worker, at least, where there is enough to do
+SHARES = 5  # chunks for each worker, at least, where there is enough to do
 SMALLEST_CHUNK = 4  # members
 
 

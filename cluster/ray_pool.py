@@ -56,9 +56,9 @@ MANY = 256  # members, from which on a call tells what members cost
 WORTH_SENDING_S = 0.01  # of evaluation: ten times what it costs to send a chunk and to take in its results
 MAX_KILLS = 3  # workers that one chunk may cost
 MAX_FAILED_STARTS = 3  # in a row
-STORE_BYTES = 256 << 20  # of shared memory, taken page by page as it is used
+STORE_BYTES = 384 << 20  # of shared memory, taken page by page as it is used
 LEAST_STORE_BYTES = 80 << 20  # Ray takes no less than 75 MiB
-MAP_BYTES = 112 << 20  # of maps that are kept in the object store
+MAP_BYTES = 240 << 20  # of maps that are kept in the object store
 
 # Read when Ray is imported.
 _ENVIRONMENT = {
@@ -78,6 +78,10 @@ _TOKEN = secrets.token_hex(32)
 _AUTH_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
+#: What a worker needs to take up a task: references to it and to its maps, and the maps that the object store holds.
+_News = tuple[Any, list[Any], set[tuple[str, int]]]
+
+
 class _Actor:
     """Runs in a worker's process: holds the generation's task and maps, answers chunks."""
 
@@ -93,7 +97,7 @@ class _Actor:
     def hello(self) -> int:
         return os.getpid()
 
-    def run(self, serial: int, recipes: bytes, first: int, stop: int, news: tuple[Any, list[Any]] | None) -> bytes:
+    def run(self, serial: int, recipes: bytes, first: int, stop: int, news: _News | None) -> bytes:
         """A chunk's seconds as float64, then its results [n, episodes], as bytes: a fifth of what pickled arrays take.
 
         `first` and `stop` say which of the task's episodes; `news` holds references to the task and its maps, for a
@@ -108,16 +112,16 @@ class _Actor:
         results, seconds = self._worker.evaluate(part, maps, np.frombuffer(recipes, RECIPE))
         return np.float64(seconds).tobytes() + results.tobytes()
 
-    def _take_up(self, serial: int, task_ref: Any, map_refs: list[Any]) -> None:
+    def _take_up(self, serial: int, task_ref: Any, map_refs: list[Any], held: set[tuple[str, int]]) -> None:
         import ray
 
         self._task = None
         task: Task = ray.get(task_ref)
-        # Maps that the last task had too are kept as they are; those that left are let go.
-        self._maps = {
-            name: self._maps[name] if name in self._maps else Scenario.from_arrays(ray.get(ref))
-            for name, ref in zip(task.maps, map_refs, strict=True)
-        }
+        for name, ref in zip(task.maps, map_refs, strict=True):
+            if name not in self._maps:
+                self._maps[name] = Scenario.from_arrays(ray.get(ref))
+        # A map in use stays in the object store: those that the coordinator has let go are let go here.
+        self._maps = {name: scenario for name, scenario in self._maps.items() if name in held}
         self._serial, self._task = serial, task
 
 
@@ -353,7 +357,7 @@ class RayPool:
             if len(todo) > len(up) and 0 < len(slot.sent) < QUEUE and suspects.isdisjoint([todo[0], slot.sent[0][0]]):
                 yield slot
 
-    def _broadcast(self, task: Task, outcome: Outcome) -> tuple[Any, list[Any]]:
+    def _broadcast(self, task: Task, outcome: Outcome) -> _News:
         """Put the task, and those of its maps that are not there yet, into the object store."""
         import ray
 
@@ -370,7 +374,7 @@ class RayPool:
         used = sum(size for _, size in self._maps.values())
         while used > self._map_bytes and len(self._maps) > len(set(task.maps)):
             used -= self._maps.popitem(last=False)[1][1]
-        return ray.put(task), [self._maps[name][0] for name in task.maps]
+        return ray.put(task), [self._maps[name][0] for name in task.maps], set(self._maps)
 
 
 def check_address(address: str) -> str:

@@ -106,7 +106,7 @@ def test_cut_covers_every_episode_of_every_member_once(n: int, episodes: int, wo
 def test_few_members_keep_all_workers_busy(n: int, episodes: int) -> None:
     parts = cut(n, episodes, 2)
     largest = max((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in parts)
-    assert largest <= n * episodes / 12
+    assert largest <= n * episodes / 8
 
 
 def test_no_members_no_results() -> None:
