@@ -33,7 +33,7 @@ class EvolveSettings:
     """Network: mlp: and the sizes of its hidden layers."""
     population: int = 512
     """Members of a generation."""
-    generations: int = 80
+    generations: int = 120
     """Generations at most; a run whose champion is solved stops earlier."""
     car_steps: int = 0
     """Car-steps at most, checked after each generation; 0: any number."""

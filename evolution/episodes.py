@@ -11,7 +11,7 @@ from gridsim.scenarios import Scenario, sample_starts
 
 
 def lane_starts(scenarios: Sequence[Scenario], maps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Episodes EPISODE [len(maps)] that start uniformly over the lanes of `scenarios[maps[k]]`, at the lower speed."""
+    """Episodes EPISODE [len(maps)] that start uniformly over the lanes of `scenarios[maps[k]]`, at rest."""
     episodes = np.zeros(len(maps), dtype=EPISODE)
     episodes["map"] = maps
     for m in np.unique(maps):

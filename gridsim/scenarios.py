@@ -17,6 +17,7 @@ from gridsim.seamless import seamless_layout
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
+START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
 ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high")
 
 
@@ -140,12 +141,12 @@ def _starts_at(points, mileage, shares, speed, starts):
 
 
 def starts_at(scenario: Scenario, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at the lower speed.
+    """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it.
     """
     starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, scenario.road.speed_low, starts)
+    _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, np.float32(START_SPEED), starts)
     return starts
 
 

@@ -172,7 +172,7 @@ def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Scenario]) 
     assert starts.shape == (500, 5)
     assert starts.dtype == np.float32
     assert min(clearance(scenario.road, x, y) for x, y in starts[:, :2]) > 1.0
-    np.testing.assert_array_equal(starts[:, 3:], np.tile([scenario.road.speed_low, 0.0], (500, 1)))
+    np.testing.assert_array_equal(starts[:, 3:], np.tile([0.0, 0.0], (500, 1)))
     # The first share is the first lane's beginning, and equal shares are equal lengths along a lane.
     first = starts_at(scenario, np.array([0.0]))[0]
     np.testing.assert_allclose(first[:2], scenario.lanes.points[0], atol=1e-5)
@@ -244,7 +244,7 @@ def test_the_step_after_an_end_begins_the_next_episode_and_does_not_drive(maps: 
     assert (info["distance_m"] > 0.0).all()
     _, rewards, terminations, truncations, info = env.step(np.full(8, Action.ACCELERATE))
     assert not (terminations | truncations | (rewards != 0.0) | (info["distance_m"] != 0.0)).any()
-    np.testing.assert_array_equal(info["speed_mps"], maps[0].road.speed_low)
+    np.testing.assert_array_equal(info["speed_mps"], 0.0)
     assert set(info["end"]) == {"running"}
     *_, info = env.step(np.full(8, Action.ACCELERATE))
     assert (info["distance_m"] > 0.0).all()
