@@ -21,7 +21,9 @@ SHOULDER = 0.5  # m of paved road outside the outer lane
 HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
 ROUNDABOUT_RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
 ROUNDABOUT_HALF = 4.5  # m, half width of the ring, which is wide enough for a lorry to turn
-ROUNDABOUT_SHARE = 0.08  # of the T and crossing tiles
+ROUNDABOUT_FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
+FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those: their outer edge runs on into the arm's
+ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
 SHORTEST_BLOCK = 8  # tiles around the smallest block of the network
 LANE_STEP = 1.0  # m between points of a lane, at most
@@ -103,19 +105,32 @@ def _through(entry: int, exit: int) -> np.ndarray:
     return _arc_points(cx, cy, radius, first, math.pi / 2 if left else -math.pi / 2)
 
 
+def _flare() -> tuple[float, float, float]:
+    """The arc by which an arm's lane joins the ring: (x, y of its centre for the eastern arm, ring angle in rad).
+
+    It touches the lane's centre line from the right and the ring's from outside.
+    """
+    y = LANE_WIDTH / 2 + ROUNDABOUT_FLARE
+    x = math.sqrt((ROUNDABOUT_RADIUS + ROUNDABOUT_FLARE) ** 2 - y**2)
+    return x, y, math.atan2(y, x)
+
+
+def _turned(points: np.ndarray, quarters: int) -> np.ndarray:
+    """Points [n, 2] turned counter-clockwise by so many quarters."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
+
+
 def _around(entry: int, exit: int) -> np.ndarray:
     """Lane [n, 2] through a roundabout: in on the right, counter-clockwise round the ring, out on the right."""
-    half, offset = TILE / 2, LANE_WIDTH / 2
-    reach = math.sqrt(ROUNDABOUT_RADIUS**2 - offset**2)
-    slip = math.asin(offset / ROUNDABOUT_RADIUS)
-    dx, dy = DIRECTIONS[entry]
-    ex, ey = DIRECTIONS[exit]
-    inward = np.linspace(half, reach, 7)[:, None] * np.array([dx, dy]) + offset * np.array([-dy, dx])
-    outward = np.linspace(reach, half, 7)[:, None] * np.array([ex, ey]) + offset * np.array([ey, -ex])
-    # Right of the inbound direction lies counter-clockwise of the arm, right of the outbound one clockwise.
-    sweep = (exit - entry) % 4 * math.pi / 2 - 2 * slip
-    ring = _arc_points(0.0, 0.0, ROUNDABOUT_RADIUS, entry * math.pi / 2 + slip, sweep)
-    return np.concatenate([inward, ring[1:-1], outward])
+    x, y, angle = _flare()
+    edge = np.array([[TILE / 2, LANE_WIDTH / 2]])
+    join = _arc_points(x, y, ROUNDABOUT_FLARE, -math.pi / 2, angle - math.pi / 2)
+    inward = np.concatenate([edge, join])
+    outward = inward[::-1] * [1.0, -1.0]  # the same way, mirrored and driven the other way round
+    sweep = (exit - entry) % 4 * math.pi / 2 - 2 * angle
+    ring = _arc_points(0.0, 0.0, ROUNDABOUT_RADIUS, entry * math.pi / 2 + angle, sweep)
+    return np.concatenate([_turned(inward, entry), ring[1:-1], _turned(outward, exit)])
 
 
 def _tile_strips(arms: list[int], roundabout: bool) -> tuple[list[list[float]], list[list[float]]]:
@@ -124,11 +139,15 @@ def _tile_strips(arms: list[int], roundabout: bool) -> tuple[list[list[float]], 
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
     if roundabout:
+        x, y, angle = _flare()
         arcs.append([0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF])
         for arm in arms:
             dx, dy = DIRECTIONS[arm]
             inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
             lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
+            for side in (1.0, -1.0):  # way in, way out
+                (cx, cy), first = _turned(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
+                arcs.append([cx, cy, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
         return lines, arcs
     for k, a in enumerate(arms):
         for b in arms[k + 1 :]:
