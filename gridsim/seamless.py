@@ -2,8 +2,8 @@
 
 Every tile is read off the edges its node has in the graph: two opposite ones make a straight, two others a curve, three
 a T, four a crossing; now and then a T or crossing is built as a roundabout. No node has one edge alone, so every open
-edge meets an open edge and every lane has a successor. No block of the network has fewer than eight tiles around it,
-about the 200 m within which a stretch that is driven again counts nothing.
+edge meets an open edge and every lane has a successor. No block of the network has fewer than ten tiles around it:
+round one it is more than the 200 m within which a stretch that is driven again counts nothing, corners cut and all.
 """
 
 from __future__ import annotations
@@ -25,23 +25,32 @@ ROUNDABOUT_FLARE = 8.0  # m, radius of the arcs by which lanes join and leave th
 FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those: their outer edge runs on into the arm's
 ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
-SHORTEST_BLOCK = 8  # tiles around the smallest block of the network
+SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
 LANE_STEP = 1.0  # m between points of a lane, at most
 
 # Edges of a tile in counter-clockwise order: east, north, west, south.
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
-def _distance(edges: np.ndarray, start: int, goal: int, limit: int) -> int:
-    """Tiles from start to goal over present edges [n, 4], at most `limit`."""
-    frontier, seen, distance = {start}, {start}, 0
-    while frontier and distance < limit:
-        if goal in frontier:
-            return distance
-        frontier = {_neighbour(tile, d) for tile in frontier for d in range(4) if edges[tile, d]} - seen
+def _closes_short_block(edges: np.ndarray, tile: int, direction: int) -> bool:
+    """Whether an edge [n, 4] from a tile would close a block of fewer than SHORTEST_BLOCK tiles.
+
+    Searched on the plane that the torus is rolled from: a way round the whole torus is no block.
+    """
+    x0, y0 = tile % TILES, tile // TILES
+    goal = DIRECTIONS[direction]
+    frontier, seen = {(0, 0)}, {(0, 0)}
+    for _ in range(SHORTEST_BLOCK - 2):
+        frontier = {
+            (x + DIRECTIONS[d][0], y + DIRECTIONS[d][1])
+            for x, y in frontier
+            for d in range(4)
+            if edges[(y0 + y) % TILES * TILES + (x0 + x) % TILES, d]
+        } - seen
         seen |= frontier
-        distance += 1
-    return limit
+        if goal in frontier:
+            return True
+    return False
 
 
 def _neighbour(tile: int, direction: int) -> int:
@@ -57,7 +66,7 @@ def tile_graph(rng: np.random.Generator) -> np.ndarray:
         for k in rng.permutation(len(pairs))[: round(EDGE_SHARE * len(pairs))]:
             tile, d = pairs[k]
             other = _neighbour(tile, d)
-            if _distance(edges, tile, other, SHORTEST_BLOCK - 1) >= SHORTEST_BLOCK - 1:
+            if not _closes_short_block(edges, tile, d):
                 edges[tile, d] = edges[other, (d + 2) % 4] = True
         while (ends := np.flatnonzero(edges.sum(axis=1) == 1)).size:
             for tile in ends:
