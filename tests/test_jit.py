@@ -194,6 +194,7 @@ def both(root, tmp_path_factory):
     rng = np.random.default_rng(5)
     given = {f"map_{k}": v for k, v in scenario.arrays().items()}
     given["start"] = sample_starts(scenario, 1, rng)[0]
+    given["start"][3] = 5.0  # m/s
     given["actions"] = np.array([0, 0, 4, 1, 5, 2, 2, 6, 4, 3, 0, 7, 7, 0, 5, 1, 4, 2, 0, 3, 0, 4, 4, 0, 1])
     given["genomes"] = rng.normal(size=(3, SPEC.size)).astype(F)
     np.savez(folder / "given.npz", allow_pickle=False, **given)
