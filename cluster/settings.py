@@ -55,7 +55,7 @@ class EvolveSettings:
     """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
-    until: float = 0.97
+    until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
     def curriculum(self) -> CurriculumConfig:
