@@ -48,12 +48,33 @@ class EpisodeConfig:
 
 
 @dataclass(frozen=True)
+class TrafficConfig:
+    """How other cars drive: IDM (Treiber et al. 2000, city values) and MOBIL (Kesting et al. 2007)."""
+
+    acceleration: float = 1.5  # m/s2, a of IDM
+    comfort: float = 2.0  # m/s2, comfortable deceleration, b of IDM
+    braking: float = 8.0  # m/s2, greatest deceleration
+    headway: float = 1.2  # s, T of IDM
+    jam: float = 2.0  # m, bumper to bumper at standstill, s0 of IDM
+    lateral: float = 2.0  # m/s2, lateral acceleration in bends
+    politeness: float = 0.2  # p of MOBIL
+    threshold: float = 0.2  # m/s2 to be gained by a change of lanes
+    safe_braking: float = 3.0  # m/s2 that a change of lanes may ask of who is behind
+    lane_change_speed: float = 1.25  # m/s sideways: three seconds for a lane
+    apart: float = 2.9  # m between the middles of two lanes below which cars on them may touch
+    spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
+    spawn_gap_ego: float = 22.0  # m between a car and the ego car then
+    courtesy: float = 10.0  # m: standing with a standing car so near ahead is not idleness
+
+
+@dataclass(frozen=True)
 class SimConfig:
     """All that the simulator needs to know beside the scenario."""
 
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)
     episode: EpisodeConfig = field(default_factory=EpisodeConfig)
+    traffic: TrafficConfig = field(default_factory=TrafficConfig)
 
 
 class Constants(NamedTuple):
@@ -78,6 +99,7 @@ class Constants(NamedTuple):
     progress: np.float32  # m
     revisit: np.float32  # m
     patience: np.int32  # steps
+    courtesy: np.float32  # m
 
 
 def constants(config: SimConfig) -> Constants:
@@ -122,4 +144,5 @@ def constants(config: SimConfig) -> Constants:
         progress=f(episode.progress),
         revisit=f(episode.revisit),
         patience=np.int32(episode.patience),
+        courtesy=f(config.traffic.courtesy),
     )

@@ -13,12 +13,15 @@ from enum import IntEnum
 
 import numpy as np
 
-from gridsim.atlas import Atlas, make_atlas, road_of
+from gridsim.atlas import Atlas, make_atlas, network_of, road_of
+from gridsim.boxes import cast_boxes, hits_box, nearest_box, stands_ahead
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.roads import VISIT_CELL, Road, clearance
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan, sense
+from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
+from gridsim.traffic import Drivers, drivers, flow, spawn
 from gridsim.vehicle import Action, act, advance, path_curvature
 
 _F, _I = np.float32, np.int32
@@ -110,37 +113,53 @@ def place(road, start, car, visits):
 
 
 @leaf
-def look(road, constants, fan, car, beams, ranges):
-    """Ranges (m) of the car's sensor, from the middle of its front axle."""
+def look(road, constants, fan, car, world, beams, ranges):
+    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car."""
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
+    if world.shape[0] > 0:
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], world, ranges)
 
 
 @leaf
-def drive(road, constants, car, visits, action):
-    """One control period of one car under one of the eight actions. Returns RUNNING, COLLISION or IDLE."""
+def drive(road, constants, car, visits, world, action):
+    """One control period of one car under one of the eight actions. Returns RUNNING, COLLISION or IDLE.
+
+    Its world's traffic has moved already.
+    """
     acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
     car[STEERING] = steering
-    return move(road, constants, car, visits, acceleration)
+    return move(road, constants, car, visits, world, acceleration)
 
 
 @leaf
-def move(road, constants, car, visits, acceleration):
+def move(road, constants, car, visits, world, acceleration):
     """One control period with the car's present steering and an acceleration in m/s2."""
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
     curvature = path_curvature(constants, speed, car[STEERING])
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
+    near = False
+    if world.shape[0] > 0:
+        nearest, closing = nearest_box(world, road.width, road.height, x, y)
+        near = nearest < _F(20.0)
+        if near:
+            fastest += closing
     parts = _I(1) + _I(fastest * constants.dt / SUBSTEP)
     dt = constants.dt / _F(parts)
     moved = _ZERO
     crashed = False
-    for _ in range(parts):
+    for part in range(parts):
         x, y, cosine, sine, speed, length = advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
         moved += length
         if collides(road, constants, x, y, cosine, sine):
             crashed = True
             break
+        if near:
+            back = _ONE - _F(part + 1) / _F(parts)
+            if hits_box(constants, world, back, constants.dt, road.width, road.height, x, y, cosine, sine):
+                crashed = True
+                break
     if x < _ZERO:
         x += road.width
     elif x >= road.width:
@@ -171,7 +190,11 @@ def move(road, constants, car, visits, acceleration):
     if road.speed_low <= speed and speed <= road.speed_high:
         car[PACED] += gained
     if gained < constants.progress:
-        car[IDLE] += _ONE
+        # Who stands behind a standing car waits as it has to.
+        if not near or not stands_ahead(
+            constants, world, constants.courtesy, road.width, road.height, car[X], car[Y], cosine, sine
+        ):
+            car[IDLE] += _ONE
     else:
         car[IDLE] = _ZERO
     if crashed:
@@ -182,9 +205,9 @@ def move(road, constants, car, visits, acceleration):
 
 
 @leaf
-def control(road, constants, car, visits, action, target, max_steps):
+def control(road, constants, car, visits, world, action, target, max_steps):
     """`drive`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
-    end = drive(road, constants, car, visits, action)
+    end = drive(road, constants, car, visits, world, action)
     if end == 0:
         if car[DISTANCE] >= target:
             return 3
@@ -194,40 +217,73 @@ def control(road, constants, car, visits, action, target, max_steps):
 
 
 @njit
-def _place_some(road, constants, fan, order, which, starts, cars, visits, beams, ranges):
+def _place_some(road, constants, fan, order, which, starts, cars, visits, worlds, beams, ranges):
     for k in order:
         i = which[k]
         place(road, starts[k], cars[i], visits[i])
-        look(road, constants, fan, cars[i], beams, ranges[k])
+        look(road, constants, fan, cars[i], worlds[i], beams, ranges[k])
 
 
 @njit(nogil=True)
-def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, ranges):
+def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, worlds, ranges):
     """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
     beams = np.empty((3, LANES), dtype=np.float32)
     for row, first, last in runs:
         road = road_of(atlas, row)
-        _place_some(road, constants, fan, order[first:last], which, starts, cars, visits, beams, ranges)
+        _place_some(road, constants, fan, order[first:last], which, starts, cars, visits, worlds, beams, ranges)
 
 
 @njit
 def _control_some(
-    road, constants, fan, order, actions, target, max_steps, cars, visits, ends, beams, ranges, speeds, progress
+    road,
+    network,
+    constants,
+    drivers,
+    fan,
+    order,
+    actions,
+    target,
+    max_steps,
+    cars,
+    visits,
+    worlds,
+    ends,
+    beams,
+    ranges,
+    speeds,
+    progress,
 ):
     for i in order:
         car = cars[i]
         progress[i] = _ZERO
         if ends[i] == 0:
             before = car[DISTANCE]
-            ends[i] = control(road, constants, car, visits[i], actions[i], target, max_steps)
+            if worlds.shape[1] > 0:
+                flow(network, drivers, worlds[i], car, _I(car[STEPS]))
+            ends[i] = control(road, constants, car, visits[i], worlds[i], actions[i], target, max_steps)
             progress[i] = car[DISTANCE] - before
-        look(road, constants, fan, car, beams, ranges[i])
+        look(road, constants, fan, car, worlds[i], beams, ranges[i])
         speeds[i] = car[SPEED]
 
 
 @njit(nogil=True)
 def _control_all(
-    atlas, constants, fan, order, runs, actions, target, max_steps, cars, visits, ends, ranges, speeds, progress
+    atlas,
+    constants,
+    drivers,
+    fan,
+    order,
+    runs,
+    actions,
+    target,
+    max_steps,
+    cars,
+    visits,
+    worlds,
+    ends,
+    ranges,
+    speeds,
+    progress,
 ):
     """One control period of every car; who has ended stands still.
 
@@ -237,7 +293,9 @@ def _control_all(
     for row, first, last in runs:
         _control_some(
             road_of(atlas, row),
+            network_of(atlas, row),
             constants,
+            drivers,
             fan,
             order[first:last],
             actions,
@@ -245,6 +303,7 @@ def _control_all(
             max_steps,
             cars,
             visits,
+            worlds,
             ends,
             beams,
             ranges,
@@ -269,12 +328,14 @@ class State:
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         maps: int32 [n], index of the car's map among the simulator's scenarios.
         ends: uint8 [n], End.
+        worlds: float32 [n, traffic, traffic.FIELDS], the other cars around each.
     """
 
     cars: np.ndarray
     visits: np.ndarray
     maps: np.ndarray
     ends: np.ndarray
+    worlds: np.ndarray
 
 
 class Simulator:
@@ -291,8 +352,11 @@ class Simulator:
         config: SimConfig | None = None,
         target: float | None = None,
         max_steps: int | None = None,
+        traffic: int = 0,
     ):
         """Make room for `cars` cars; `target` (m) and `max_steps` (control steps) are the configuration's unless given.
+
+        Each car has a world of its own, with `traffic` other cars in it.
 
         Raises: ValueError with one line where a number makes no sense.
         """
@@ -302,17 +366,21 @@ class Simulator:
         self.max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
         if cars < 1:
             raise ValueError(f"a simulator needs 1 car or more, not {cars}")
+        if traffic < 0:
+            raise ValueError(f"there are 0 other cars or more, not {traffic}")
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode has a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
         self._limit = _F(self.target)
         self.scenarios = list(scenarios)
         self._constants: Constants = constants(self.config)
+        self._drivers: Drivers = drivers(self.config)
         self._fan = fan(self.config.sensors.rays, self._constants.ray_first, self._constants.ray_step)
         self.state = State(
             cars=np.zeros((cars, FIELDS), dtype=np.float32),
             visits=np.zeros((cars, 0), dtype=np.float32),
             maps=np.full(cars, -1, dtype=np.int32),
             ends=np.zeros(cars, dtype=np.uint8),
+            worlds=np.zeros((cars, traffic, TRAFFIC_FIELDS), dtype=np.float32),
         )
         self._atlas: Atlas | None = None  # maps that cars are on; None before the first reset
         self._shown: list[Scenario] = []  # what the atlas shows
@@ -323,7 +391,12 @@ class Simulator:
         return len(self.state.ends)
 
     def reset(
-        self, starts: np.ndarray, maps: np.ndarray | int = 0, cars: np.ndarray | None = None
+        self,
+        starts: np.ndarray,
+        maps: np.ndarray | int = 0,
+        cars: np.ndarray | None = None,
+        keys: np.ndarray | int = 0,
+        worlds: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Begin episodes.
 
@@ -331,6 +404,8 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
+            keys: uint64 [k], or one for all, from which the traffic around each is spawned.
+            worlds: float32 [k, traffic, traffic.FIELDS], the traffic itself in place of keys.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
         Raises: ValueError with one line for a wrong shape, a number that is not finite, or a map that is not there.
@@ -355,6 +430,8 @@ class Simulator:
             visits[:, : self.state.visits.shape[1]] = self.state.visits
             self.state = replace(self.state, visits=visits)
         state = self.state
+        if state.worlds.shape[1]:
+            state.worlds[cars] = self._traffic(starts, maps, keys, worlds)
         _place_all(
             self._atlas,
             self._constants,
@@ -364,6 +441,7 @@ class Simulator:
             starts,
             state.cars,
             state.visits,
+            state.worlds,
             ranges,
         )
         state.maps[cars] = maps
@@ -372,6 +450,23 @@ class Simulator:
             self._rows[cars] = rows
             self._order, self._runs = _by_map(self._rows)
         return ranges, starts[:, 3].copy()
+
+    def _traffic(
+        self, starts: np.ndarray, maps: np.ndarray, keys: np.ndarray | int, worlds: np.ndarray | None
+    ) -> np.ndarray:
+        """The traffic [k, traffic, FIELDS] that episodes begin with."""
+        count = self.state.worlds.shape[1]
+        if worlds is not None:
+            worlds = np.asarray(worlds, dtype=np.float32)
+            if worlds.shape != (len(starts), count, TRAFFIC_FIELDS) or not np.isfinite(worlds).all():
+                raise ValueError(f"traffic must be {len(starts)} worlds of {count} cars, not {worlds.shape}")
+            return worlds
+        keys = np.broadcast_to(np.asarray(keys, dtype=np.uint64), maps.shape)
+        spawned = np.empty((len(starts), count, TRAFFIC_FIELDS), dtype=np.float32)
+        for m in np.unique(maps):
+            of = np.flatnonzero(maps == m)
+            spawned[of] = spawn(self.scenarios[m].network, starts[of], count, keys[of], self.config.traffic)
+        return spawned
 
     def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:
         """Rows int64 [k] in the atlas of maps [k]. It is made anew if one is missing, of these alone for `everyone`.
@@ -383,7 +478,9 @@ class Simulator:
         missing = [scenario for scenario in wanted.values() if not any(scenario is other for other in shown)]
         if missing:
             self._shown = list(wanted.values()) if everyone else shown + missing
-            self._atlas = make_atlas([scenario.road for scenario in self._shown])
+            self._atlas = make_atlas(
+                [scenario.road for scenario in self._shown], [scenario.network for scenario in self._shown]
+            )
         row = {id(scenario): k for k, scenario in enumerate(self._shown)}
         return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int64)
 
@@ -405,6 +502,7 @@ class Simulator:
         _control_all(
             self._atlas,
             self._constants,
+            self._drivers,
             self._fan,
             self._order,
             self._runs,
@@ -413,6 +511,7 @@ class Simulator:
             self.max_steps,
             state.cars,
             state.visits,
+            state.worlds,
             state.ends,
             ranges,
             speeds,

@@ -1,0 +1,118 @@
+"""Other cars as oriented boxes: what rays hit of them, and whether they are run into."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.jit import leaf
+from gridsim.traffic import COS, LANE, SIN, SPEED, X, Y
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+
+@leaf
+def wrapped(difference, side):
+    """The shortest way round a torus of a side (m) for a difference of coordinates (m)."""
+    return difference - math.floor(difference / side + _HALF) * side
+
+
+@leaf
+def cast_boxes(constants, fan, width, height, x, y, cosine, sine, world, ranges):
+    """Shorten ranges (m) to the first box of a world that each ray meets: slab test (Kay and Kajiya 1986).
+
+    Args: fan of `sensors.fan`; sides of the torus, m; the sensor's position (m) and heading; world of `traffic`.
+    """
+    length, breadth = constants.half_length, constants.half_width
+    radius = math.sqrt(length * length + breadth * breadth)
+    last_ray = _I(ranges.shape[0] - 1)
+    for j in range(world.shape[0]):
+        if world[j, LANE] < _ZERO:
+            continue
+        dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+        forward = dx * cosine + dy * sine
+        squared = dx * dx + dy * dy
+        reach = constants.ray_range + radius
+        if squared > reach * reach:
+            continue
+        first, last = _I(0), last_ray
+        if squared > _F(4.0) * radius * radius:
+            # Only rays within the angle that the box's circle fills; its arc sine is at most 1.05 times its sine here.
+            half = _F(1.06) * radius / math.sqrt(squared)
+            angle = math.atan2(dy * cosine - dx * sine, forward)
+            low, high = (angle - half - constants.ray_first), (angle + half - constants.ray_first)
+            if high < _ZERO or low > constants.ray_step * _F(last_ray):
+                continue
+            first = max(_I(low / constants.ray_step), _I(0))
+            last = min(_I(high / constants.ray_step) + _I(1), last_ray)
+        bc, bs = world[j, COS], world[j, SIN]
+        ox, oy = -(dx * bc + dy * bs), -(dy * bc - dx * bs)  # the sensor as the box sees it
+        rc, rs = cosine * bc + sine * bs, sine * bc - cosine * bs
+        for r in range(first, last + 1):
+            ux, uy = rc * fan[0, r] - rs * fan[1, r], rs * fan[0, r] + rc * fan[1, r]
+            ix, iy = _ONE / ux, _ONE / uy
+            x0, x1 = (-length - ox) * ix, (length - ox) * ix
+            y0, y1 = (-breadth - oy) * iy, (breadth - oy) * iy
+            enter = max(min(x0, x1), min(y0, y1))
+            leave = min(max(x0, x1), max(y0, y1))
+            if enter <= leave and leave > _ZERO and enter < ranges[r]:
+                ranges[r] = max(enter, _ZERO)
+
+
+@leaf
+def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
+    """Whether two cars overlap, the other (dx, dy) m away: separating axes (Gottschalk et al. 1996)."""
+    length, breadth = constants.half_length, constants.half_width
+    along = abs(cosine * other_cosine + sine * other_sine)
+    across = abs(cosine * other_sine - sine * other_cosine)
+    long_side = length + length * along + breadth * across
+    short_side = breadth + length * across + breadth * along
+    return (
+        abs(dx * cosine + dy * sine) <= long_side
+        and abs(dy * cosine - dx * sine) <= short_side
+        and abs(dx * other_cosine + dy * other_sine) <= long_side
+        and abs(dy * other_cosine - dx * other_sine) <= short_side
+    )
+
+
+@leaf
+def nearest_box(world, width, height, x, y):
+    """m from a point to the middle of the nearest box of a world, and the greatest speed (m/s) of any box within 20 m."""
+    nearest, fastest = _F(1e18), _ZERO
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= _ZERO:
+            dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+            squared = dx * dx + dy * dy
+            nearest = min(nearest, squared)
+            if squared < _F(400.0):
+                fastest = max(fastest, world[j, SPEED])
+    return math.sqrt(nearest), fastest
+
+
+@leaf
+def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
+    """Whether a car overlaps a box of a world as it was `back` of a control period (share) ago."""
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= _ZERO:
+            behind = back * dt * world[j, SPEED]
+            dx = wrapped(world[j, X] - behind * world[j, COS] - x, width)
+            dy = wrapped(world[j, Y] - behind * world[j, SIN] - y, height)
+            if dx * dx + dy * dy < _F(25.0) and boxes_touch(
+                constants, dx, dy, cosine, sine, world[j, COS], world[j, SIN]
+            ):
+                return True
+    return False
+
+
+@leaf
+def stands_ahead(constants, world, reach, width, height, x, y, cosine, sine):
+    """Whether a standing box is within `reach` m of the front of a car, in its way."""
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= _ZERO and world[j, SPEED] < _HALF:
+            dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+            forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+            if _ZERO < forward < reach + _F(2.0) * constants.half_length and abs(aside) < _F(2.0) * constants.half_width:
+                return True
+    return False
