@@ -1,15 +1,16 @@
 """Roads: strips with exact geometry, lanes with successors, and the fields that kernels read.
 
-The drivable area is the union of strips: straight pieces and arcs of a centre line, each with a half width. The signed
-clearance of a point is the greatest (half width - distance to the centre line) over the strips: positive on the road,
-zero on its edge, exact outside and at the edge, and never too large inside. Kernels read it from a byte field,
+The drivable area is the union of strips, straight pieces and arcs of a centre line, each with a half width, without the
+blocks: oriented rectangles such as parked cars. The signed clearance of a point is the greatest (half width - distance
+to the centre line) over the strips, and no more than the distance to the nearest block, negative inside: positive on
+the road, zero on its edge, exact near the edges, and never too large inside. Kernels read it from a byte field,
 bilinearly; tests hold it against the strips themselves.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -50,25 +51,45 @@ class Strips:
     Attributes:
         lines: float64 [n, 5]: x0, y0, x1, y1, half width.
         arcs: float64 [m, 6]: centre x, centre y, radius, start angle, sweep (rad, counter-clockwise), half width.
+        blocks: float64 [k, 5]: centre x, centre y, heading (rad), half length, half width: not drivable.
     """
 
     lines: np.ndarray
     arcs: np.ndarray
+    blocks: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """Directed lanes as polylines, joined by successors.
+    """Directed lanes as polylines of equally spaced points: s metres along lane l is at index s / steps[l].
 
     Attributes:
         points: float32 [n, 2], m; a lane's points lie together, in driving direction, not wrapped over the torus.
         offsets: int32 [lanes + 1], where each lane's points begin.
-        successors: int32 [lanes, k], -1 where there is none further; every lane has at least one.
+        successors: int32 [lanes, k], -1 where there is none further; every lane has at least one. Where a successor
+            begins, the lane has ended, save for whole turns of the torus.
+        steps: float32 [lanes], m along the lane between its points; 1 m at most.
+        lengths: float32 [lanes], m: steps * (points - 1).
+        left: int32 [lanes], the lane beside it to which a car may change, point i beside point i; -1 where none is.
+        right: int32 [lanes], as `left`.
+        crossing_offsets: int32 [lanes + 1], where each lane's part of `crossings` begins.
+        crossings: int32, the other lanes that a car on this lane may collide with inside a junction: they cross it or
+            merge into its end. Not those that begin where it begins, precede or succeed it, or lie beside it.
+        junction: uint8 [lanes], 1 where a lane has crossings.
+        limits: float32 [lanes], m/s that keep lateral acceleration in the lane's sharpest bend within comfort.
     """
 
     points: np.ndarray
     offsets: np.ndarray
     successors: np.ndarray
+    steps: np.ndarray
+    lengths: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    crossing_offsets: np.ndarray
+    crossings: np.ndarray
+    junction: np.ndarray
+    limits: np.ndarray
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -76,6 +97,35 @@ class Lanes:
     def lane(self, i: int) -> np.ndarray:
         """Points [n, 2] of lane i."""
         return self.points[self.offsets[i] : self.offsets[i + 1]]
+
+    def crossing(self, i: int) -> np.ndarray:
+        """Lanes [k] that cross lane i."""
+        return self.crossings[self.crossing_offsets[i] : self.crossing_offsets[i + 1]]
+
+
+@njit(nogil=True)
+def _cut_blocks(field, blocks, widest, wrap, node):
+    """Lower the clearance at the nodes around each block, as far as a road of half width `widest` may reach."""
+    rows, columns = field.shape
+    for k in range(blocks.shape[0]):
+        x, y, heading, half_length, half_width = blocks[k]
+        c, s = math.cos(heading), math.sin(heading)
+        reach_x = abs(c) * half_length + abs(s) * half_width + widest
+        reach_y = abs(s) * half_length + abs(c) * half_width + widest
+        i0, i1 = int(math.floor((x - reach_x) / node)), int(math.ceil((x + reach_x) / node))
+        j0, j1 = int(math.floor((y - reach_y) / node)), int(math.ceil((y + reach_y) / node))
+        if not wrap:
+            i0, i1, j0, j1 = max(i0, 0), min(i1, columns - 1), max(j0, 0), min(j1, rows - 1)
+        for j in range(j0, j1 + 1):
+            for i in range(i0, i1 + 1):
+                dx, dy = i * node - x, j * node - y
+                along = abs(dx * c + dy * s) - half_length
+                across = abs(dy * c - dx * s) - half_width
+                outside = math.sqrt(max(along, 0.0) ** 2 + max(across, 0.0) ** 2)
+                distance = _F(max(outside + min(max(along, across), 0.0), FIELD_FLOOR))
+                row, column = j % rows, i % columns
+                if distance < field[row, column]:
+                    field[row, column] = distance
 
 
 @njit(nogil=True)
@@ -247,7 +297,10 @@ def clearance_nodes(strips: Strips, width: float, height: float, torus: bool = T
         raise ValueError(f"a field's sides must be powers of two, not {columns} x {rows}")
     if columns * rows > MEMORY_LIMIT_CELLS:
         raise ValueError(f"a map of {width:.0f} m x {height:.0f} m is too large")
-    return _clearance_nodes(freeze(strips.lines), freeze(strips.arcs), columns, rows, torus, 1.0 / CELLS_PER_M)
+    nodes = _clearance_nodes(freeze(strips.lines), freeze(strips.arcs), columns, rows, torus, 1.0 / CELLS_PER_M)
+    widest = max(strips.lines[:, 4].max(initial=0.0), strips.arcs[:, 5].max(initial=0.0))
+    _cut_blocks(nodes, freeze(strips.blocks), widest, torus, 1.0 / CELLS_PER_M)
+    return nodes
 
 
 def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float) -> Road:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -58,11 +58,8 @@ class Scenario:
             "field": self.road.field,
             "start_row": self.road.start_row,
             "start": self.road.start,
-            "points": self.lanes.points,
-            "offsets": self.lanes.offsets,
-            "successors": self.lanes.successors,
-            "lines": self.strips.lines,
-            "arcs": self.strips.arcs,
+            **vars(self.lanes),
+            **vars(self.strips),
         }
 
     @classmethod
@@ -85,8 +82,8 @@ class Scenario:
                 f(low),
                 f(high),
             ),
-            lanes=Lanes(frozen["points"], frozen["offsets"], frozen["successors"]),
-            strips=Strips(frozen["lines"], frozen["arcs"]),
+            lanes=Lanes(**{field.name: frozen[field.name] for field in fields(Lanes)}),
+            strips=Strips(**{field.name: frozen[field.name] for field in fields(Strips)}),
             torus=bool(torus),
         )
 
@@ -97,11 +94,12 @@ class ScenarioSpec:
 
     summary: str
     speed_interval: tuple[float, float]  # m/s, within which speed counts
+    traffic: int  # cars beside the ego car, unless told otherwise
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
 
 REGISTRY: dict[str, ScenarioSpec] = {
-    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), seamless_layout),
+    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, seamless_layout),
 }
 
 
@@ -123,8 +121,8 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
         name=name,
         seed=seed,
         road=make_road(nodes, spec.speed_interval, config.sensors.range),
-        lanes=Lanes(freeze(lanes.points), freeze(lanes.offsets), freeze(lanes.successors)),
-        strips=Strips(freeze(strips.lines), freeze(strips.arcs)),
+        lanes=Lanes(**{name: freeze(array) for name, array in vars(lanes).items()}),
+        strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
     )
 
 

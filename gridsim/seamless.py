@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from gridsim.lanes import Path, lay_lanes
 from gridsim.roads import Lanes, Strips
 
 TILE = 32.0  # m, side of a tile
@@ -26,7 +27,6 @@ FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those: their outer e
 ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
 SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
-LANE_STEP = 1.0  # m between points of a lane, at most
 
 # Edges of a tile in counter-clockwise order: east, north, west, south.
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -92,26 +92,13 @@ def _largest_component(edges: np.ndarray) -> np.ndarray:
     return label == np.bincount(used).argmax() if used.size else label >= 0
 
 
-def _arc_points(cx: float, cy: float, radius: float, first: float, sweep: float) -> np.ndarray:
-    n = max(2, math.ceil(abs(sweep) * radius / LANE_STEP) + 1)
-    angle = first + sweep * np.linspace(0.0, 1.0, n)
-    return np.stack([cx + radius * np.cos(angle), cy + radius * np.sin(angle)], axis=1)
-
-
-def _through(entry: int, exit: int) -> np.ndarray:
-    """Lane [n, 2] through a plain tile centred on the origin, from edge `entry` to edge `exit`, on the right."""
+def _through(turn: int) -> tuple[tuple[float, float], ...]:
+    """Pieces of the lane through a plain tile that leaves by the edge `turn` quarters on from that of its entry."""
     half, offset = TILE / 2, LANE_WIDTH / 2
-    dx, dy = DIRECTIONS[entry]
-    if (exit - entry) % 4 == 2:
-        along = np.linspace(half, -half, math.ceil(TILE / LANE_STEP) + 1)[:, None]
-        # Driving against (dx, dy); right of that is (-dy, dx).
-        return along * np.array([dx, dy]) + offset * np.array([-dy, dx])
-    ex, ey = DIRECTIONS[exit]
-    left = (exit - entry) % 4 == 3
-    radius = half + offset if left else half - offset
-    cx, cy = half * (dx + ex), half * (dy + ey)
-    first = math.atan2(-ey, -ex)
-    return _arc_points(cx, cy, radius, first, math.pi / 2 if left else -math.pi / 2)
+    if turn == 2:
+        return ((TILE, 0.0),)
+    radius = half + offset if turn == 3 else half - offset  # to the left, to the right
+    return ((math.pi / 2 * radius, (1.0 if turn == 3 else -1.0) / radius),)
 
 
 def _flare() -> tuple[float, float, float]:
@@ -130,16 +117,13 @@ def _turned(points: np.ndarray, quarters: int) -> np.ndarray:
     return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
 
 
-def _around(entry: int, exit: int) -> np.ndarray:
-    """Lane [n, 2] through a roundabout: in on the right, counter-clockwise round the ring, out on the right."""
-    x, y, angle = _flare()
-    edge = np.array([[TILE / 2, LANE_WIDTH / 2]])
-    join = _arc_points(x, y, ROUNDABOUT_FLARE, -math.pi / 2, angle - math.pi / 2)
-    inward = np.concatenate([edge, join])
-    outward = inward[::-1] * [1.0, -1.0]  # the same way, mirrored and driven the other way round
-    sweep = (exit - entry) % 4 * math.pi / 2 - 2 * angle
-    ring = _arc_points(0.0, 0.0, ROUNDABOUT_RADIUS, entry * math.pi / 2 + angle, sweep)
-    return np.concatenate([_turned(inward, entry), ring[1:-1], _turned(outward, exit)])
+def _around(turn: int) -> tuple[tuple[float, float], ...]:
+    """Pieces of the lane through a roundabout: in on the right, counter-clockwise round the ring, out on the right."""
+    x, _, angle = _flare()
+    straight = (TILE / 2 - x, 0.0)
+    flare = ((math.pi / 2 - angle) * ROUNDABOUT_FLARE, -1.0 / ROUNDABOUT_FLARE)
+    ring = ((turn * math.pi / 2 - 2 * angle) * ROUNDABOUT_RADIUS, 1.0 / ROUNDABOUT_RADIUS)
+    return (straight, flare, ring, flare, straight)
 
 
 def _tile_strips(arms: list[int], roundabout: bool) -> tuple[list[list[float]], list[list[float]]]:
@@ -176,9 +160,7 @@ def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, flo
     edges = tile_graph(rng)
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
-    points: list[np.ndarray] = []
-    ways: dict[tuple[int, int], list[int]] = {}  # (tile, entry edge) -> lanes that begin there
-    leads: list[tuple[int, int]] = []  # where each lane leads: (tile, entry edge)
+    paths: list[Path] = []
     for tile in range(len(edges)):
         arms = [int(d) for d in np.flatnonzero(edges[tile])]
         roundabout = rng.random() < ROUNDABOUT_SHARE and len(arms) > 2
@@ -187,18 +169,11 @@ def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, flo
         lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in tile_lines]
         arcs += [[a + x, b + y, *rest] for a, b, *rest in tile_arcs]
         for entry in arms:
+            edge_x, edge_y = _turned(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
             for exit in arms:
                 if exit != entry:
-                    ways.setdefault((tile, entry), []).append(len(points))
-                    leads.append((_neighbour(tile, exit), (exit + 2) % 4))
-                    points.append((_around if roundabout else _through)(entry, exit) + np.array([x, y]))
-    successors = np.full((len(points), 3), -1, dtype=np.int32)
-    for k, lead in enumerate(leads):
-        successors[k, : len(ways[lead])] = ways[lead]
-    lanes = Lanes(
-        points=np.concatenate(points).astype(np.float32),
-        offsets=np.cumsum([0, *map(len, points)]).astype(np.int32),
-        successors=successors,
-    )
+                    pieces = (_around if roundabout else _through)((exit - entry) % 4)
+                    paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, pieces))
+    lanes = lay_lanes(paths, TILE * TILES, TILE * TILES)
     strips = Strips(np.array(lines, dtype=np.float64).reshape(-1, 5), np.array(arcs, dtype=np.float64).reshape(-1, 6))
     return strips, lanes, TILE * TILES, TILE * TILES

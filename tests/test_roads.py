@@ -15,7 +15,6 @@ from gridsim.roads import (
     HEADING_BINS,
     START_CELLS_PER_M,
     START_UNITS,
-    Lanes,
     Strips,
     clearance,
     clearance_nodes,
@@ -291,9 +290,3 @@ def test_freeze_copies_only_what_it_must():
     part = freeze(whole[:, ::2])
     assert part.flags.c_contiguous
     assert not np.shares_memory(part, whole)
-
-
-def test_a_lane_is_its_points():
-    lanes = Lanes(np.arange(10, dtype=F).reshape(5, 2), np.array([0, 2, 5], dtype=np.int32), np.zeros((2, 1)))
-    assert len(lanes) == 2
-    assert lanes.lane(1).tolist() == [[4, 5], [6, 7], [8, 9]]

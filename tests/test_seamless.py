@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from gridsim.config import SimConfig, constants
+from gridsim.lanes import LANE_STEP
 from gridsim.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
 from gridsim.seamless import (
     DIRECTIONS,
     FLARE_HALF,
     HALF_ROAD,
-    LANE_STEP,
     LANE_WIDTH,
     ROUNDABOUT_HALF,
     SHORTEST_BLOCK,
