@@ -32,8 +32,10 @@ from gridsim.simulator import (
     look,
     place,
 )
+from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
+from gridsim.traffic import drivers, flow
 
-_F = np.float32
+_F, _I = np.float32, np.int32
 
 #: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
 #: its own target (m) and limit (control steps), where these are not 0.
@@ -57,14 +59,36 @@ class Limits:
 
 
 @njit
-def _run(road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring):
-    """One episode of one car. ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n."""
+def _run(
+    road,
+    network,
+    constants,
+    drivers,
+    fan,
+    packed,
+    layers,
+    start,
+    target,
+    max_steps,
+    car,
+    visits,
+    world,
+    beams,
+    ranges,
+    scratch,
+    ring,
+    world_ring,
+):
+    """One episode of one car. ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n.
+
+    world_ring float32 [n, cars, fields] is the same of its world.
+    """
     place(road, start, car, visits)
     keep = ring.shape[0]
     end = 0
     steps = 0
     while end == 0:
-        look(road, constants, fan, car, beams, ranges)
+        look(road, constants, fan, car, world, beams, ranges)
         encode(ranges, car[SPEED], scratch)
         action = decide(packed, layers, scratch)
         if action < 0:  # not a number: the genome loses what is left
@@ -72,7 +96,11 @@ def _run(road, constants, fan, packed, layers, start, target, max_steps, car, vi
             break
         if keep > 0:
             ring[steps % keep] = car
-        end = drive(road, constants, car, visits, action)
+        if world.shape[0] > 0:
+            if keep > 0:
+                world_ring[steps % keep] = world
+            flow(network, drivers, world, car, _I(steps))
+        end = drive(road, constants, car, visits, world, action)
         steps += 1
         if end == 0:
             if car[DISTANCE] >= target:
@@ -83,8 +111,28 @@ def _run(road, constants, fan, packed, layers, start, target, max_steps, car, vi
 
 
 @njit(nogil=True)
-def _rollout(road, constants, fan, genomes, layers, start, target, max_steps, rewind, results, column, rewound):
-    """All genomes [n, genes] on one episode; fills results[:, column] and, if rewind > 0, rewound[:, column]."""
+def _rollout(
+    road,
+    network,
+    constants,
+    drivers,
+    fan,
+    genomes,
+    layers,
+    start,
+    traffic,
+    target,
+    max_steps,
+    rewind,
+    results,
+    column,
+    rewound,
+    rewound_worlds,
+):
+    """All genomes [n, genes] on one episode with traffic [cars, fields]; fills results[:, column].
+
+    If rewind > 0 also rewound[:, column] and rewound_worlds[:, column].
+    """
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car = np.empty(FIELDS, dtype=np.float32)
     visits = np.empty(cells, dtype=np.float32)
@@ -93,10 +141,30 @@ def _rollout(road, constants, fan, genomes, layers, start, target, max_steps, re
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
     packed = np.empty(packed_size(layers), dtype=np.float32)
     ring = np.zeros((rewind, FIELDS), dtype=np.float32)
+    world = np.empty(traffic.shape, dtype=np.float32)
+    world_ring = np.zeros((rewind, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
     for i in range(genomes.shape[0]):
         pack(genomes[i], layers, packed)
+        world[:] = traffic
         end = _run(
-            road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring
+            road,
+            network,
+            constants,
+            drivers,
+            fan,
+            packed,
+            layers,
+            start,
+            target,
+            max_steps,
+            car,
+            visits,
+            world,
+            beams,
+            ranges,
+            scratch,
+            ring,
+            world_ring,
         )
         row = results[i, column]
         row["distance"] = car[DISTANCE]
@@ -104,7 +172,9 @@ def _rollout(road, constants, fan, genomes, layers, start, target, max_steps, re
         row["steps"] = car[STEPS]
         row["end"] = end
         if rewind > 0:
-            back = ring[max(int(car[STEPS]) - rewind, 0) % rewind]
+            row_back = max(int(car[STEPS]) - rewind, 0) % rewind
+            back = ring[row_back]
+            rewound_worlds[i, column] = world_ring[row_back]
             rewound[i, column, 0] = back[X]
             rewound[i, column, 1] = back[Y]
             rewound[i, column, 2] = math.atan2(back[SIN], back[COS])
@@ -125,7 +195,8 @@ def evaluate(
     limits: Limits,
     config: SimConfig,
     rewind: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
+    worlds: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive every genome through every episode.
 
     Args:
@@ -133,9 +204,11 @@ def evaluate(
         scenarios: the maps that the episodes index.
         episodes: EPISODE [e].
         rewind: control steps before each end whose state is wanted, 0 for none.
+        worlds: the traffic that each episode begins with, float32 [e, cars, traffic.FIELDS]; None is no traffic.
 
     Returns: (RESULT [n, e], the states `rewind` steps before the ends, or at the starts of shorter episodes, as starts
-    float32 [n, e, 5]; [n, e, 0] if none are wanted).
+    float32 [n, e, 5] and the traffic of then, float32 [n, e, cars, traffic.FIELDS]; [n, e, 0] and [n, e, 0, ...] if none
+    are wanted).
     Raises: ValueError where shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -144,48 +217,81 @@ def evaluate(
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
     if spec.inputs != config.sensors.rays + 1:
         raise ValueError(f"{spec} sees {spec.inputs - 1} rays, the sensor has {config.sensors.rays}")
-    k = constants(config)
+    if worlds is None:
+        worlds = no_traffic(len(episodes))
+    if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
+        raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
+    k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     results = np.zeros((len(genomes), len(episodes)), dtype=RESULT)
     rewound = np.zeros((len(genomes), len(episodes), 5 if rewind else 0), dtype=np.float32)
+    cars = worlds.shape[1] if rewind else 0
+    rewound_worlds = np.zeros((len(genomes), len(episodes), cars, TRAFFIC_FIELDS), dtype=np.float32)
     for column, episode in enumerate(episodes):
         _rollout(
             scenarios[episode["map"]].road,
+            scenarios[episode["map"]].network,
             k,
+            others,
             rays,
             genomes,
             spec.layers,
             freeze(episode["start"].copy()),
+            freeze(worlds[column].copy()),
             _F(episode["target"] or limits.target),
             int(episode["steps"] or limits.steps),
             rewind,
             results,
             column,
             rewound,
+            rewound_worlds,
         )
-    return results, rewound
+    return results, rewound, rewound_worlds
+
+
+def no_traffic(episodes: int) -> np.ndarray:
+    """Worlds float32 [episodes, 0, fields] with nobody in them."""
+    return np.zeros((episodes, 0, TRAFFIC_FIELDS), dtype=np.float32)
 
 
 def trajectory(
-    spec: PolicySpec, genome: np.ndarray, scenario: Scenario, start: np.ndarray, limits: Limits, config: SimConfig
-) -> tuple[np.ndarray, np.ndarray]:
+    spec: PolicySpec,
+    genome: np.ndarray,
+    scenario: Scenario,
+    start: np.ndarray,
+    limits: Limits,
+    config: SimConfig,
+    world: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive one genome through one episode and keep its path.
 
-    Returns: (RESULT [], states float32 [steps, FIELDS] before each step; fields as in `gridsim.simulator`).
+    Args: as `evaluate`'s; start float32 [5], world float32 [cars, traffic.FIELDS].
+    Returns: (RESULT [], states float32 [steps, FIELDS] before each step, with fields as in `gridsim.simulator`, and
+    the traffic then, float32 [steps, cars, traffic.FIELDS]).
     """
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    result, states = _trajectory(
-        scenario.road, k, rays, freeze(genome), spec.layers, freeze(start), _F(limits.target), limits.steps
+    result, states, worlds = _trajectory(
+        scenario.road,
+        scenario.network,
+        k,
+        drivers(config),
+        rays,
+        freeze(genome),
+        spec.layers,
+        freeze(start),
+        freeze(no_traffic(1)[0] if world is None else world.copy()),
+        _F(limits.target),
+        limits.steps,
     )
     row = np.zeros((), dtype=RESULT)
     row["distance"], row["paced"], row["steps"], row["end"] = result
-    return row, states[: int(row["steps"])]
+    return row, states[: int(row["steps"])], worlds[: int(row["steps"])]
 
 
 @njit(nogil=True)
-def _trajectory(road, constants, fan, genome, layers, start, target, max_steps):
+def _trajectory(road, network, constants, drivers, fan, genome, layers, start, traffic, target, max_steps):
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car = np.empty(FIELDS, dtype=np.float32)
     visits = np.empty(cells, dtype=np.float32)
@@ -195,7 +301,27 @@ def _trajectory(road, constants, fan, genome, layers, start, target, max_steps):
     packed = np.empty(packed_size(layers), dtype=np.float32)
     pack(genome, layers, packed)
     ring = np.zeros((max_steps, FIELDS), dtype=np.float32)
+    world = np.empty(traffic.shape, dtype=np.float32)
+    world[:] = traffic
+    world_ring = np.zeros((max_steps, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
     end = _run(
-        road, constants, fan, packed, layers, start, target, max_steps, car, visits, beams, ranges, scratch, ring
+        road,
+        network,
+        constants,
+        drivers,
+        fan,
+        packed,
+        layers,
+        start,
+        target,
+        max_steps,
+        car,
+        visits,
+        world,
+        beams,
+        ranges,
+        scratch,
+        ring,
+        world_ring,
     )
-    return (car[DISTANCE], car[PACED], car[STEPS], end), ring
+    return (car[DISTANCE], car[PACED], car[STEPS], end), ring, world_ring

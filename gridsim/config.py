@@ -61,7 +61,7 @@ class TrafficConfig:
     threshold: float = 0.2  # m/s2 to be gained by a change of lanes
     safe_braking: float = 3.0  # m/s2 that a change of lanes may ask of who is behind
     lane_change_speed: float = 1.25  # m/s sideways: three seconds for a lane
-    apart: float = 2.9  # m between the middles of two lanes below which cars on them may touch
+    apart: float = 2.35  # m between the middles of two lanes below which cars on them may touch
     spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
     spawn_gap_ego: float = 22.0  # m between a car and the ego car then
     courtesy: float = 10.0  # m: standing with a standing car so near ahead is not idleness

@@ -13,11 +13,13 @@ from gridsim.config import SimConfig
 from gridsim.jit import njit
 from gridsim.roads import Lanes, Road, Strips, clearance_nodes, freeze, make_road
 from gridsim.seamless import seamless_layout
+from gridsim.traffic import Network, make_network, network_of_lanes
 
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
 START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
+TRAFFIC_PACE = 0.5  # traffic's speed on a straight as a share of the interval's two ends together: its middle
 ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high")
 
 
@@ -31,6 +33,7 @@ class Scenario:
         road: what the kernels read.
         lanes: directed polylines, for starts, traffic and drivers.
         strips: exact geometry of the drivable area, for pictures and tests.
+        network: the lanes as traffic reads them.
         torus: whether leaving on one side means entering on the other.
     """
 
@@ -39,6 +42,7 @@ class Scenario:
     road: Road
     lanes: Lanes
     strips: Strips
+    network: Network
     torus: bool = True
 
     @cached_property
@@ -60,6 +64,8 @@ class Scenario:
             "start": self.road.start,
             **vars(self.lanes),
             **vars(self.strips),
+            "speeds": self.network.speeds,
+            "clear": self.network.clear,
         }
 
     @classmethod
@@ -68,6 +74,7 @@ class Scenario:
         frozen = {key: freeze(value) for key, value in arrays.items()}
         columns, rows, width, height, low, high, seed, torus = frozen["scalars"]
         f = np.float32
+        lanes = Lanes(**{field.name: frozen[field.name] for field in fields(Lanes)})
         return cls(
             name=frozen["name"].tobytes().decode(),
             seed=int(seed),
@@ -82,8 +89,9 @@ class Scenario:
                 f(low),
                 f(high),
             ),
-            lanes=Lanes(**{field.name: frozen[field.name] for field in fields(Lanes)}),
+            lanes=lanes,
             strips=Strips(**{field.name: frozen[field.name] for field in fields(Strips)}),
+            network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], width, height),
             torus=bool(torus),
         )
 
@@ -117,12 +125,14 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
     strips, lanes, width, height = spec.layout(rng)
     nodes = clearance_nodes(strips, width, height)
+    lanes = Lanes(**{name: freeze(array) for name, array in vars(lanes).items()})
     return Scenario(
         name=name,
         seed=seed,
         road=make_road(nodes, spec.speed_interval, config.sensors.range),
-        lanes=Lanes(**{name: freeze(array) for name, array in vars(lanes).items()}),
+        lanes=lanes,
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
+        network=make_network(lanes, width, height, TRAFFIC_PACE * sum(spec.speed_interval), config.traffic),
     )
 
 

@@ -161,19 +161,24 @@ def make_network(lanes: Lanes, width: float, height: float, speed_limit: float, 
             points, offsets, steps, freeze(lanes.crossing_offsets), freeze(lanes.crossings), f(width), f(height),
             f(config.apart), clear,
         )  # fmt: skip
+    return network_of_lanes(lanes, freeze(speeds), freeze(clear), width, height)
+
+
+def network_of_lanes(lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, width: float, height: float) -> Network:
+    """Tables from what `make_network` computed before; all arrays read-only already."""
     return Network(
-        points=points,
-        speeds=freeze(speeds),
-        offsets=offsets,
-        steps=steps,
-        successors=successors,
-        left=freeze(lanes.left),
-        right=freeze(lanes.right),
-        crossing_offsets=freeze(lanes.crossing_offsets),
-        crossings=freeze(lanes.crossings),
-        clear=freeze(clear),
-        width=f(width),
-        height=f(height),
+        points=lanes.points,
+        speeds=speeds,
+        offsets=lanes.offsets,
+        steps=lanes.steps,
+        successors=lanes.successors,
+        left=lanes.left,
+        right=lanes.right,
+        crossing_offsets=lanes.crossing_offsets,
+        crossings=lanes.crossings,
+        clear=clear,
+        width=np.float32(width),
+        height=np.float32(height),
     )
 
 
@@ -391,6 +396,8 @@ def _may_enter(network, drivers, world, i, ego):
             if world[j, SPEED] < _F(2.0):
                 return False
     # The ego car goes first, unless it is behind this one.
+    if ego[COS] == _ZERO and ego[SIN] == _ZERO:
+        return True
     dx, dy = ego[X] - car[X], ego[Y] - car[Y]
     dx -= _round(dx / network.width) * network.width
     dy -= _round(dy / network.height) * network.height
@@ -420,7 +427,7 @@ def _leader(network, drivers, world, i, ego, horizon):
             continue
         other = world[j] if j < world.shape[0] else ego
         is_ego = j == world.shape[0]
-        if not is_ego and other[LANE] < _ZERO:
+        if not is_ego and other[LANE] < _ZERO or is_ego and other[COS] == _ZERO and other[SIN] == _ZERO:
             continue
         dx, dy = other[X] - car[X], other[Y] - car[Y]
         dx -= _round(dx / network.width) * network.width
@@ -479,7 +486,7 @@ def _change_lanes(network, drivers, world, i, ego, step):
             if j == i:
                 continue
             other = world[j] if j < world.shape[0] else ego
-            if j < world.shape[0] and other[LANE] < _ZERO:
+            if j < world.shape[0] and other[LANE] < _ZERO or other[COS] == _ZERO and other[SIN] == _ZERO:
                 continue
             dx, dy = other[X] - car[X], other[Y] - car[Y]
             dx -= _round(dx / network.width) * network.width
@@ -579,7 +586,8 @@ def _go(network, drivers, car):
 def flow(network, drivers, world, ego, step):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
-    Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read; number of the control step.
+    Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it is
+    not there); number of the control step.
     """
     cars = world.shape[0]
     for i in range(cars):
