@@ -35,7 +35,7 @@ from cluster.worker import Task, Worker
 from evolution.breeding import Mutation
 from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits
+from evolution.rollout import EPISODE, Limits, no_traffic
 from gridsim.config import SimConfig
 
 LAST = 10  # generations that are measured
@@ -128,7 +128,17 @@ def children_per_s(maps: Maps) -> float:
         for _ in range(6):
             begun = time.perf_counter()
             recipes, key = genetic.ask(Mutation())
-            task = Task("mlp:6,7", genetic.parents, key, Mutation(), np.zeros(4, EPISODE), (), Limits(150.0, 100), sim)
+            task = Task(
+                "mlp:6,7",
+                genetic.parents,
+                key,
+                Mutation(),
+                np.zeros(4, EPISODE),
+                no_traffic(4),
+                (),
+                Limits(150.0, 100),
+                sim,
+            )
             results = pool.evaluate(task, recipes).results
             genetic.tell(results["distance"].sum(axis=1) + rng.random(CHILDREN))
             rates.append(CHILDREN / (time.perf_counter() - begun))

@@ -66,7 +66,7 @@ def median_s(run: Callable[[], object], runs: int) -> float:
 def rollout_rays(champion: Champion, maps: list[Scenario], runs: int) -> tuple[float, float]:
     """(car-steps/s, m/s driven) of the fused rollout of whole episodes."""
     spec, episode = PolicySpec.parse(champion.policy), champion.sim.episode
-    episodes = lane_starts(maps, np.arange(EPISODES) % len(maps), np.random.default_rng(0))
+    episodes, _ = lane_starts(maps, np.arange(EPISODES) % len(maps), np.random.default_rng(0))
     limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
 
     def run() -> np.ndarray:

@@ -58,7 +58,9 @@ def evolve(
             if on_generation:
                 on_generation(evolution.generation, row)
         assert evolution.champion is not None
-        champion = Champion(evolution.champion.genome, settings.policy, settings.scenario, evolution.sim)
+        champion = Champion(
+            evolution.champion.genome, settings.policy, settings.scenario, evolution.sim, settings.traffic
+        )
         return champion, evolution.history
     finally:
         pool.close()

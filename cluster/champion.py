@@ -18,11 +18,12 @@ import numpy as np
 from cluster import checkpoint
 from cluster.checkpoint import CheckpointError
 from cluster.coordinator import Maps, summarise
+from cluster.settings import MAX_TRAFFIC
 from evolution.curriculum import HELD_OUT_MAPS, spread_starts
 from evolution.policy import PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
-from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, VehicleConfig
+from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY
 
 
@@ -35,12 +36,14 @@ class Champion:
         policy: its network, as in `mlp:6,7`.
         scenario: where it learned.
         sim: the simulator's numbers it learned with.
+        traffic: other cars it learned among.
     """
 
     genome: np.ndarray
     policy: str
     scenario: str
     sim: SimConfig
+    traffic: int = 0
 
     @property
     def sha256(self) -> str:
@@ -65,7 +68,12 @@ class Champion:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if that cannot be done."""
-        meta = {"policy": self.policy, "scenario": self.scenario, "sim": dataclasses.asdict(self.sim)}
+        meta = {
+            "policy": self.policy,
+            "scenario": self.scenario,
+            "traffic": self.traffic,
+            "sim": dataclasses.asdict(self.sim),
+        }
         checkpoint.save(path, {"genome": self.genome}, meta)
 
 
@@ -81,19 +89,27 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         if genome.dtype != np.float32 or genome.shape != (spec.size,):
             raise ValueError(f"its genome does not fit {spec}")
         config = SimConfig(
-            VehicleConfig(**sim["vehicle"]), SensorConfig(**sim["sensors"]), EpisodeConfig(**sim["episode"])
+            VehicleConfig(**sim["vehicle"]),
+            SensorConfig(**sim["sensors"]),
+            EpisodeConfig(**sim["episode"]),
+            TrafficConfig(**sim.get("traffic", {})),
         )
-        return Champion(genome, str(spec), str(meta["scenario"]), config)
+        return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: no champion: {error}") from error
 
 
 def evaluate(
-    champion: Champion, scenario: str | None = None, episodes: int = 64, seed: int = HELD_OUT_SEED
+    champion: Champion,
+    scenario: str | None = None,
+    episodes: int = 64,
+    seed: int = HELD_OUT_SEED,
+    traffic: int | None = None,
 ) -> dict[str, float]:
     """Drive a champion through episodes on maps it never saw, in this process.
 
-    Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed.
+    Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed; other cars on the
+    road (default: as many as it learned among, or as the other scenario has by default).
     Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means). With the defaults these are the
     held-out figures of summary.json.
     Raises: ValueError for an unknown scenario or fewer than one episode.
@@ -103,15 +119,25 @@ def evaluate(
         raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
+    if traffic is not None and not 0 <= traffic <= MAX_TRAFFIC:
+        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     maps = Maps(name, champion.sim)
     try:
-        seeds, starts = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes)
+        if traffic is None:
+            traffic = champion.traffic if name == champion.scenario else REGISTRY[name].traffic
+        held_out = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)
         episode = champion.sim.episode
         limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
-        scenarios = [maps.get(s) for s in seeds]
-        results, _ = roll_out(
-            PolicySpec.parse(champion.policy), champion.genome[None], scenarios, starts, limits, champion.sim
-        )
+        scenarios = [maps.get(s) for s in held_out.maps]
+        results = roll_out(
+            PolicySpec.parse(champion.policy),
+            champion.genome[None],
+            scenarios,
+            held_out.rows,
+            limits,
+            champion.sim,
+            worlds=held_out.worlds,
+        )[0]
         return summarise(results[0], episode.control_period)
     finally:
         maps.close()

@@ -80,6 +80,8 @@ class EvaluateFlags:
     """A champion.npz, or a run's folder."""
     scenario: str = ""
     """Road to drive on; by default the one it learned on."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
     episodes: int = 64
     """How many; the default 64 are the held-out episodes of every run."""
     seed: int = 2_000_000
@@ -371,7 +373,7 @@ def compile_kernels(session: Session) -> None:
     from evolution.rollout import Limits
 
     evolution = session.evolution
-    maps, episodes = evolution.curriculum.episodes(0)
+    episodes = evolution.curriculum.episodes(0).part(0, 1)
     recipes = np.zeros(2, dtype=RECIPE)
     recipes["a"] = recipes["b"] = FRESH
     recipes["seed"] = 1
@@ -380,13 +382,14 @@ def compile_kernels(session: Session) -> None:
         parents=np.zeros((1, evolution.spec.size), dtype=np.float32),
         key=1,
         mutation=Mutation(),
-        episodes=episodes[:1],
-        maps=tuple((session.run.settings.scenario, seed) for seed in maps),
+        episodes=episodes.rows,
+        worlds=episodes.worlds,
+        maps=tuple((session.run.settings.scenario, seed) for seed in episodes.maps),
         limits=Limits(1.0, 1),
         config=evolution.sim,
         rewind=1,
     )
-    Worker().evaluate(task, [session.maps.get(seed) for seed in maps], recipes)
+    Worker().evaluate(task, [session.maps.get(seed) for seed in episodes.maps], recipes)
 
 
 def _make_folder(prog: str, run: RunFolder) -> list[Path]:
@@ -430,7 +433,8 @@ def evaluate_main() -> None:
         path = Path(flags.champion)
         try:
             champion = load_champion(path / "champion.npz" if path.is_dir() else path)
-            figures = evaluate(champion, flags.scenario or None, flags.episodes, flags.seed)
+            traffic = None if flags.traffic == -1 else flags.traffic
+            figures = evaluate(champion, flags.scenario or None, flags.episodes, flags.seed, traffic)
         except (CheckpointError, ValueError) as error:
             fail(prog, str(error))
         if flags.json:

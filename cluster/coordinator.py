@@ -24,6 +24,7 @@ from cluster.worker import Task
 from evolution import fitness
 from evolution.breeding import RECIPE, Mutation
 from evolution.curriculum import HELD_OUT_EPISODES, HELD_OUT_MAPS, Curriculum, spread_starts, success_rate
+from evolution.episodes import Episodes
 from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, targets
@@ -38,7 +39,7 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of history.csv after `generation`; the names that MLflow has them under."""
 
-MAPS_KEPT = 48
+MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 
 
 class Maps:
@@ -133,7 +134,13 @@ class Evolution:
         )
         episode = self.sim.episode
         self.curriculum = Curriculum(
-            s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period
+            s.curriculum(),
+            s.seed,
+            self.maps.get,
+            episode.target,
+            episode.time_limit,
+            episode.control_period,
+            s.traffic,
         )
         if self.initial is not None:
             self.genetic.seed_with(self.initial)
@@ -154,16 +161,17 @@ class Evolution:
         return Mutation(s.mutation_rate, self.curriculum.sigma(s.sigma), s.bump_rate)
 
     def _evaluate(
-        self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, maps: list[int], episodes: np.ndarray,
-        limits: Limits, rewind: int = 0,
+        self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, episodes: Episodes, limits: Limits,
+        rewind: int = 0,
     ) -> np.ndarray:  # fmt: skip
         task = Task(
             policy=self.settings.policy,
             parents=parents,
             key=key,
             mutation=self._mutation(),
-            episodes=episodes,
-            maps=tuple((self.settings.scenario, seed) for seed in maps),
+            episodes=episodes.rows,
+            worlds=episodes.worlds,
+            maps=tuple((self.settings.scenario, seed) for seed in episodes.maps),
             limits=limits,
             config=self.sim,
             rewind=rewind,
@@ -174,13 +182,11 @@ class Evolution:
         self.car_steps += int(outcome.results["steps"].sum())
         return outcome.results
 
-    def drive(
-        self, stage: str, genomes: np.ndarray, maps: list[int], episodes: np.ndarray, limits: Limits, rewind: int = 0
-    ) -> np.ndarray:
+    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, rewind: int = 0) -> np.ndarray:
         """Results RESULT [n, e] of given genomes [n, genes]: recipes that are plain copies."""
         recipes = np.zeros(len(genomes), dtype=RECIPE)
         recipes["a"] = recipes["b"] = np.arange(len(genomes))
-        return self._evaluate(stage, genomes, recipes, 0, maps, episodes, limits, rewind)
+        return self._evaluate(stage, genomes, recipes, 0, episodes, limits, rewind)
 
     # ------------------------------------------------------------------------------------------------ a generation
 
@@ -204,27 +210,27 @@ class Evolution:
         s, curriculum = self.settings, self.curriculum
         self.outcomes.clear()
         generation, limits = self.generation, curriculum.limits()
-        maps, episodes = curriculum.episodes(generation)
+        episodes = curriculum.episodes(generation)
         recipes, key = self.genetic.ask(self._mutation())
         self.maps.ahead(curriculum.map_seeds[: generation + 4])
-        results = self._evaluate("evolve", self.genetic.parents, recipes, key, maps, episodes, limits)
-        goals = targets(episodes, limits)
+        results = self._evaluate("evolve", self.genetic.parents, recipes, key, episodes, limits)
+        goals = targets(episodes.rows, limits)
         score = self._score(results, goals)
         rank = fitness.pareto(fitness.elements(results, goals)) if s.ranking == "pareto" else score
 
         # The generation's best race on more episodes; who raced comes before who did not.
         best = np.argsort(-np.nan_to_num(rank, nan=-np.inf), kind="stable")[: curriculum.config.racers]
-        race_maps, race_episodes = curriculum.race(generation)
+        race = curriculum.race(generation)
         racers = self.genetic.genomes(best)
         race_limits = curriculum.race_limits()
-        raced = self.drive("race", racers, race_maps, race_episodes, race_limits, curriculum.config.rewind)
-        n, m = len(episodes), len(race_episodes)
+        raced = self.drive("race", racers, race, race_limits, curriculum.config.rewind)
+        n, m = len(episodes.rows), len(race.rows)
         race_score = (n * score[best] + m * self._score(raced, race_limits.target)) / (n + m)
         order = np.argsort(-race_score, kind="stable")
         total = rank - rank.max() - 1.0  # below 0
         total[best[order]] = np.arange(len(order), 0, -1)
         race_success = float(success_rate(raced)[order[:8]].mean())
-        curriculum.raced(order, raced, raced["rewound"], race_maps, race_episodes)
+        curriculum.raced(order, raced, race)
         self.genetic.tell(total)
         if self.champion is not None:
             self.genetic.readmit(self.champion.genome)
@@ -253,15 +259,15 @@ class Evolution:
 
     def _validate(self, contenders: np.ndarray) -> None:
         """Find out whether one of [n, genes] beats the champion; only who passes a first stage is tried whole."""
-        maps, episodes = self.curriculum.validation()
+        episodes = self.curriculum.validation()
         limits = self.curriculum.goal_limits()
         first = self.curriculum.config.first_validation
-        trial = self.drive("validate", contenders, maps, episodes[:first], limits)
+        trial = self.drive("validate", contenders, episodes.part(0, first), limits)
         score = self.curriculum.validation_score(trial)
         k = int(np.lexsort((trial["distance"].mean(axis=1), score))[-1])
         if self.champion is not None and score[k] < self.champion.score - 0.02:
             return
-        rest = self.drive("validate", contenders[k : k + 1], maps, episodes[first:], limits)
+        rest = self.drive("validate", contenders[k : k + 1], episodes.part(first), limits)
         whole = np.concatenate([trial[k : k + 1], rest], axis=1)
         total, distance = float(self.curriculum.validation_score(whole)[0]), float(whole["distance"].mean())
         if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
@@ -281,8 +287,8 @@ class Evolution:
         """The champion on roads nobody was trained or chosen on: the same 64 episodes for every run of a scenario."""
         assert self.champion is not None
         before = self.car_steps
-        maps, episodes = held_out_episodes(self.maps)
-        results = self.drive("held out", self.champion.genome[None], maps, episodes, self.curriculum.goal_limits())
+        episodes = held_out_episodes(self.maps, self.settings.traffic)
+        results = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
         self.car_steps = before  # not part of learning
         return summarise(results[0], self.sim.episode.control_period)
 
@@ -296,6 +302,7 @@ class Evolution:
         arrays = {
             "parents": self.genetic.parents,
             "crashes": _plain(self.curriculum.crashes),
+            "crash_worlds": self.curriculum.crash_worlds,
             "history": np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS)),
             "elites": np.array(self.elites, dtype=np.float32).reshape(-1, genes),
             "champion": champion.genome if champion else np.zeros(0, dtype=np.float32),
@@ -318,7 +325,7 @@ class Evolution:
         genes = self.spec.size
         try:
             history, parents, elites = arrays["history"], arrays["parents"], arrays["elites"]
-            generation, crashes = int(meta["generation"]), arrays["crashes"]
+            generation, crashes, worlds = int(meta["generation"]), arrays["crashes"], arrays["crash_worlds"]
             fits = (
                 meta["columns"] == list(COLUMNS)
                 and history.shape == (generation, len(COLUMNS))
@@ -329,6 +336,8 @@ class Evolution:
                 and parents.dtype == np.float32
                 and crashes.ndim == 2
                 and crashes.shape[1] == 6
+                and worlds.shape == (len(crashes), *self.curriculum.crash_worlds.shape[1:])
+                and worlds.dtype == np.float32
                 and 0 <= int(meta["elite_rows"]) <= len(parents)
                 and arrays["champion"].size in (0, genes)
             )
@@ -337,7 +346,7 @@ class Evolution:
             self.genetic.generation, self.genetic.elites = generation, int(meta["elite_rows"])
             self.genetic.parents = parents
             self.curriculum.target = float(meta["target_m"])
-            self.curriculum.crashes = _crashes(crashes)
+            self.curriculum.crashes, self.curriculum.crash_worlds = _crashes(crashes), worlds
             self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
             self.history = [dict(zip(COLUMNS, row.tolist(), strict=True)) for row in history]
             self.elites = list(elites)
@@ -358,9 +367,9 @@ class Evolution:
         return text.getvalue().encode()
 
 
-def held_out_episodes(maps: Maps) -> tuple[list[int], np.ndarray]:
-    """Map seeds and EPISODE [64] that are reported on and never chosen on."""
-    return spread_starts(maps.get, HELD_OUT_SEED, HELD_OUT_MAPS, HELD_OUT_EPISODES)
+def held_out_episodes(maps: Maps, traffic: int) -> Episodes:
+    """The 64 episodes that are reported on and never chosen on."""
+    return spread_starts(maps.get, HELD_OUT_SEED, HELD_OUT_MAPS, HELD_OUT_EPISODES, traffic)
 
 
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:

@@ -153,7 +153,7 @@ def of_episodes(task: Task, first: int, stop: int) -> Task:
     """The task with only some of its episodes."""
     if stop - first == len(task.episodes):
         return task
-    return replace(task, episodes=task.episodes[first:stop])
+    return replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
 
 
 def describe(index: int, chunk: Chunk) -> str:

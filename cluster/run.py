@@ -228,18 +228,19 @@ class Session:
 
         evolution, path = self.evolution, self.run.path
         assert evolution.champion is not None
+        settings = self.run.settings
         champion = Champion(
-            evolution.champion.genome, self.run.settings.policy, self.run.settings.scenario, evolution.sim
+            evolution.champion.genome, settings.policy, settings.scenario, evolution.sim, settings.traffic
         )
         champion.save(path / CHAMPION)
         checkpoint.save(path / ELITES, {"genomes": np.array(evolution.elites)}, {"policy": self.run.settings.policy})
         figures = evolution.held_out()
         report.curves(evolution.history, path / "curves.png")
-        seeds, episodes = held_out_episodes(self.maps)
-        scenario = self.maps.get(seeds[int(episodes[0]["map"])])
-        result, states = drive_trajectory(
-            evolution.spec, champion.genome, scenario, episodes[0]["start"], evolution.curriculum.goal_limits(),
-            evolution.sim,
+        episodes = held_out_episodes(self.maps, settings.traffic)
+        scenario = self.maps.get(episodes.maps[int(episodes.rows[0]["map"])])
+        result, states, _ = drive_trajectory(
+            evolution.spec, champion.genome, scenario, episodes.rows[0]["start"], evolution.curriculum.goal_limits(),
+            evolution.sim, episodes.worlds[0],
         )  # fmt: skip
         report.trajectory(
             scenario, states, path / "trajectory.png",

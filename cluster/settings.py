@@ -13,6 +13,7 @@ from evolution.policy import PolicySpec
 from gridsim.scenarios import REGISTRY
 
 MAX_POPULATION = 1_000_000
+MAX_TRAFFIC = 100
 
 
 class SettingsError(ValueError):
@@ -25,8 +26,8 @@ class EvolveSettings:
 
     scenario: str = "seamless"
     """Road to learn to drive on."""
-    traffic: int = 0
-    """Other cars on the road."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as the scenario has by default."""
     seed: int = 0
     """Seed of every random number of the run."""
     policy: str = "mlp:6,7"
@@ -55,8 +56,12 @@ class EvolveSettings:
     """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
-    until: float = 0.99
+    until: float = 0.985
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
+
+    def __post_init__(self) -> None:
+        if self.traffic == -1 and self.scenario in REGISTRY:
+            object.__setattr__(self, "traffic", REGISTRY[self.scenario].traffic)
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""
@@ -66,8 +71,8 @@ class EvolveSettings:
         """Raises SettingsError, one line that says what to change."""
         if self.scenario not in REGISTRY:
             raise SettingsError(f"unknown scenario {self.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
-        if self.traffic:
-            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no traffic yet; use --traffic 0")
+        if not 0 <= self.traffic <= MAX_TRAFFIC:
+            raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
         if not 0 <= self.seed < 1 << 63:
             raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
         if self.car_steps < 0:

@@ -10,7 +10,7 @@ import numpy as np
 
 from evolution.breeding import Mutation, breed
 from evolution.policy import PolicySpec
-from evolution.rollout import RACED, RESULT, Limits, evaluate
+from evolution.rollout import RESULT, Limits, evaluate, raced_dtype
 from gridsim.config import SimConfig
 from gridsim.roads import freeze
 from gridsim.scenarios import Scenario
@@ -26,6 +26,7 @@ class Task:
         key: the generation's number for breeding, 64 bits.
         mutation: how children differ from their parents.
         episodes: EPISODE [episodes], the same for every member.
+        worlds: the traffic that each begins with, float32 [episodes, cars, traffic.FIELDS].
         maps: (scenario, seed) of each map that `episodes` indexes.
         limits: where an episode ends if nothing happens.
         config: the simulator's.
@@ -37,6 +38,7 @@ class Task:
     key: int
     mutation: Mutation
     episodes: np.ndarray
+    worlds: np.ndarray
     maps: tuple[tuple[str, int], ...]
     limits: Limits
     config: SimConfig
@@ -45,12 +47,13 @@ class Task:
     @property
     def row(self) -> np.dtype:
         """What comes back of each member's episode."""
-        return RACED if self.rewind else RESULT
+        return raced_dtype(self.worlds.shape[1]) if self.rewind else RESULT
 
     def __post_init__(self) -> None:
         # What comes out of the object store is read-only. Numba compiles once more for what is not, so no pool has it.
         freeze(self.parents)
         freeze(self.episodes)
+        freeze(self.worlds)
 
 
 class Worker:
@@ -64,11 +67,13 @@ class Worker:
         started = time.perf_counter()
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
-        results, rewound = evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.rewind)
+        results, rewound, worlds = evaluate(
+            spec, genomes, maps, task.episodes, task.limits, task.config, task.rewind, task.worlds
+        )
         if task.rewind:
-            raced = np.zeros(results.shape, dtype=RACED)
+            raced = np.zeros(results.shape, dtype=task.row)
             for name in RESULT.names or ():
                 raced[name] = results[name]
-            raced["rewound"] = rewound
+            raced["rewound"], raced["world"] = rewound, worlds
             results = raced
         return results, time.perf_counter() - started

@@ -11,19 +11,19 @@ State is arrays and numbers only; all randomness comes from (seed, generation).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from evolution.episodes import lane_starts
+from evolution.episodes import Episodes, lane_starts
 from evolution.rollout import EPISODE, Limits
 from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
 from gridsim.simulator import End
 
 HELD_OUT_MAPS = 8
 HELD_OUT_EPISODES = 64
-VALIDATION_MAPS = 16
+VALIDATION_MAPS = 48
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class CurriculumConfig:
 
 
 def spread_starts(
-    build: Callable[[int], Scenario], first_seed: int, maps: int, episodes: int
-) -> tuple[list[int], np.ndarray]:
-    """Map seeds and EPISODE [episodes] over `maps` maps in turn; the same for every run of a scenario."""
+    build: Callable[[int], Scenario], first_seed: int, maps: int, episodes: int, traffic: int = 0
+) -> Episodes:
+    """Episodes over `maps` maps in turn; the same for every run of a scenario with as much traffic."""
     seeds = [first_seed + k for k in range(maps)]
     rng = np.random.default_rng(np.random.SeedSequence([first_seed, episodes]))
-    return seeds, lane_starts([build(seed) for seed in seeds], np.arange(episodes) % maps, rng)
+    return Episodes(seeds, *lane_starts([build(seed) for seed in seeds], np.arange(episodes) % maps, rng, traffic))
 
 
 class Curriculum:
@@ -72,12 +72,13 @@ class Curriculum:
         target_m: float,
         time_s: float,
         period_s: float,
+        traffic: int = 0,
     ):
-        self.config, self.seed, self.build = config, seed, build
+        self.config, self.seed, self.build, self.traffic = config, seed, build, traffic
         self.goal, self.period = target_m, period_s
         self.goal_steps = round(time_s / period_s)
         self.target = min(config.first_target, target_m)
-        self.crashes = np.zeros(0, dtype=EPISODE)
+        self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), traffic)
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
         self.map_seeds = [
             int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
@@ -111,18 +112,17 @@ class Curriculum:
         """Mutation's standard deviation: finer as episodes grow longer."""
         return sigma * (self.config.first_target / self.target) ** 0.35
 
-    def _new_starts(self, generation: int, count: int, purpose: int) -> tuple[list[int], np.ndarray]:
+    def _new_starts(self, generation: int, count: int, purpose: int) -> tuple[list[int], np.ndarray, np.ndarray]:
         rng = self._rng(generation, purpose)
         n = self._maps(generation)
         maps = rng.choice(n, count, replace=count > n)
         used = sorted({int(m) for m in maps})
         local = np.array([used.index(int(m)) for m in maps])
-        episodes = lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng)
-        return used, episodes
+        return used, *lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng, self.traffic)
 
-    def episodes(self, generation: int) -> tuple[list[int], np.ndarray]:
-        """Map seeds and EPISODE [e] that every member of a generation meets: new ones, and some before crashes."""
-        used, fresh = self._new_starts(generation, self.config.starts, 0)
+    def episodes(self, generation: int) -> Episodes:
+        """What every member of a generation meets: new episodes, and some that start before crashes."""
+        used, fresh, worlds = self._new_starts(generation, self.config.starts, 0)
         if len(self.crashes) and self.config.crash_starts:
             chosen = self._rng(generation, 1).integers(len(self.crashes), size=self.config.crash_starts)
             crashes = self.crashes[chosen].copy()
@@ -132,44 +132,40 @@ class Curriculum:
             target = min(self.config.crash_target, self.target)
             crashes["target"], crashes["steps"] = target, self._steps(target)
             fresh = np.concatenate([fresh, crashes])
-        return [self.map_seeds[m] for m in used], fresh
+            worlds = np.concatenate([worlds, self.crash_worlds[chosen]])
+        return Episodes([self.map_seeds[m] for m in used], fresh, worlds)
 
-    def race(self, generation: int) -> tuple[list[int], np.ndarray]:
-        """Map seeds and EPISODE of the race that decides among the generation's best."""
-        used, episodes = self._new_starts(generation, self.config.race_episodes, 2)
-        return [self.map_seeds[m] for m in used], episodes
+    def race(self, generation: int) -> Episodes:
+        """The race that decides among the generation's best."""
+        used, episodes, worlds = self._new_starts(generation, self.config.race_episodes, 2)
+        return Episodes([self.map_seeds[m] for m in used], episodes, worlds)
 
-    def raced(
-        self,
-        order: np.ndarray,
-        results: np.ndarray,
-        rewound: np.ndarray,
-        map_seeds: Sequence[int],
-        episodes: np.ndarray,
-    ) -> None:
+    def raced(self, order: np.ndarray, results: np.ndarray, race: Episodes) -> None:
         """Learn from a race: remember the leaders' crashes, lengthen the task when the best succeed.
 
-        Args: racers from best to worst; RESULT [racers, e]; states float32 [racers, e, 5] some steps before each end;
-        the race's maps and EPISODE [e].
+        Args: racers from best to worst; `rollout.raced_dtype` [racers, e], with the states some steps before each end.
         """
-        new = []
+        new, worlds = [], []
         for racer in order[: self.config.leaders]:
-            for e in range(len(episodes)):
+            for e in range(len(race.rows)):
                 row = results[racer, e]
                 if row["end"] in (End.COLLISION, End.IDLE) and row["steps"] > 10:
                     start = np.zeros((), dtype=EPISODE)
-                    start["map"] = self.map_seeds.index(map_seeds[episodes[e]["map"]])
-                    start["start"] = rewound[racer, e]
+                    start["map"] = self.map_seeds.index(race.maps[race.rows[e]["map"]])
+                    start["start"] = row["rewound"]
                     new.append(start)
+                    worlds.append(row["world"])
         if new:
-            self.crashes = np.concatenate([self.crashes, np.array(new, dtype=EPISODE)])[-self.config.crash_memory :]
+            kept = self.config.crash_memory
+            self.crashes = np.concatenate([self.crashes, np.array(new, dtype=EPISODE)])[-kept:]
+            self.crash_worlds = np.concatenate([self.crash_worlds, np.array(worlds, dtype=np.float32)])[-kept:]
         best = results[order[:8]]
         if (best["distance"] >= self.target).mean() >= self.config.growth:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
-    def validation(self) -> tuple[list[int], np.ndarray]:
-        """Map seeds and EPISODE [validation], the same for every run of the scenario."""
-        return spread_starts(self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation)
+    def validation(self) -> Episodes:
+        """What champions are chosen on, the same for every run of the scenario."""
+        return spread_starts(self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation, self.traffic)
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:
         """How good members are, in [0, 1], by results [n, e] of validation: success, worth less below the pace."""

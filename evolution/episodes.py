@@ -1,20 +1,51 @@
-"""Which episodes a generation meets: starts on lanes from a seed, and how the task grows."""
+"""Which episodes are driven: starts on lanes and the traffic around them, from a seed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from evolution.rollout import EPISODE
+from evolution.rollout import EPISODE, no_traffic
+from gridsim.config import TrafficConfig
 from gridsim.scenarios import Scenario, sample_starts
+from gridsim.traffic import FIELDS, spawn
 
 
-def lane_starts(scenarios: Sequence[Scenario], maps: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Episodes EPISODE [len(maps)] that start uniformly over the lanes of `scenarios[maps[k]]`, at rest."""
-    episodes = np.zeros(len(maps), dtype=EPISODE)
+class Episodes(NamedTuple):
+    """Episodes that every member of a group meets."""
+
+    maps: list[int]  # seeds of the maps
+    rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
+    worlds: np.ndarray  # float32 [e, cars, traffic.FIELDS], the traffic that each begins with
+
+    def part(self, first: int, stop: int | None = None) -> Episodes:
+        """Some of them."""
+        return Episodes(self.maps, self.rows[first:stop], self.worlds[first:stop])
+
+
+def lane_starts(
+    scenarios: Sequence[Scenario],
+    maps: np.ndarray,
+    rng: np.random.Generator,
+    traffic: int = 0,
+    config: TrafficConfig | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Episodes that start uniformly over the lanes of `scenarios[maps[k]]`, at rest, with so many other cars.
+
+    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, traffic.FIELDS]).
+    """
+    episodes, worlds = np.zeros(len(maps), dtype=EPISODE), no_traffic(len(maps))
     episodes["map"] = maps
     for m in np.unique(maps):
         of = np.flatnonzero(episodes["map"] == m)
         episodes["start"][of] = sample_starts(scenarios[m], len(of), rng)
-    return episodes
+    if traffic:
+        worlds = np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
+        keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
+        for m in np.unique(maps):
+            of = np.flatnonzero(episodes["map"] == m)
+            starts = episodes["start"][of]
+            worlds[of] = spawn(scenarios[m].network, starts, traffic, keys[of], config or TrafficConfig())
+    return episodes, worlds

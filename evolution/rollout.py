@@ -44,8 +44,11 @@ EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("st
 #: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
 
-#: The same with the state some steps before the end, as a start: what a race returns.
-RACED = np.dtype([*RESULT.descr, ("rewound", "<f4", 5)])
+
+def raced_dtype(traffic: int) -> np.dtype:
+    """RESULT with the state some steps before the end, as a start, and the traffic of then: what a race returns."""
+    return np.dtype([*RESULT.descr, ("rewound", "<f4", 5), ("world", "<f4", (traffic, TRAFFIC_FIELDS))])
+
 
 MAX_STEPS = 65_535
 
@@ -207,8 +210,7 @@ def evaluate(
         worlds: the traffic that each episode begins with, float32 [e, cars, traffic.FIELDS]; None is no traffic.
 
     Returns: (RESULT [n, e], the states `rewind` steps before the ends, or at the starts of shorter episodes, as starts
-    float32 [n, e, 5] and the traffic of then, float32 [n, e, cars, traffic.FIELDS]; [n, e, 0] and [n, e, 0, ...] if none
-    are wanted).
+    float32 [n, e, 5] and the traffic of then, float32 [n, e, cars, traffic.FIELDS]; empty if none are wanted).
     Raises: ValueError where shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:

@@ -39,7 +39,7 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
             np.pad(array, ((0, 0), (0, most - array.shape[1])), constant_values=-1) for array in columns["successors"]
         ]
         together = {name: freeze(np.concatenate(arrays)) for name, arrays in columns.items()}
-        lanes = lanes._replace(**together)
+        lanes = Network(**together, width=lanes.width, height=lanes.height)
     sizes = [(len(network.points), len(network.steps), len(network.crossings)) for network in networks]
     parts = [(road.field, road.start_row, road.start) for road in roads]
     lengths = np.array([[len(array) for array in part] for part in parts], dtype=np.int64)

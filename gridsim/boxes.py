@@ -7,16 +7,10 @@ import math
 import numpy as np
 
 from gridsim.jit import leaf
-from gridsim.traffic import COS, LANE, SIN, SPEED, X, Y
+from gridsim.traffic import COS, LANE, SIN, SPEED, X, Y, wrapped
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
-
-
-@leaf
-def wrapped(difference, side):
-    """The shortest way round a torus of a side (m) for a difference of coordinates (m)."""
-    return difference - math.floor(difference / side + _HALF) * side
 
 
 @leaf
@@ -79,7 +73,7 @@ def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
 
 @leaf
 def nearest_box(world, width, height, x, y):
-    """m from a point to the middle of the nearest box of a world, and the greatest speed (m/s) of any box within 20 m."""
+    """Distance (m) from a point to the nearest box of a world, and the greatest speed (m/s) of any within 20 m."""
     nearest, fastest = _F(1e18), _ZERO
     for j in range(world.shape[0]):
         if world[j, LANE] >= _ZERO:
@@ -113,6 +107,9 @@ def stands_ahead(constants, world, reach, width, height, x, y, cosine, sine):
         if world[j, LANE] >= _ZERO and world[j, SPEED] < _HALF:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
             forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
-            if _ZERO < forward < reach + _F(2.0) * constants.half_length and abs(aside) < _F(2.0) * constants.half_width:
+            if (
+                _ZERO < forward < reach + _F(2.0) * constants.half_length
+                and abs(aside) < _F(2.0) * constants.half_width
+            ):
                 return True
     return False

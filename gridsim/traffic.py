@@ -1,9 +1,9 @@
 """Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change lanes on the highway.
 
-Longitudinal motion is the intelligent driver model (Treiber, Hennecke and Helbing 2000), lane changes are MOBIL (Kesting,
-Treiber and Helbing 2007). A car is on rails: its centre of mass lies on its lane, shifted sideways while it changes
-lanes. A junction lane is entered only with a permit, which nobody gets while the ground it crosses is another's. The ego
-car is an obstacle like any other, and has the right of way at junctions.
+Longitudinal motion is the intelligent driver model (Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
+(Kesting, Treiber and Helbing 2007). A car is on rails: its centre of mass lies on its lane, shifted sideways while it
+changes lanes. A junction lane is entered only with a permit, which nobody gets while the ground it crosses is taken.
+The ego car is an obstacle like any other, and has the right of way at junctions.
 
 A world is the traffic around one ego car: float32 [cars, FIELDS], the fields below. Whatever happens in it follows from
 that array and from the ego car alone.
@@ -38,7 +38,10 @@ FACTOR = 12  # desired speed over the lane's
 SEED = 13  # of its turns, below 2 ** 24
 TURNS = 14  # lanes it has chosen so far
 PACE = 15  # m/s2, its acceleration in this step
-FIELDS = 16
+HORIZON = 16  # m ahead that it looks in this step
+GAP = 17  # m from its middle to where it must not get
+LEAD = 18  # m/s of what is there
+FIELDS = 19
 
 _CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
@@ -46,7 +49,7 @@ _REACH = _F(2.4)  # m from the middle of a car within which all of it lies
 
 
 class Network(NamedTuple):
-    """Lanes as the kernels read them; arrays flat, read-only and C-contiguous. See `roads.Lanes` for what is not here."""
+    """Lanes as the kernels read them; arrays flat, read-only and C-contiguous. The rest is in `roads.Lanes`."""
 
     points: np.ndarray  # float32 [n, 2], m
     speeds: np.ndarray  # float32 [n], m/s: greatest speed there, so that bends ahead are met in comfort
@@ -103,7 +106,7 @@ def drivers(sim: SimConfig) -> Drivers:
 
 @njit
 def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, speeds):
-    """Greatest speed at each point: by curvature and lateral acceleration, and so that braking for it is comfortable."""
+    """Greatest speed at each point: by lateral acceleration, and so that braking for what comes is comfortable."""
     lanes = offsets.shape[0] - 1
     for lane in range(lanes):
         first, last = offsets[lane], offsets[lane + 1] - 1
@@ -186,9 +189,20 @@ def network_of_lanes(lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, width:
 
 
 @leaf
-def _round(x):
-    """Nearest whole number: `math.floor` is one instruction, `round` is a call."""
-    return math.floor(x + _HALF)
+def wrapped(difference, side):
+    """The shortest way round a torus of a side (m) for a difference of two coordinates on it."""
+    half = _HALF * side
+    if difference > half:
+        return difference - side
+    if difference < -half:
+        return difference + side
+    return difference
+
+
+@leaf
+def _turned(difference, side):
+    """The same for any difference: lanes' points are not wrapped."""
+    return difference - math.floor(difference / side + _HALF) * side
 
 
 @leaf
@@ -243,8 +257,7 @@ def _is_free(network, world, n, x, y, apart):
     for j in range(n):
         if world[j, LANE] >= _ZERO:
             dx, dy = world[j, X] - x, world[j, Y] - y
-            dx -= _round(dx / network.width) * network.width
-            dy -= _round(dy / network.height) * network.height
+            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy < apart * apart:
                 return False
     return True
@@ -269,8 +282,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             car[LANE], car[ALONG] = _F(lane), _F(metres - mileage[lane])
             _pose(network, car, _ZERO)
             dx, dy = car[X] - start[0], car[Y] - start[1]
-            dx -= _round(dx / network.width) * network.width
-            dy -= _round(dy / network.height) * network.height
+            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
                 car[SEED] = _F(mix(bits) >> _U(40))
                 car[FACTOR] = _F(0.8) + _F(0.4) * uniform(mix(bits + GOLDEN))
@@ -321,8 +333,8 @@ def idm(drivers, speed, desired, gap, leader):
 
 
 @leaf
-def _ahead(network, drivers, car, other_lane, other_along):
-    """m from a car's middle to a place on its lane or one of the two that come then; 1e9 if it is on none, or behind."""
+def _ahead(network, car, other_lane, other_along):
+    """Way (m) from a car to a place on its lane or one of the two that come then; 1e9 if it is on none, or behind."""
     lane, after, third = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
     if other_lane == lane and other_along > car[ALONG]:
         return other_along - car[ALONG]
@@ -336,7 +348,7 @@ def _ahead(network, drivers, car, other_lane, other_along):
 
 @leaf
 def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
-    """m from a car's middle along its path to where its way is blocked by a car at (x, y) with a heading; 1e9 if not.
+    """M from a car's middle along its path to where its way is blocked by a car at (x, y) with a heading; 1e9 if not.
 
     Looks at points of the path from the car's front on, up to `horizon` m.
     """
@@ -354,9 +366,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
             if travelled > horizon:
                 return _F(1e9)
             k = first + _I(along / step)
-            dx, dy = network.points[k, 0] - x, network.points[k, 1] - y
-            dx -= _round(dx / network.width) * network.width
-            dy -= _round(dy / network.height) * network.height
+            dx, dy = _turned(network.points[k, 0] - x, network.width), _turned(network.points[k, 1] - y, network.height)
             forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
             away = max(abs(forward) - half_length, abs(aside) - half_width)
             if away < _ZERO:
@@ -374,7 +384,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
 
 @leaf
 def _may_enter(network, drivers, world, i, ego):
-    """Whether car i may enter its next lane, a junction's, now: nobody's way crosses it, and there is room behind it."""
+    """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
     car = world[i]
     lane, beyond = _I(car[NEXT]), _I(car[AFTER])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
@@ -392,24 +402,22 @@ def _may_enter(network, drivers, world, i, ego):
                 network.clear[c] + _HALF
             ):
                 return False
-        if there == beyond and world[j, ALONG] < _F(3.0) * drivers.half_length + drivers.jam:
-            if world[j, SPEED] < _F(2.0):
-                return False
+        room = _F(3.0) * drivers.half_length + drivers.jam
+        if there == beyond and world[j, ALONG] < room and world[j, SPEED] < _F(2.0):
+            return False
     # The ego car goes first, unless it is behind this one.
     if ego[COS] == _ZERO and ego[SIN] == _ZERO:
         return True
     dx, dy = ego[X] - car[X], ego[Y] - car[Y]
-    dx -= _round(dx / network.width) * network.width
-    dy -= _round(dy / network.height) * network.height
+    dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
     forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
     if dx * dx + dy * dy < _F(2500.0) and not (forward < _ZERO and abs(aside) < _F(2.5)):
         for t in range(3):
             x, y = ego[X] + _F(t) * ego[SPEED] * ego[COS], ego[Y] + _F(t) * ego[SPEED] * ego[SIN]
             k = network.offsets[lane]
             while k < network.offsets[lane + 1]:
-                dx, dy = network.points[k, 0] - x, network.points[k, 1] - y
-                dx -= _round(dx / network.width) * network.width
-                dy -= _round(dy / network.height) * network.height
+                dx = _turned(network.points[k, 0] - x, network.width)
+                dy = _turned(network.points[k, 1] - y, network.height)
                 apart = math.sqrt(dx * dx + dy * dy)
                 if apart < _F(3.0):
                     return False
@@ -418,41 +426,52 @@ def _may_enter(network, drivers, world, i, ego):
 
 
 @leaf
-def _leader(network, drivers, world, i, ego, horizon):
-    """The nearest thing that car i has to keep behind: (m from its middle to where it must not get, speed m/s)."""
-    car = world[i]
-    nearest, speed = _F(1e9), _ZERO
-    for j in range(world.shape[0] + 1):
-        if j == i:
+def _follow(network, drivers, car, other, is_ego):
+    """Take another car within a car's horizon into account: whether it is the nearest thing to keep behind."""
+    along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
+    at = _F(1e9)
+    if not is_ego:
+        at = _ahead(network, car, _I(other[LANE]), other[ALONG]) - drivers.half_length
+    if at > _F(1e8):
+        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
+    if at < car[GAP]:
+        car[GAP], car[LEAD] = at, along
+    if is_ego and other[SPEED] > _ONE:
+        # Where the ego car will be in a second: it may be about to cut in.
+        x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
+        at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])
+        dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
+        if at < car[GAP] and dx * car[COS] + dy * car[SIN] > _ZERO:
+            car[GAP], car[LEAD] = at, along
+
+
+@leaf
+def _see(network, drivers, world, ego):
+    """Find for each car the nearest thing that it has to keep behind, within its horizon: GAP and LEAD."""
+    cars = world.shape[0]
+    for i in range(cars):
+        speed = world[i, SPEED]
+        world[i, HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_F(2.0) * drivers.comfort))
+        world[i, GAP], world[i, LEAD] = _F(1e9), _ZERO
+    for i in range(cars):
+        if world[i, LANE] < _ZERO:
             continue
-        other = world[j] if j < world.shape[0] else ego
-        is_ego = j == world.shape[0]
-        if not is_ego and other[LANE] < _ZERO or is_ego and other[COS] == _ZERO and other[SIN] == _ZERO:
-            continue
-        dx, dy = other[X] - car[X], other[Y] - car[Y]
-        dx -= _round(dx / network.width) * network.width
-        dy -= _round(dy / network.height) * network.height
-        squared = dx * dx + dy * dy
-        if squared > (horizon + _F(5.0)) * (horizon + _F(5.0)):
-            continue
-        at = _F(1e9)
-        if not is_ego:
-            at = _ahead(network, drivers, car, _I(other[LANE]), other[ALONG]) - drivers.half_length
-        if at > _F(1e8):
-            at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], horizon)
-        if at < nearest:
-            nearest = at
-            speed = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
-        if is_ego and other[SPEED] > _ONE:
-            # Where the ego car will be in a second: it may be about to cut in.
-            at = _in_the_way(
-                network, drivers, car, other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN],
-                other[COS], other[SIN], horizon,
-            )  # fmt: skip
-            if at < nearest and dx * car[COS] + dy * car[SIN] > _ZERO:
-                nearest = at
-                speed = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
-    return nearest, speed
+        x, y = world[i, X], world[i, Y]
+        for j in range(i):
+            if world[j, LANE] < _ZERO:
+                continue
+            dx, dy = wrapped(world[j, X] - x, network.width), wrapped(world[j, Y] - y, network.height)
+            apart = math.sqrt(dx * dx + dy * dy) - _F(5.0)
+            if apart < world[i, HORIZON]:
+                _follow(network, drivers, world[i], world[j], False)
+            if apart < world[j, HORIZON]:
+                _follow(network, drivers, world[j], world[i], False)
+        dx, dy = wrapped(ego[X] - x, network.width), wrapped(ego[Y] - y, network.height)
+        if (
+            math.sqrt(dx * dx + dy * dy) - _F(5.0) < world[i, HORIZON]
+            and ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
+        ):
+            _follow(network, drivers, world[i], ego, True)
 
 
 @leaf
@@ -463,7 +482,7 @@ def _desired(network, car):
     return car[FACTOR] * network.speeds[min(at, _I(network.offsets[lane + 1] - 1))]
 
 
-@njit
+@njit(_nrt=False)
 def _change_lanes(network, drivers, world, i, ego, step):
     """MOBIL (Kesting et al. 2007): move car i to a neighbouring lane where that is safe and it gains by it."""
     car = world[i]
@@ -486,11 +505,10 @@ def _change_lanes(network, drivers, world, i, ego, step):
             if j == i:
                 continue
             other = world[j] if j < world.shape[0] else ego
-            if j < world.shape[0] and other[LANE] < _ZERO or other[COS] == _ZERO and other[SIN] == _ZERO:
+            if (j < world.shape[0] and other[LANE] < _ZERO) or (other[COS] == _ZERO and other[SIN] == _ZERO):
                 continue
             dx, dy = other[X] - car[X], other[Y] - car[Y]
-            dx -= _round(dx / network.width) * network.width
-            dy -= _round(dy / network.height) * network.height
+            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy > _F(10000.0):
                 continue
             if j < world.shape[0]:
@@ -504,10 +522,8 @@ def _change_lanes(network, drivers, world, i, ego, step):
                 elif network.successors[there, 0] == target:
                     ahead = along + _lane_length(network, there) - place
                     ahead = -ahead
-                elif there != lane and other[SHIFT] != _ZERO:
-                    # Somebody else is moving over, from beyond the target lane or out of it.
-                    if dx * dx + dy * dy < _F(400.0):
-                        free = False
+                elif there != lane and other[SHIFT] != _ZERO and dx * dx + dy * dy < _F(400.0):
+                    free = False  # somebody else is moving over, from beyond the target lane or out of it
                 if ahead > _F(1e8):
                     continue
             else:
@@ -545,15 +561,14 @@ def _change_lanes(network, drivers, world, i, ego, step):
         k = _I(car[ALONG] / network.steps[best])
         dx = network.points[second + k, 0] - network.points[first + k, 0]
         dy = network.points[second + k, 1] - network.points[first + k, 1]
-        dx -= _round(dx / network.width) * network.width
-        dy -= _round(dy / network.height) * network.height
+        dx, dy = _turned(dx, network.width), _turned(dy, network.height)
         car[SHIFT] = -toward * math.sqrt(dx * dx + dy * dy)
         car[LANE] = _F(best)
         car[NEXT] = _F(_choose(network, best, car))
         car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
 
 
-@njit
+@leaf
 def _go(network, drivers, car):
     """Move one car by its acceleration for a control period."""
     after = max(car[SPEED] + car[PACE] * drivers.dt, _ZERO)
@@ -582,27 +597,26 @@ def _go(network, drivers, car):
     _pose(network, car, sway)
 
 
-@njit(nogil=True)
+@njit(nogil=True, _nrt=False)
 def flow(network, drivers, world, ego, step):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
-    Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it is
-    not there); number of the control step.
+    Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it
+    is not there); number of the control step.
     """
     cars = world.shape[0]
+    _see(network, drivers, world, ego)
     for i in range(cars):
         car = world[i]
         if car[LANE] < _ZERO:
             continue
         lane, onward = _I(car[LANE]), _I(car[NEXT])
-        horizon = drivers.jam + _F(8.0) + car[SPEED] * (_F(1.5) + car[SPEED] / (_F(2.0) * drivers.comfort))
-        at, leader = _leader(network, drivers, world, i, ego, horizon)
         desired = _desired(network, car)
-        pace = idm(drivers, car[SPEED], desired, at - drivers.half_length, leader)
+        pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD])
         if network.crossing_offsets[onward + 1] > network.crossing_offsets[onward] and car[PERMIT] != car[NEXT]:
             # A junction comes: up to its line without a permit.
             line = _lane_length(network, lane) - car[ALONG] - drivers.half_length
-            if line < horizon:
+            if line < car[HORIZON]:
                 if _may_enter(network, drivers, world, i, ego):
                     car[PERMIT] = car[NEXT]
                 else:

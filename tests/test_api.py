@@ -44,7 +44,7 @@ def test_environment_and_rollout_drive_alike(champion):
     direction = scenario.lanes.points[4] - scenario.lanes.points[3]
     start[2] = np.arctan2(direction[1], direction[0])
     spec = PolicySpec.parse(champion.policy)
-    result, _ = trajectory(spec, champion.genome, scenario, start, Limits(2000.0, 4000), champion.sim)
+    result, _, _ = trajectory(spec, champion.genome, scenario, start, Limits(2000.0, 4000), champion.sim)
     observation, _ = env.reset(seed=1, options={"map_seed": 12, "start": start})
     steps, over, info = 0, False, {}
     while not over:

@@ -150,7 +150,7 @@ def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Scenario]) ->
     episodes["start"][:, 3] = 5.0
     ends = set()
     for genome in genomes(40):
-        results, _ = evaluate(SPEC, genome[None], maps, episodes, limits, config)
+        results, _, _ = evaluate(SPEC, genome[None], maps, episodes, limits, config)
         env, driver = GridSimVectorEnv(24, maps=maps, config=config), Driver(genome)
         options = {"map_seed": [maps[m].seed for m in episodes["map"]], "start": episodes["start"]}
         _, info = env.reset(seed=0, options=options)

@@ -15,7 +15,7 @@ from cluster.pool import SMALLEST_CHUNK, PoolError, SerialPool, chunks, cut, las
 from cluster.worker import Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.episodes import lane_starts
-from evolution.rollout import EPISODE, RESULT, Limits
+from evolution.rollout import EPISODE, RESULT, Limits, no_traffic
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario, build
 
@@ -48,7 +48,17 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
     if episodes is None:
         episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
         episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
-    return Task("mlp:6,7", parents, 12345, Mutation(), episodes, maps, Limits(150.0, 300), SimConfig())
+    return Task(
+        "mlp:6,7",
+        parents,
+        12345,
+        Mutation(),
+        episodes,
+        no_traffic(len(episodes)),
+        maps,
+        Limits(150.0, 300),
+        SimConfig(),
+    )
 
 
 def make_recipes(n: int) -> np.ndarray:
@@ -69,7 +79,7 @@ def never_built(name: str, seed: int) -> Scenario:
 def drive_task() -> tuple[Task, list[Scenario]]:
     """A small real task on two maps, and the maps."""
     scenarios = [build(*name) for name in MAPS]
-    episodes = lane_starts(scenarios, np.array([0, 1, 1]), np.random.default_rng(1))
+    episodes, _ = lane_starts(scenarios, np.array([0, 1, 1]), np.random.default_rng(1))
     return make_task(MAPS, episodes), scenarios
 
 

@@ -8,7 +8,7 @@ import oracle
 import pytest
 
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits, evaluate
+from evolution.rollout import EPISODE, Limits, evaluate, no_traffic
 from gridsim.config import EpisodeConfig, SimConfig, constants
 from gridsim.roads import Strips, clearance_nodes, make_road
 from gridsim.scenarios import build, sample_starts
@@ -41,6 +41,7 @@ K = constants(CONFIG)
 RAYS = fan(31, K.ray_first, K.ray_step)
 SIDE = 256.0
 INTERVAL = (5.0, 12.0)  # m/s
+NOBODY = no_traffic(1)[0]
 
 
 @dataclass
@@ -63,9 +64,9 @@ def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
     states: list[np.ndarray] = []
     end = 0
     while end == 0:
-        look(road, k, RAYS, car, beams, ranges)
+        look(road, k, RAYS, car, NOBODY, beams, ranges)
         actions.append(int(choose(len(actions), ranges, car)))
-        end = drive(road, k, car, visits, actions[-1])
+        end = drive(road, k, car, visits, NOBODY, actions[-1])
         states.append(car.copy())
         if end == 0 and car[DISTANCE] >= target:
             end = End.SUCCESS
@@ -432,13 +433,13 @@ def task(scenarios):
 def test_a_bad_genome_loses_and_spoils_nothing(scenarios, task, poison):
     spec, genomes, starts = task
     limits = Limits(500.0, 800)
-    clean, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
+    clean, _, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
     assert (clean["distance"] > 1.0).any()
     for gene in (0, spec.size // 2, spec.size - 1):
         spoilt = genomes.copy()
         spoilt[1, gene] = poison
         spoilt[4] = math.nan
-        results, _ = evaluate(spec, spoilt, scenarios, starts, limits, CONFIG)
+        results, _, _ = evaluate(spec, spoilt, scenarios, starts, limits, CONFIG)
         others = [0, 2, 3, 5]
         assert results[others].tobytes() == clean[others].tobytes()
         assert (results["distance"][4] == 0.0).all()
@@ -451,8 +452,8 @@ def test_a_bad_genome_loses_and_spoils_nothing(scenarios, task, poison):
 def test_results_do_not_depend_on_the_company(scenarios, task):
     spec, genomes, starts = task
     limits = Limits(500.0, 800)
-    together, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
+    together, _, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
     for i in range(len(genomes)):
         for e in range(len(starts)):
-            alone, _ = evaluate(spec, genomes[i : i + 1], scenarios, starts[e : e + 1], limits, CONFIG)
+            alone, _, _ = evaluate(spec, genomes[i : i + 1], scenarios, starts[e : e + 1], limits, CONFIG)
             assert alone[0, 0].tobytes() == together[i, e].tobytes()
