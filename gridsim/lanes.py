@@ -15,7 +15,7 @@ import numpy as np
 
 from gridsim.config import VehicleConfig
 from gridsim.jit import njit
-from gridsim.roads import Lanes
+from gridsim.roads import Lanes, Strips
 
 LANE_STEP = 1.0  # m between points of a lane, at most
 CROSSING_GAP = 2.9  # m between two lanes' centre lines below which their cars, 2 m wide, may touch
@@ -33,17 +33,71 @@ class Path(NamedTuple):
     pieces: tuple[tuple[float, float], ...]  # length (m, above 0) and curvature (1/m, left positive) of each
 
 
-def shifted(path: Path, dx: float, dy: float) -> Path:
-    """The path, moved."""
-    return path._replace(x=path.x + dx, y=path.y + dy)
-
-
 def end_of(path: Path) -> tuple[float, float, float]:
     """Pose (m, m, rad) where a path ends."""
-    pose = (path.x, path.y, path.heading)
+    pose = path[:3]
     for length, curvature in path.pieces:
         pose = _on(*pose, length, curvature)
     return pose
+
+
+def beside(path: Path, offset: float) -> list[Path]:
+    """The pieces of a path, each a path of its own, `offset` m to the left of it."""
+    pose, result = path[:3], []
+    for length, curvature in path.pieces:
+        x, y, heading = pose
+        scale = 1.0 - offset * curvature
+        piece = (length * scale, curvature / scale)
+        result.append(Path(x - offset * math.sin(heading), y + offset * math.cos(heading), heading, (piece,)))
+        pose = _on(x, y, heading, length, curvature)
+    return result
+
+
+def backwards(path: Path) -> Path:
+    """The same curve, driven the other way."""
+    x, y, heading = end_of(path)
+    return Path(x, y, heading + math.pi, tuple((length, -curvature) for length, curvature in reversed(path.pieces)))
+
+
+def sample(path: Path, step: float) -> tuple[np.ndarray, float]:
+    """Points float32 [n, 2] along a path, and the spacing of them in m: `step` at most."""
+    length = sum(length for length, _ in path.pieces)
+    intervals = math.ceil(length / step)
+    offsets = np.array([0, intervals + 1])
+    pieces = np.array(path.pieces)
+    points, _ = _sample(
+        np.array([path[:3]]), pieces, np.array([0, len(pieces)]), np.array([length / intervals]), offsets
+    )
+    return points, length / intervals
+
+
+def strips_along(path: Path, half_width: float) -> Strips:
+    """Drivable area along a path."""
+    pose = path[:3]
+    lines, arcs = [], []
+    for length, curvature in path.pieces:
+        x, y, heading = pose
+        pose = _on(x, y, heading, length, curvature)
+        if curvature == 0.0:
+            lines.append([x, y, pose[0], pose[1], half_width])
+        else:
+            r = 1.0 / curvature  # signed: the centre is to the left or to the right
+            first = heading - math.copysign(math.pi / 2, r)
+            arcs.append(
+                [x - r * math.sin(heading), y + r * math.cos(heading), abs(r), first, length * curvature, half_width]
+            )
+    return Strips(np.array(lines).reshape(-1, 5), np.array(arcs).reshape(-1, 6))
+
+
+def through_square(turn: int, half: float, offset: float) -> tuple[tuple[float, float], ...]:
+    """Pieces of a lane through a square of side 2 * half, driving on the right, `offset` m from the road's middle.
+
+    It leaves by the side `turn` quarters on, counter-clockwise, from the one it enters by: 1 right, 2 straight, 3 left.
+    """
+    if turn == 2:
+        return ((2.0 * half, 0.0),)
+    radius = half + offset if turn == 3 else half - offset
+    return ((math.pi / 2 * radius, (1.0 if turn == 3 else -1.0) / radius),)
 
 
 @njit
@@ -142,15 +196,15 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     Raises: ValueError if a lane leads nowhere.
     """
     n = len(paths)
-    starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(n, 3)
-    pieces = np.array([piece for path in paths for piece in path.pieces], dtype=np.float64).reshape(-1, 2)
-    piece_offsets = np.cumsum([0, *(len(path.pieces) for path in paths)])
     lengths = np.array([sum(length for length, _ in path.pieces) for path in paths])
-    sharpest = np.array([max(abs(curvature) for _, curvature in path.pieces) for path in paths])
     longest = lengths.reshape(-1, abreast).max(axis=1, initial=0.0)
     intervals = np.repeat(np.maximum(np.ceil(longest / LANE_STEP - 1e-9), 1), abreast).astype(np.int32)
     steps = lengths / intervals
     offsets = np.concatenate([[0], np.cumsum(intervals + 1)]).astype(np.int32)
+    starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(n, 3)
+    pieces = np.array([piece for path in paths for piece in path.pieces], dtype=np.float64).reshape(-1, 2)
+    piece_offsets = np.cumsum([0, *(len(path.pieces) for path in paths)])
+    sharpest = np.array([max(abs(curvature) for _, curvature in path.pieces) for path in paths])
     points, ends = _sample(starts, pieces, piece_offsets, steps, offsets)
     successors = np.full((n, FORKS), -1, dtype=np.int32)
     if n and _successors(starts, ends, width, height, successors) == 0:

@@ -9,10 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
+from gridsim.city import city_layout
 from gridsim.config import SimConfig
+from gridsim.curved import curved_layout
+from gridsim.highway import highway_layout
 from gridsim.jit import njit
 from gridsim.roads import Lanes, Road, Strips, clearance_nodes, freeze, make_road
-from gridsim.seamless import seamless_layout
+from gridsim.seamless import roundabout_layout, seamless_layout
 from gridsim.traffic import Network, make_network, network_of_lanes
 
 TRAINING_SEED = 0  # first seed of the maps that are trained on
@@ -107,7 +110,11 @@ class ScenarioSpec:
 
 
 REGISTRY: dict[str, ScenarioSpec] = {
+    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, highway_layout),
+    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, curved_layout),
     "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, seamless_layout),
+    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, roundabout_layout),
+    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, city_layout),
 }
 
 

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from gridsim.lanes import Path, lay_lanes
+from gridsim.lanes import Path, lay_lanes, through_square
 from gridsim.roads import Lanes, Strips
 
 TILE = 32.0  # m, side of a tile
@@ -24,7 +24,8 @@ ROUNDABOUT_RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as
 ROUNDABOUT_HALF = 4.5  # m, half width of the ring, which is wide enough for a lorry to turn
 ROUNDABOUT_FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
 FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those: their outer edge runs on into the arm's
-ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
+ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles of the seamless road
+FEWEST_ROUNDABOUTS = 6  # of a map of the roundabout scenario
 EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
 SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
 
@@ -92,15 +93,6 @@ def _largest_component(edges: np.ndarray) -> np.ndarray:
     return label == np.bincount(used).argmax() if used.size else label >= 0
 
 
-def _through(turn: int) -> tuple[tuple[float, float], ...]:
-    """Pieces of the lane through a plain tile that leaves by the edge `turn` quarters on from that of its entry."""
-    half, offset = TILE / 2, LANE_WIDTH / 2
-    if turn == 2:
-        return ((TILE, 0.0),)
-    radius = half + offset if turn == 3 else half - offset  # to the left, to the right
-    return ((math.pi / 2 * radius, (1.0 if turn == 3 else -1.0) / radius),)
-
-
 def _flare() -> tuple[float, float, float]:
     """The arc by which an arm's lane joins the ring: (x, y of its centre for the eastern arm, ring angle in rad).
 
@@ -111,7 +103,7 @@ def _flare() -> tuple[float, float, float]:
     return x, y, math.atan2(y, x)
 
 
-def _turned(points: np.ndarray, quarters: int) -> np.ndarray:
+def turned(points: np.ndarray, quarters: int) -> np.ndarray:
     """Points [n, 2] turned counter-clockwise by so many quarters."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
@@ -126,53 +118,70 @@ def _around(turn: int) -> tuple[tuple[float, float], ...]:
     return (straight, flare, ring, flare, straight)
 
 
-def _tile_strips(arms: list[int], roundabout: bool) -> tuple[list[list[float]], list[list[float]]]:
-    """Lines and arcs of one tile centred on the origin."""
+def _ring_strips(arms: list[int]) -> tuple[list[list[float]], list[list[float]]]:
+    """Lines and arcs of a roundabout centred on the origin."""
     half = TILE / 2
+    x, y, angle = _flare()
+    lines: list[list[float]] = []
+    arcs = [[0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF]]
+    for arm in arms:
+        dx, dy = DIRECTIONS[arm]
+        inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
+        lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
+        for side in (1.0, -1.0):  # way in, way out
+            (cx, cy), first = turned(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
+            arcs.append([cx, cy, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
+    return lines, arcs
+
+
+def square_strips(arms: list[int], half: float, half_road: float) -> tuple[list[list[float]], list[list[float]]]:
+    """Lines and arcs that join the middles of those sides of a square (of side 2 * half, centred on the origin)."""
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
-    if roundabout:
-        x, y, angle = _flare()
-        arcs.append([0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF])
-        for arm in arms:
-            dx, dy = DIRECTIONS[arm]
-            inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
-            lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
-            for side in (1.0, -1.0):  # way in, way out
-                (cx, cy), first = _turned(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
-                arcs.append([cx, cy, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
-        return lines, arcs
     for k, a in enumerate(arms):
         for b in arms[k + 1 :]:
             ax, ay = DIRECTIONS[a]
             bx, by = DIRECTIONS[b]
             if (b - a) % 4 == 2:
-                lines.append([ax * half, ay * half, bx * half, by * half, HALF_ROAD])
+                lines.append([ax * half, ay * half, bx * half, by * half, half_road])
             else:
                 first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
                 sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
-                arcs.append([half * (ax + bx), half * (ay + by), half, first, sweep, HALF_ROAD])
+                arcs.append([half * (ax + bx), half * (ay + by), half, first, sweep, half_road])
     return lines, arcs
 
 
 def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
     """Lay a network: (strips, lanes, width m, height m)."""
-    edges = tile_graph(rng)
+    return _layout(rng, tile_graph(rng), ROUNDABOUT_SHARE)
+
+
+def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
+    """Lay a network in which every T and crossing is a roundabout: (strips, lanes, width m, height m)."""
+    while True:
+        edges = tile_graph(rng)
+        if (edges.sum(axis=1) > 2).sum() >= FEWEST_ROUNDABOUTS:
+            return _layout(rng, edges, 1.0)
+
+
+def _layout(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[Strips, Lanes, float, float]:
+    """Tiles and lanes along a graph's edges; this share of the T and crossing tiles are roundabouts."""
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
     paths: list[Path] = []
     for tile in range(len(edges)):
         arms = [int(d) for d in np.flatnonzero(edges[tile])]
-        roundabout = rng.random() < ROUNDABOUT_SHARE and len(arms) > 2
+        roundabout = rng.random() < share and len(arms) > 2
         x, y = (tile % TILES + 0.5) * TILE, (tile // TILES + 0.5) * TILE
-        tile_lines, tile_arcs = _tile_strips(arms, roundabout)
+        tile_lines, tile_arcs = _ring_strips(arms) if roundabout else square_strips(arms, TILE / 2, HALF_ROAD)
         lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in tile_lines]
         arcs += [[a + x, b + y, *rest] for a, b, *rest in tile_arcs]
         for entry in arms:
-            edge_x, edge_y = _turned(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
+            edge_x, edge_y = turned(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
             for exit in arms:
                 if exit != entry:
-                    pieces = (_around if roundabout else _through)((exit - entry) % 4)
+                    turn = (exit - entry) % 4
+                    pieces = _around(turn) if roundabout else through_square(turn, TILE / 2, LANE_WIDTH / 2)
                     paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, pieces))
     lanes = lay_lanes(paths, TILE * TILES, TILE * TILES)
     strips = Strips(np.array(lines, dtype=np.float64).reshape(-1, 5), np.array(arcs, dtype=np.float64).reshape(-1, 6))

@@ -26,7 +26,7 @@ STAGES = (16.0,)  # m, to which rays are cast before they are cast to their whol
 
 
 class ExactRoad:
-    """The union of capsules (lines) and round-ended annular sectors (arcs), repeated over the torus."""
+    """The union of capsules (lines) and round-ended annular sectors (arcs) without rectangles (blocks), on the torus."""
 
     def __init__(self, strips: Strips, width: float, height: float, torus: bool = True):
         self.width, self.height, self.torus = width, height, torus
@@ -37,10 +37,11 @@ class ExactRoad:
             pieces += [(cx, cy, radius, low + abs(sweep) * k / n, abs(sweep) / n, half_width) for k in range(n)]
         self.lines = np.array(strips.lines, dtype=np.float64).reshape(-1, 5)
         self.arcs = np.array(pieces, dtype=np.float64).reshape(-1, 6)
-        self._bounds: tuple[np.ndarray, np.ndarray] | None = None
+        self.blocks = np.array(strips.blocks, dtype=np.float64).reshape(-1, 5)
+        self._bounds: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def _boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounding boxes of lines and arcs, [4, n]: x from, x to, y from, y to."""
+    def _boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Bounding boxes of lines, arcs and blocks, [4, n]: x from, x to, y from, y to."""
         lines, arcs = self.lines, self.arcs
         a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4:5]
         low, high = np.minimum(a, b) - w, np.maximum(a, b) + w
@@ -48,27 +49,31 @@ class ExactRoad:
         middle = arcs[:, 3] + arcs[:, 4] / 2
         mx, my = arcs[:, 0] + arcs[:, 2] * np.cos(middle), arcs[:, 1] + arcs[:, 2] * np.sin(middle)
         size = 2 * arcs[:, 2] * np.sin(arcs[:, 4] / 4) + arcs[:, 5]
+        bx, by, diagonal = self.blocks[:, 0], self.blocks[:, 1], np.hypot(self.blocks[:, 3], self.blocks[:, 4])
         return (
             np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]]),
             np.stack([mx - size, mx + size, my - size, my + size]),
+            np.stack([bx - diagonal, bx + diagonal, by - diagonal, by + diagonal]),
         )
 
-    def _near(self, x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Lines and arcs, with their repetitions over the torus, that may come within `radius` of a point."""
+    def _near(self, x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lines, arcs and blocks, with their repetitions over the torus, that may come within `radius` of a point."""
         if self._bounds is None:
             self._bounds = self._boxes()
         found_lines: list[np.ndarray] = []
         found_arcs: list[np.ndarray] = []
+        found_blocks: list[np.ndarray] = []
         for dx in self._shifts(x, radius, self.width):
             for dy in self._shifts(y, radius, self.height):
                 for items, box, found, shift in (
                     (self.lines, self._bounds[0], found_lines, [dx, dy, dx, dy, 0.0]),
                     (self.arcs, self._bounds[1], found_arcs, [dx, dy, 0.0, 0.0, 0.0, 0.0]),
+                    (self.blocks, self._bounds[2], found_blocks, [dx, dy, 0.0, 0.0, 0.0]),
                 ):
                     away_x = np.maximum(np.maximum(box[0] + dx - x, x - box[1] - dx), 0.0)
                     away_y = np.maximum(np.maximum(box[2] + dy - y, y - box[3] - dy), 0.0)
                     found.append(items[away_x**2 + away_y**2 <= radius**2] + shift)
-        return np.concatenate(found_lines), np.concatenate(found_arcs)
+        return np.concatenate(found_lines), np.concatenate(found_arcs), np.concatenate(found_blocks)
 
     def _shifts(self, at: float, radius: float, side: float) -> Iterator[float]:
         if not self.torus:
@@ -89,11 +94,14 @@ class ExactRoad:
                 yield chosen, float(x), float(y)
 
     def clearance(self, points: np.ndarray, deepest: float = 3.0) -> np.ndarray:
-        """Greatest (half width - distance to the centre line) at points [n, 2], in m; below -deepest it is -deepest."""
+        """Greatest (half width - distance to the centre line) at points [n, 2], in m, or the distance to the nearest
+        block (negative inside) where that is less; below -deepest it is -deepest."""
         points = np.asarray(points, dtype=np.float64)
         result = np.full(len(points), -deepest)
         for chosen, x, y in self._groups(points):
-            lines, arcs = self._near(x, y, deepest + GROUP * math.sqrt(0.5))
+            # No block further off than the widest strip is can be nearer than the strip's edge.
+            far = max(deepest, self.lines[:, 4].max(initial=0.0), self.arcs[:, 5].max(initial=0.0))
+            lines, arcs, blocks = self._near(x, y, far + GROUP * math.sqrt(0.5))
             p = points[chosen, None, :]
             best = [np.full(len(chosen), -deepest)]
             if len(lines):
@@ -111,6 +119,10 @@ class ExactRoad:
                 nearest = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
                 best.append((w - np.linalg.norm(q - nearest, axis=2)).max(axis=1))
             result[chosen] = np.max(best, axis=0)
+            if len(blocks):
+                beyond = np.abs(_in_frame(p - blocks[:, 0:2], blocks[:, 2])) - blocks[:, 3:5]
+                signed = np.linalg.norm(np.maximum(beyond, 0.0), axis=2) + np.minimum(beyond.max(axis=2), 0.0)
+                result[chosen] = np.maximum(np.minimum(result[chosen], signed.min(axis=1)), -deepest)
         return result
 
     def cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:
@@ -128,7 +140,7 @@ class ExactRoad:
     def _cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:
         result = np.zeros(len(angles))
         for chosen, x, y in self._groups(origins):
-            lines, arcs = self._near(x, y, reach + GROUP * math.sqrt(0.5))
+            lines, arcs, blocks = self._near(x, y, reach + GROUP * math.sqrt(0.5))
             p, d = origins[chosen, None, :], np.stack([np.cos(angles[chosen]), np.sin(angles[chosen])], axis=-1)
             d = d[:, None, :]
             inside = []
@@ -148,6 +160,12 @@ class ExactRoad:
                 if (further <= t + 1e-9).all():
                     break
                 t = further
+            if len(blocks):
+                q, e = _in_frame(p - blocks[:, 0:2], blocks[:, 2]), _in_frame(d, blocks[:, 2])
+                half = blocks[:, 3:5]
+                enter, leave = _meet(*(_between(q[..., k], e[..., k], -half[:, k], half[:, k]) for k in (0, 1)))
+                hit = np.where(leave > 0.0, np.maximum(enter, 0.0), np.inf)
+                t = np.minimum(t, hit.min(axis=1))
             result[chosen] = np.minimum(t, reach)
         return result
 
@@ -172,10 +190,18 @@ class ExactRoad:
 
     def widened(self, margin: float) -> ExactRoad:
         """The road with its edges moved outwards by `margin` (m), inwards if that is negative."""
-        wider = ExactRoad(Strips(self.lines, self.arcs), self.width, self.height, self.torus)
+        wider = ExactRoad(Strips(self.lines, self.arcs, self.blocks), self.width, self.height, self.torus)
         wider.lines[:, 4] += margin
         wider.arcs[:, 5] += margin
+        wider.blocks[:, 3:5] -= margin
         return wider
+
+
+def _in_frame(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """Vectors [n, k, 2] seen from frames with these headings [k]: along and to the left."""
+    c, s = np.cos(heading), np.sin(heading)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([x * c + y * s, y * c - x * s], axis=-1)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,0 +1,387 @@
+"""What holds of every map of every scenario, over many seeds; and what makes each scenario what it is."""
+
+import hashlib
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import oracle
+import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+import gridsim.city as city
+import gridsim.curved as curved
+import gridsim.highway as highway
+from gridsim.config import SimConfig, constants
+from gridsim.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
+from gridsim.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
+from gridsim.scenarios import REGISTRY, Scenario, build, sample_starts
+from gridsim.seamless import FEWEST_ROUNDABOUTS
+from gridsim.simulator import collides
+
+LAID = range(24)  # seeds of which strips and lanes are looked at
+BUILT = (0, 1)  # ... whole maps
+F = np.float32
+ROUND = 215.0  # m, of the shortest loop: more than the 200 m within which ground driven again counts nothing
+MEMORY = 8 * 2**20  # bytes of a map
+
+
+def lay(name, seed):
+    strips, lanes, width, height = REGISTRY[name].layout(np.random.default_rng(seed))
+    return SimpleNamespace(strips=strips, lanes=lanes, sides=np.array([width, height]))
+
+
+@pytest.fixture(scope="module", params=REGISTRY)
+def name(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def laid(name):
+    return [lay(name, seed) for seed in LAID]
+
+
+@pytest.fixture(scope="module")
+def built(name):
+    return [build(name, seed) for seed in BUILT]
+
+
+def exact_of(scenario):
+    return oracle.ExactRoad(scenario.strips, float(scenario.road.width), float(scenario.road.height))
+
+
+def wrapped(away, sides):
+    return away - np.round(away / sides) * sides
+
+
+def headings(lane):
+    """Tangents (rad) at the points [n, 2] of a lane: between those of the pieces on either side."""
+    step = np.diff(lane.astype(float), axis=0)
+    angle = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    if len(angle) == 1:
+        return np.repeat(angle, 2)
+    inner = (angle[1:] + angle[:-1]) / 2
+    return np.concatenate([[1.5 * angle[0] - 0.5 * angle[1]], inner, [1.5 * angle[-1] - 0.5 * angle[-2]]])
+
+
+# --- Lanes -----------------------------------------------------------------------------------------------------------
+
+
+def test_every_lane_goes_on_where_it_ends(laid):
+    for m in laid:
+        lanes = m.lanes
+        assert (lanes.successors[:, 0] >= 0).all()
+        points = [lanes.lane(i).astype(float) for i in range(len(lanes))]
+        angles = [headings(p) for p in points]
+        for i in range(len(lanes)):
+            following = lanes.successors[i][lanes.successors[i] >= 0].tolist()
+            assert len(set(following)) == len(following)
+            for j in following:
+                assert np.abs(wrapped(points[j][0] - points[i][-1], m.sides)).max() < 1e-3
+                assert (
+                    abs(math.remainder(angles[j][0] - angles[i][-1], 2 * math.pi)) < 0.05
+                )  # half a step on a radius of 10 m
+
+
+def test_every_lane_is_found_by_a_predecessor_and_leads_back_to_itself(name, laid):
+    """Each direction of the loop is a network of its own; of the highway each lane, because changes are no successors."""
+    for m in laid:
+        graph = lane_graph(m.lanes)
+        parts, _ = connected_components(graph, connection="strong")
+        assert parts == {"highway": highway.LANE_COUNT, "curved": 2}.get(name, 1)
+        assert set(m.lanes.successors[m.lanes.successors >= 0].tolist()) == set(range(len(m.lanes)))
+
+
+def test_points_are_equally_spaced(laid):
+    for m in laid:
+        lanes = m.lanes
+        assert lanes.steps.max() <= LANE_STEP * (1 + 1e-6)
+        assert lanes.lengths == pytest.approx(lanes.steps * (np.diff(lanes.offsets) - 1), rel=1e-6)
+        for i in range(len(lanes)):
+            chord = np.linalg.norm(np.diff(lanes.lane(i).astype(float), axis=0), axis=1)
+            assert chord.max() <= lanes.steps[i] + 2e-4  # points are float32, up to 1 km from the origin
+            # A chord of an arc of 6 m or more falls short of it by 1 / (24 * 36) at most.
+            assert chord.min() >= lanes.steps[i] * (1 - 1.2e-3) - 2e-4
+
+
+def test_limits_keep_lateral_acceleration_within_comfort(laid):
+    for m in laid:
+        for i in range(len(m.lanes)):
+            turn = np.abs(np.diff(headings(m.lanes.lane(i))[1:-1]))  # inside, where pieces are not cut short
+            curvature = turn.max(initial=0.0) / m.lanes.steps[i]
+            assert curvature * m.lanes.limits[i] ** 2 <= COMFORT * 1.03 + 0.1  # float32 points: 1e-4 rad a step
+            assert 3.0 < m.lanes.limits[i] <= 30.0
+
+
+def test_neighbours_are_each_others(name, laid):
+    for m in laid:
+        lanes = m.lanes
+        for one, other in ((lanes.left, lanes.right), (lanes.right, lanes.left)):
+            has = np.flatnonzero(one >= 0)
+            assert (other[one[has]] == has).all()
+        beside_another = (lanes.left >= 0) | (lanes.right >= 0)
+        assert beside_another.all() if name == "highway" else not beside_another.any()
+        for i in np.flatnonzero(lanes.left >= 0):
+            mine, its = lanes.lane(i).astype(float), lanes.lane(lanes.left[i]).astype(float)
+            assert mine.shape == its.shape
+            angle = headings(mine)
+            to_left = 3.75 * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+            assert its - mine == pytest.approx(to_left, abs=0.02)
+
+
+def least_distance(one, other, sides):
+    """From the points [n, 2] of one lane to the segments of another."""
+    a = wrapped(other[None, :-1] - one[:, None], sides)
+    d = np.diff(other, axis=0)
+    t = np.clip(-(a * d).sum(axis=2) / (d * d).sum(axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(a + t[..., None] * d, axis=2).min())
+
+
+def test_crossings_are_the_lanes_that_come_close(laid):
+    """Against all pairs whose circles meet, in NumPy."""
+    for m in laid[:2]:
+        lanes = m.lanes
+        assert lanes.crossing_offsets[0] == 0
+        assert lanes.crossing_offsets[-1] == len(lanes.crossings)
+        assert (np.diff(lanes.crossing_offsets) > 0).tolist() == lanes.junction.astype(bool).tolist()
+        points = [lanes.lane(i).astype(float) for i in range(len(lanes))]
+        middle = np.array([p[len(p) // 2] for p in points])
+        size = np.array([np.linalg.norm(p - c, axis=1).max() for p, c in zip(points, middle, strict=True)])
+        for i in range(len(lanes)):
+            mine = set(lanes.crossing(i).tolist())
+            assert i not in mine
+            away = np.linalg.norm(wrapped(middle - middle[i], m.sides), axis=1) - size - size[i]
+            assert mine <= set(np.flatnonzero(away < CROSSING_GAP).tolist())
+            for j in np.flatnonzero(away < CROSSING_GAP).tolist():
+                fork = np.abs(wrapped(points[i][0] - points[j][0], m.sides)).max() < 0.1
+                follows = j in lanes.successors[i] or i in lanes.successors[j]
+                parallel = j in (lanes.left[i], lanes.right[i])
+                assert (j in mine) == (i in lanes.crossing(j))
+                if i == j or fork or follows or parallel:
+                    assert j not in mine
+                    continue
+                distance = least_distance(points[i], points[j], m.sides)
+                if abs(distance - CROSSING_GAP) > 0.01:
+                    assert (j in mine) == (distance < CROSSING_GAP)
+
+
+def test_lanes_have_crossings_where_the_roads_have_junctions(name, laid):
+    for m in laid:
+        if name in ("highway", "curved"):
+            assert not m.lanes.junction.any()
+            continue
+        forks = (m.lanes.successors >= 0).sum(axis=1) > 1
+        for i in np.flatnonzero(forks):
+            assert m.lanes.junction[m.lanes.successors[i]][: forks[i].sum()].all()
+
+
+def lane_graph(lanes):
+    one, k = np.nonzero(lanes.successors >= 0)
+    other = lanes.successors[one, k]
+    return csr_array((lanes.lengths[one], (one, other)), shape=(len(lanes), len(lanes)))
+
+
+def test_no_loop_is_so_short_that_driving_it_counts_nothing(laid):
+    for m in laid:
+        graph = lane_graph(m.lanes)
+        reach = dijkstra(graph, limit=1.5 * ROUND)  # from a lane's beginning to another's
+        one, other = graph.nonzero()
+        loops = m.lanes.lengths[one] + reach[other, one]
+        assert loops.min() >= ROUND
+
+
+# --- Roads -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_car_on_rails_touches_nothing(laid):
+    """A car of 4 m x 2 m, its middle on the centre line, heading along it: its outline stays on the exact road."""
+    for m in laid[:8]:
+        exact = oracle.ExactRoad(m.strips, *m.sides)
+        poses = [np.column_stack([p, headings(p)]) for p in map(m.lanes.lane, range(len(m.lanes)))]
+        assert exact.outline_on_road(np.concatenate(poses), 2.0, 1.0).all()
+
+
+def test_the_field_is_the_exact_road(built):
+    for scenario in built:
+        exact = exact_of(scenario)
+        rng = np.random.default_rng(scenario.seed)
+        lanes = scenario.lanes.points[rng.integers(len(scenario.lanes.points), size=6000)]
+        points = (lanes + rng.uniform(-9.0, 9.0, lanes.shape)).astype(F)
+        true = exact.clearance(points)
+        read = np.array([clearance(scenario.road, x, y) for x, y in points])
+        error = read - np.clip(true, FIELD_FLOOR, FIELD_FLOOR + 255 / FIELD_UNITS)
+        near = np.abs(true) < 0.5
+        assert near.sum() > 300
+        assert np.abs(error).max() < 0.4  # where a block's corner or two strips' edges meet in a point
+        assert np.quantile(np.abs(error[near]), 0.9) < 0.5 / FIELD_UNITS + 0.005
+        assert abs(error[near].mean()) < 0.01
+
+
+def test_no_start_is_in_a_wall(built):
+    k = constants(SimConfig())
+    for scenario in built:
+        starts = sample_starts(scenario, 2000, np.random.default_rng(scenario.seed))
+        assert not any(collides(scenario.road, k, x, y, np.cos(h), np.sin(h)) for x, y, h, _, _ in starts)
+
+
+def test_a_map_is_small_and_survives_as_arrays(built):
+    for scenario in built:
+        arrays = scenario.arrays()
+        assert sum(array.nbytes for array in arrays.values()) <= MEMORY
+        again = Scenario.from_arrays({key: value.copy() for key, value in arrays.items()}).arrays()
+        assert {k: (v.dtype, v.tobytes()) for k, v in again.items()} == {
+            k: (v.dtype, v.tobytes()) for k, v in arrays.items()
+        }
+
+
+def test_the_same_seed_is_the_same_map_and_another_is_another(name, built):
+    again = build(name, BUILT[0]).arrays()
+    assert {k: v.tobytes() for k, v in again.items()} == {k: v.tobytes() for k, v in built[0].arrays().items()}
+    assert again["field"].tobytes() != built[1].arrays()["field"].tobytes()
+
+
+def test_the_registry_is_the_designs_table():
+    table = {name: (*spec.speed_interval, spec.traffic) for name, spec in REGISTRY.items()}
+    assert table == {
+        "highway": (15, 25, 8),
+        "curved": (6, 15, 0),
+        "seamless": (5, 12, 0),
+        "roundabout": (5, 10, 4),
+        "city": (3, 10, 6),
+    }
+
+
+# --- Each of them ----------------------------------------------------------------------------------------------------
+
+# Of what seamless maps were when the shipped champion was trained on them: field, start table, strips.
+SEAMLESS = {0: "0d992ad832cf2cb2", 7: "15f5590a4f0407fc", 2_000_000: "c99a166bf22aed11"}
+
+
+@pytest.mark.parametrize("seed", SEAMLESS)
+def test_seamless_maps_are_what_they_were(seed):
+    arrays = build("seamless", seed).arrays()
+    digest = hashlib.sha256()
+    for key in ("field", "start_row", "start", "lines", "arcs", "successors"):
+        digest.update(arrays[key].tobytes())
+    assert digest.hexdigest()[:16] == SEAMLESS[seed]
+
+
+def test_the_highway_goes_round_and_bends_easily():
+    for seed in range(100):
+        m = lay("highway", seed)
+        radii = m.strips.arcs[:, 2]
+        assert highway.RADIUS[0] <= radii.min() <= radii.max() <= highway.RADIUS[1]
+        assert len(set(np.sign(m.strips.arcs[:, 4]))) == 2
+        assert set(m.strips.lines[:, 4]) | set(m.strips.arcs[:, 5]) == {8.0}
+        # Round the torus once, each of the lanes: a little more than its width.
+        of = m.lanes.lengths.astype(float).reshape(-1, highway.LANE_COUNT).sum(axis=0)
+        assert of.min() > highway.WIDTH
+        assert of.max() < 1.06 * highway.WIDTH
+
+
+def test_curved_loops_wind_both_ways_and_keep_apart():
+    sizes = []
+    for seed in range(40):
+        m = lay("curved", seed)
+        n = len(m.lanes) // 2
+        assert m.lanes.lengths[:n].sum() >= 450.0 - 2 * math.pi * 1.75
+        sweeps = m.strips.arcs[:, 4]
+        assert min((sweeps > 0.3).sum(), (sweeps < -0.3).sum()) >= 2
+        assert abs(sweeps.sum()) == pytest.approx(2 * math.pi)  # a simple closed curve
+        assert curved.RADIUS[0] - 1e-9 <= m.strips.arcs[:, 2].min()
+        assert m.strips.arcs[:, 2].max() <= curved.RADIUS[1]
+        points = m.lanes.points[: m.lanes.offsets[n]].astype(float)  # one direction, all the way round
+        at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        apart = np.abs(at[:, None] - at)
+        apart = np.minimum(apart, at[-1] - apart)
+        away = np.linalg.norm(points[:, None] - points[None], axis=2)
+        # The lane is 1.75 m beside the middle of either road.
+        assert away[apart > 30.0].min() > 2 * curved.HALF_ROAD + curved.GAP - 2 * 1.75
+        sizes.append(at[-1])
+    print(f"curved: loops of {min(sizes):.0f} to {max(sizes):.0f} m, median {np.median(sizes):.0f} m")
+
+
+def test_roundabouts_are_many_and_nothing_else_is_a_junction():
+    for seed in range(40):
+        m = lay("roundabout", seed)
+        rings = m.strips.arcs[np.abs(m.strips.arcs[:, 4]) > 6.0]
+        assert len(rings) >= FEWEST_ROUNDABOUTS
+        for i in np.flatnonzero((m.lanes.successors >= 0).sum(axis=1) > 1):
+            for j in m.lanes.successors[i][m.lanes.successors[i] >= 0]:
+                away = wrapped(m.lanes.lane(j).mean(axis=0) - rings[:, :2], m.sides)
+                assert np.linalg.norm(away, axis=1).min() < 16.0
+
+
+def test_parked_cars_stand_beside_the_lanes():
+    counts, bays = [], 0
+    for seed in range(40):
+        m = lay("city", seed)
+        blocks = m.strips.blocks
+        counts.append(len(blocks))
+        bays += (m.strips.lines[:, 4] > 4.0).sum()
+        assert set(blocks[:, 3]) <= {2.0}
+        assert set(blocks[:, 4]) <= {0.9}
+        away = wrapped(m.lanes.points[:, None].astype(float) - blocks[None, :, :2], m.sides)
+        c, s = np.cos(blocks[:, 2]), np.sin(blocks[:, 2])
+        u, v = np.abs(away[..., 0] * c + away[..., 1] * s), np.abs(away[..., 1] * c - away[..., 0] * s)
+        gap = np.hypot(np.maximum(u - 2.0, 0), np.maximum(v - 0.9, 0)).min(axis=0)
+        assert gap.min() >= 1.5
+        assert gap.max() < 3.0
+        for k in range(len(blocks)):  # no two overlap: centres along and across the street
+            others = np.delete(np.arange(len(blocks)), k)
+            d = wrapped(blocks[others, :2] - blocks[k, :2], m.sides)
+            assert np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])).min() > 4.1
+    assert min(counts) >= 10
+    print(f"city: {min(counts)} to {max(counts)} parked cars, {bays / 40:.1f} bays a map")
+
+
+def test_cities_differ_in_their_streets():
+    for seed in range(40):
+        m = lay("city", seed)
+        kinds = np.bincount((m.lanes.successors >= 0).sum(axis=1), minlength=4)
+        assert kinds[2] > 0  # lanes that end at a T
+        widths = {round(w, 6) for w in m.strips.lines[:, 4]}
+        assert len(widths) == 2  # streets, and streets with a bay
+        assert city.HALF_ROAD[0] <= min(widths) <= city.HALF_ROAD[1]
+        assert city.CORNER[0] <= m.strips.arcs[:, 2].min() <= m.strips.arcs[:, 2].max() <= city.CORNER[1]
+
+
+# --- Paths -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_path_and_back_again():
+    path = Path(3.0, 4.0, 0.5, ((10.0, 0.0), (math.pi * 8.0, 1 / 8.0), (5.0, -0.05)))
+    x, y, heading = end_of(Path(0.0, 0.0, 0.0, ((math.pi * 8.0, 1 / 8.0),)))
+    assert (x, y, heading) == pytest.approx((0.0, 16.0, math.pi))
+    back = end_of(backwards(path))
+    assert back == pytest.approx((path.x, path.y, path.heading + 2 * math.pi), abs=1e-9) or back[2] % (
+        2 * math.pi
+    ) == pytest.approx((path.heading + math.pi) % (2 * math.pi))
+
+
+def test_beside_a_path_lengths_are_those_of_the_parallel_arcs():
+    (straight,), (left,) = (p.pieces for p in beside(Path(0, 0, 0, ((10.0, 0.0), (16.0, 1 / 8.0))), 2.0))
+    assert straight == (10.0, 0.0)
+    assert left == pytest.approx((16.0 * 6 / 8, 1 / 6))
+
+
+def test_a_lane_that_leads_nowhere_is_refused():
+    with pytest.raises(ValueError, match="another begins"):
+        lay_lanes([Path(0.0, 0.0, 0.0, ((10.0, 0.0),))], 64.0, 64.0)
+
+
+def test_no_paths_are_no_lanes():
+    lanes = lay_lanes([], 64.0, 64.0)
+    assert len(lanes) == 0
+    assert lanes.points.shape == (0, 2)
+
+
+def test_blocks_cut_the_field_even_across_the_sides():
+    m = lay("city", 3)
+    nodes = clearance_nodes(m.strips, *m.sides)
+    exact = oracle.ExactRoad(m.strips, *m.sides)
+    j, i = np.meshgrid(np.arange(0, 512, 5), np.arange(0, 512, 5))
+    points = np.stack([i.ravel(), j.ravel()], axis=1) / 2
+    true = np.maximum(exact.clearance(points), FIELD_FLOOR)
+    assert nodes[j.ravel(), i.ravel()] == pytest.approx(true, abs=1e-4)
