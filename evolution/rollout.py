@@ -99,7 +99,7 @@ def _run(
             break
         if keep > 0:
             ring[steps % keep] = car
-        if world.shape[0] > 0:
+        if world is not None:
             if keep > 0:
                 world_ring[steps % keep] = world
             flow(network, drivers, world, car, _I(steps))
@@ -132,7 +132,7 @@ def _rollout(
     rewound,
     rewound_worlds,
 ):
-    """All genomes [n, genes] on one episode with traffic [cars, fields]; fills results[:, column].
+    """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results[:, column].
 
     If rewind > 0 also rewound[:, column] and rewound_worlds[:, column].
     """
@@ -144,11 +144,14 @@ def _rollout(
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
     packed = np.empty(packed_size(layers), dtype=np.float32)
     ring = np.zeros((rewind, FIELDS), dtype=np.float32)
-    world = np.empty(traffic.shape, dtype=np.float32)
-    world_ring = np.zeros((rewind, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
+    world = None
+    world_ring = np.zeros((0, 0, 0), dtype=np.float32)
+    if traffic is not None:
+        world_ring = np.zeros((rewind, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
     for i in range(genomes.shape[0]):
         pack(genomes[i], layers, packed)
-        world[:] = traffic
+        if traffic is not None:
+            world = traffic.copy()
         end = _run(
             road,
             network,
@@ -177,7 +180,8 @@ def _rollout(
         if rewind > 0:
             row_back = max(int(car[STEPS]) - rewind, 0) % rewind
             back = ring[row_back]
-            rewound_worlds[i, column] = world_ring[row_back]
+            if traffic is not None:
+                rewound_worlds[i, column] = world_ring[row_back]
             rewound[i, column, 0] = back[X]
             rewound[i, column, 1] = back[Y]
             rewound[i, column, 2] = math.atan2(back[SIN], back[COS])
@@ -240,7 +244,7 @@ def evaluate(
             genomes,
             spec.layers,
             freeze(episode["start"].copy()),
-            freeze(worlds[column].copy()),
+            freeze(worlds[column].copy()) if worlds.shape[1] else None,
             _F(episode["target"] or limits.target),
             int(episode["steps"] or limits.steps),
             rewind,
@@ -283,7 +287,7 @@ def trajectory(
         freeze(genome),
         spec.layers,
         freeze(start),
-        freeze(no_traffic(1)[0] if world is None else world.copy()),
+        None if world is None or not len(world) else freeze(world.copy()),
         _F(limits.target),
         limits.steps,
     )
@@ -303,9 +307,9 @@ def _trajectory(road, network, constants, drivers, fan, genome, layers, start, t
     packed = np.empty(packed_size(layers), dtype=np.float32)
     pack(genome, layers, packed)
     ring = np.zeros((max_steps, FIELDS), dtype=np.float32)
-    world = np.empty(traffic.shape, dtype=np.float32)
-    world[:] = traffic
-    world_ring = np.zeros((max_steps, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
+    world = None if traffic is None else traffic.copy()
+    cars = 0 if traffic is None else traffic.shape[0]
+    world_ring = np.zeros((max_steps, cars, TRAFFIC_FIELDS), dtype=np.float32)
     end = _run(
         road,
         network,

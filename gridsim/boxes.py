@@ -101,15 +101,13 @@ def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
 
 
 @leaf
-def stands_ahead(constants, world, reach, width, height, x, y, cosine, sine):
-    """Whether a standing box is within `reach` m of the front of a car, in its way."""
+def stands_ahead(constants, world, width, height, x, y, cosine, sine):
+    """Whether a standing box is close ahead of the front of a car, in its way."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= _ZERO and world[j, SPEED] < _HALF:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
             forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
-            if (
-                _ZERO < forward < reach + _F(2.0) * constants.half_length
-                and abs(aside) < _F(2.0) * constants.half_width
-            ):
+            limit = constants.courtesy + _F(2.0) * constants.half_length
+            if _ZERO < forward < limit and abs(aside) < _F(2.0) * constants.half_width:
                 return True
     return False

@@ -114,11 +114,14 @@ def place(road, start, car, visits):
 
 @leaf
 def look(road, constants, fan, car, world, beams, ranges):
-    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car."""
+    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
+
+    Here and below a world of None is no traffic, and what traffic needs is not even compiled.
+    """
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
-    if world.shape[0] > 0:
+    if world is not None:
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], world, ranges)
 
 
@@ -140,7 +143,7 @@ def move(road, constants, car, visits, world, acceleration):
     curvature = path_curvature(constants, speed, car[STEERING])
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
     near = False
-    if world.shape[0] > 0:
+    if world is not None:
         nearest, closing = nearest_box(world, road.width, road.height, x, y)
         near = nearest < _F(20.0)
         if near:
@@ -155,7 +158,7 @@ def move(road, constants, car, visits, world, acceleration):
         if collides(road, constants, x, y, cosine, sine):
             crashed = True
             break
-        if near:
+        if world is not None and near:
             back = _ONE - _F(part + 1) / _F(parts)
             if hits_box(constants, world, back, constants.dt, road.width, road.height, x, y, cosine, sine):
                 crashed = True
@@ -191,9 +194,10 @@ def move(road, constants, car, visits, world, acceleration):
         car[PACED] += gained
     if gained < constants.progress:
         # Who stands behind a standing car waits as it has to.
-        if not near or not stands_ahead(
-            constants, world, constants.courtesy, road.width, road.height, car[X], car[Y], cosine, sine
-        ):
+        waits = False
+        if world is not None and near:
+            waits = stands_ahead(constants, world, road.width, road.height, car[X], car[Y], cosine, sine)
+        if not waits:
             car[IDLE] += _ONE
     else:
         car[IDLE] = _ZERO
@@ -221,7 +225,10 @@ def _place_some(road, constants, fan, order, which, starts, cars, visits, worlds
     for k in order:
         i = which[k]
         place(road, starts[k], cars[i], visits[i])
-        look(road, constants, fan, cars[i], worlds[i], beams, ranges[k])
+        if worlds is not None:
+            look(road, constants, fan, cars[i], worlds[i], beams, ranges[k])
+        else:
+            look(road, constants, fan, cars[i], None, beams, ranges[k])
 
 
 @njit(nogil=True)
@@ -258,11 +265,16 @@ def _control_some(
         progress[i] = _ZERO
         if ends[i] == 0:
             before = car[DISTANCE]
-            if worlds.shape[1] > 0:
+            if worlds is not None:
                 flow(network, drivers, worlds[i], car, _I(car[STEPS]))
-            ends[i] = control(road, constants, car, visits[i], worlds[i], actions[i], target, max_steps)
+                ends[i] = control(road, constants, car, visits[i], worlds[i], actions[i], target, max_steps)
+            else:
+                ends[i] = control(road, constants, car, visits[i], None, actions[i], target, max_steps)
             progress[i] = car[DISTANCE] - before
-        look(road, constants, fan, car, worlds[i], beams, ranges[i])
+        if worlds is not None:
+            look(road, constants, fan, car, worlds[i], beams, ranges[i])
+        else:
+            look(road, constants, fan, car, None, beams, ranges[i])
         speeds[i] = car[SPEED]
 
 
@@ -441,7 +453,7 @@ class Simulator:
             starts,
             state.cars,
             state.visits,
-            state.worlds,
+            self._traffic_or_none(),
             ranges,
         )
         state.maps[cars] = maps
@@ -450,6 +462,10 @@ class Simulator:
             self._rows[cars] = rows
             self._order, self._runs = _by_map(self._rows)
         return ranges, starts[:, 3].copy()
+
+    def _traffic_or_none(self) -> np.ndarray | None:
+        """The worlds as kernels take them."""
+        return self.state.worlds if self.state.worlds.shape[1] else None
 
     def _traffic(
         self, starts: np.ndarray, maps: np.ndarray, keys: np.ndarray | int, worlds: np.ndarray | None
@@ -511,7 +527,7 @@ class Simulator:
             self.max_steps,
             state.cars,
             state.visits,
-            state.worlds,
+            self._traffic_or_none(),
             state.ends,
             ranges,
             speeds,

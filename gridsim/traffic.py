@@ -430,18 +430,23 @@ def _follow(network, drivers, car, other, is_ego):
     """Take another car within a car's horizon into account: whether it is the nearest thing to keep behind."""
     along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
     at = _F(1e9)
+    dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
+    forward = dx * car[COS] + dy * car[SIN]
+    looked = forward < _F(-6.0)  # who is behind is not in the way
     if not is_ego:
-        at = _ahead(network, car, _I(other[LANE]), other[ALONG]) - drivers.half_length
-    if at > _F(1e8):
+        lane = _I(other[LANE])
+        at = _ahead(network, car, lane, other[ALONG]) - drivers.half_length
+        # Neither is who keeps to a lane beside others.
+        looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
+    if not looked:
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    if is_ego and other[SPEED] > _ONE:
+    if is_ego and not looked and other[SPEED] > _ONE:
         # Where the ego car will be in a second: it may be about to cut in.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
         at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])
-        dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
-        if at < car[GAP] and dx * car[COS] + dy * car[SIN] > _ZERO:
+        if at < car[GAP] and forward > _ZERO:
             car[GAP], car[LEAD] = at, along
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from evolution.breeding import FRESH, RECIPE, Mutation, breed
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits, evaluate, no_traffic
+from evolution.rollout import EPISODE, Limits, evaluate
 from gridsim import jit
 from gridsim.config import SimConfig, constants
 from gridsim.roads import Strips, clearance_nodes, make_road
@@ -131,7 +131,6 @@ def test_where_nothing_can_be_written_the_cache_is_temporary(tmp_path, monkeypat
 SPEC = PolicySpec.parse("mlp:5,3")
 STEPS = 25
 CONFIG = SimConfig()
-NOBODY = no_traffic(1)[0]
 
 
 def drive_a_while(scenario, start, actions):
@@ -143,8 +142,8 @@ def drive_a_while(scenario, start, actions):
     place(scenario.road, start, car, visits)
     states, seen, ends = [], [], []
     for action in actions:
-        look(scenario.road, k, rays, car, NOBODY, beams, ranges)
-        ends.append(drive(scenario.road, k, car, visits, NOBODY, int(action)))
+        look(scenario.road, k, rays, car, None, beams, ranges)
+        ends.append(drive(scenario.road, k, car, visits, None, int(action)))
         states.append(car.copy())
         seen.append(ranges.copy())
     return {"states": np.array(states), "ranges": np.array(seen), "ends": np.array(ends)}

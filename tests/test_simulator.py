@@ -8,7 +8,7 @@ import oracle
 import pytest
 
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits, evaluate, no_traffic
+from evolution.rollout import EPISODE, Limits, evaluate
 from gridsim.config import EpisodeConfig, SimConfig, constants
 from gridsim.roads import Strips, clearance_nodes, make_road
 from gridsim.scenarios import build, sample_starts
@@ -41,7 +41,6 @@ K = constants(CONFIG)
 RAYS = fan(31, K.ray_first, K.ray_step)
 SIDE = 256.0
 INTERVAL = (5.0, 12.0)  # m/s
-NOBODY = no_traffic(1)[0]
 
 
 @dataclass
@@ -64,9 +63,9 @@ def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
     states: list[np.ndarray] = []
     end = 0
     while end == 0:
-        look(road, k, RAYS, car, NOBODY, beams, ranges)
+        look(road, k, RAYS, car, None, beams, ranges)
         actions.append(int(choose(len(actions), ranges, car)))
-        end = drive(road, k, car, visits, NOBODY, actions[-1])
+        end = drive(road, k, car, visits, None, actions[-1])
         states.append(car.copy())
         if end == 0 and car[DISTANCE] >= target:
             end = End.SUCCESS
