@@ -22,7 +22,7 @@ from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan, sense
 from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic import Drivers, drivers, flow, spawn
-from gridsim.vehicle import Action, act, advance, path_curvature
+from gridsim.vehicle import Action, act, act_continuous, advance, path_curvature
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
@@ -209,9 +209,9 @@ def move(road, constants, car, visits, world, acceleration):
 
 
 @leaf
-def control(road, constants, car, visits, world, action, target, max_steps):
-    """`drive`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
-    end = drive(road, constants, car, visits, world, action)
+def control(road, constants, car, visits, world, acceleration, target, max_steps):
+    """`move`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
+    end = move(road, constants, car, visits, world, acceleration)
     if end == 0:
         if car[DISTANCE] >= target:
             return 3
@@ -265,11 +265,17 @@ def _control_some(
         progress[i] = _ZERO
         if ends[i] == 0:
             before = car[DISTANCE]
+            if actions.ndim == 1:
+                acceleration, steering = act(constants, actions[i], car[SPEED], car[STEERING])
+            else:
+                acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
             if worlds is not None:
                 flow(network, drivers, worlds[i], car, _I(car[STEPS]))
-                ends[i] = control(road, constants, car, visits[i], worlds[i], actions[i], target, max_steps)
+                car[STEERING] = steering
+                ends[i] = control(road, constants, car, visits[i], worlds[i], acceleration, target, max_steps)
             else:
-                ends[i] = control(road, constants, car, visits[i], None, actions[i], target, max_steps)
+                car[STEERING] = steering
+                ends[i] = control(road, constants, car, visits[i], None, acceleration, target, max_steps)
             progress[i] = car[DISTANCE] - before
         if worlds is not None:
             look(road, constants, fan, car, worlds[i], beams, ranges[i])
@@ -503,7 +509,7 @@ class Simulator:
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
 
-        Args: actions integers [n], 0 to 7 (`vehicle.Action`).
+        Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2] in [-1, 1] (`act_continuous`).
         Returns: (ranges float32 [n, rays] in m, speeds float32 [n] in m/s, progress float32 [n], m of new ground in
         this step, ends uint8 [n], End); arrays of the caller's own.
         Raises: ValueError with one line for anything but an action for each car; RuntimeError before the first reset.
@@ -542,11 +548,16 @@ def _visit_cells(road: Road) -> int:
 
 
 def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
-    """Actions int64 [n], C-contiguous.
+    """Actions int64 [n], or continuous ones float32 [n, 2]; C-contiguous.
 
-    Raises: ValueError with one line unless they are n whole numbers that name actions.
+    Raises: ValueError with one line unless they are n whole numbers that name actions, or n pairs within [-1, 1].
     """
     array = np.asarray(actions)
+    if array.shape == (n, 2) and array.dtype.kind in "fiu":
+        pairs = np.ascontiguousarray(array, dtype=np.float32)
+        if not (np.abs(pairs) <= 1.0).all():  # false for what is not a number, too
+            raise ValueError(f"continuous actions must be within -1 and 1, not {pairs[~(np.abs(pairs) <= 1.0)][0]}")
+        return pairs
     if array.shape != (n,):
         raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")
     if array.dtype.kind not in "iu":

@@ -58,6 +58,21 @@ def act(constants, action, speed, steering):
 
 
 @leaf
+def act_continuous(constants, pedal, wheel, steering):
+    """What a continuous action asks of the car in one control period, `pedal` and `wheel` each in [-1, 1].
+
+    pedal is a share of the greatest acceleration above 0 and of the greatest braking below; wheel is a share of the
+    greatest steering angle, left positive, towards which the wheels turn at their rate.
+    Returns: (acceleration m/s2, steering angle rad after the period). Braking goes on backwards, up to the limit there.
+    """
+    step = constants.steering_step
+    target = min(max(wheel, -_ONE), _ONE) * constants.steering_limit
+    steering = min(max(target, steering - step), steering + step)
+    pedal = min(max(pedal, -_ONE), _ONE)
+    return pedal * (constants.acceleration if pedal > _ZERO else constants.braking), steering
+
+
+@leaf
 def path_curvature(constants, speed, steering):
     """Curvature (1/m, left positive) of the centre of mass's path: the bicycle's, bounded by lateral grip."""
     tangent = constants.rear_share * math.tan(steering)  # of the slip angle
