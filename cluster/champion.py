@@ -23,7 +23,7 @@ from evolution.policy import PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, VehicleConfig
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY
+from gridsim.scenarios import HELD_OUT_SEED, check_name
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,7 @@ def evaluate(
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
     name = scenario or champion.scenario
-    if name not in REGISTRY:
-        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    check_name(name)
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
     maps = Maps(name, champion.sim)

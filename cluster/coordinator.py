@@ -28,7 +28,7 @@ from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, targets
 from gridsim.config import SimConfig
-from gridsim.scenarios import HELD_OUT_SEED, Scenario, build
+from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, map_of
 from gridsim.simulator import End
 
 COLUMNS = (
@@ -163,7 +163,7 @@ class Evolution:
             key=key,
             mutation=self._mutation(),
             episodes=episodes,
-            maps=tuple((self.settings.scenario, seed) for seed in maps),
+            maps=tuple((self.settings.scenario, map_of(self.settings.scenario, seed)) for seed in maps),
             limits=limits,
             config=self.sim,
             rewind=rewind,

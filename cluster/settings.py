@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
 from evolution.policy import PolicySpec
-from gridsim.scenarios import REGISTRY
+from gridsim.scenarios import build, check_name, is_map_file
 
 MAX_POPULATION = 1_000_000
 
@@ -24,7 +25,7 @@ class EvolveSettings:
     """What an evolution run depends on: two runs with equal settings have the same champion."""
 
     scenario: str = "seamless"
-    """Road to learn to drive on."""
+    """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
     traffic: int = 0
     """Other cars on the road."""
     seed: int = 0
@@ -58,14 +59,22 @@ class EvolveSettings:
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
+    def __post_init__(self) -> None:
+        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
+            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
+
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""
         return CurriculumConfig()
 
     def check(self) -> None:
         """Raises SettingsError, one line that says what to change."""
-        if self.scenario not in REGISTRY:
-            raise SettingsError(f"unknown scenario {self.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+        try:
+            check_name(self.scenario)
+            if is_map_file(self.scenario):
+                build(self.scenario, 0)  # kept, so that it is read once
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
         if self.traffic:
             raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no traffic yet; use --traffic 0")
         if not 0 <= self.seed < 1 << 63:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -32,6 +34,7 @@ class Scenario:
         lanes: directed polylines, for starts, traffic and drivers.
         strips: exact geometry of the drivable area, for pictures and tests.
         torus: whether leaving on one side means entering on the other.
+        starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Scenario:
     lanes: Lanes
     strips: Strips
     torus: bool = True
+    starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
 
     @cached_property
     def mileage(self) -> np.ndarray:
@@ -63,6 +67,7 @@ class Scenario:
             "successors": self.lanes.successors,
             "lines": self.strips.lines,
             "arcs": self.strips.arcs,
+            "starts": self.starts,
         }
 
     @classmethod
@@ -88,6 +93,7 @@ class Scenario:
             lanes=Lanes(frozen["points"], frozen["offsets"], frozen["successors"]),
             strips=Strips(frozen["lines"], frozen["arcs"]),
             torus=bool(torus),
+            starts=frozen["starts"],
         )
 
 
@@ -105,15 +111,40 @@ REGISTRY: dict[str, ScenarioSpec] = {
 }
 
 
+def is_map_file(name: str) -> bool:
+    """Whether a scenario is named by a map's file, `gridsim.maps`, and not by the registry."""
+    return "." in name or os.sep in name
+
+
+def check_name(name: str) -> None:
+    """Raises: ValueError with one line for what is neither in the registry nor a map's file."""
+    if name not in REGISTRY and not is_map_file(name):
+        names = ", ".join(sorted(REGISTRY))
+        raise ValueError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
+
+
+def label(name: str) -> str:
+    """A scenario in one word: a map's file is called by its stem."""
+    return Path(name).stem if is_map_file(name) else name
+
+
+def map_of(name: str, seed: int) -> int:
+    """The seed that stands for the map of a seed: a file has one map."""
+    return 0 if is_map_file(name) else seed
+
+
 def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    Raises: ValueError with one line for an unknown scenario or a seed below 0.
+    Raises: ValueError with one line for an unknown scenario, a seed below 0, or a map's file that is none.
     """
-    if name not in REGISTRY:
-        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    check_name(name)
     if seed < 0:
         raise ValueError(f"a seed must be 0 or more, not {seed}")
+    if is_map_file(name):
+        from gridsim.maps import load_map  # here: workers never read files
+
+        return load_map(name, config)
     config = config or SimConfig()
     spec = REGISTRY[name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
@@ -143,8 +174,11 @@ def _starts_at(points, mileage, shares, speed, starts):
 def starts_at(scenario: Scenario, shares: np.ndarray) -> np.ndarray:
     """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
 
-    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it.
+    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it. Of a map
+    without lanes, the starts at these shares of `Scenario.starts`.
     """
+    if not len(scenario.lanes):
+        return scenario.starts[(np.asarray(shares) * len(scenario.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
     _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, np.float32(START_SPEED), starts)
     return starts
