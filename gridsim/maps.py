@@ -326,8 +326,8 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
             side = 1 << max(round(math.log2(nodes)), 0)
             if abs(nodes / side - 1.0) > 1e-3 or side < SHORTEST_SIDE * CELLS_PER_M:
                 raise ValueError(
-                    f"a torus' sides must be {SHORTEST_SIDE}, 32, 64 ... m; {pixels} pixels are {nodes / CELLS_PER_M:g} m: "
-                    f"scale the picture or set its resolution"
+                    f"a torus' sides must be {SHORTEST_SIDE}, 32, 64 ... m, not {pixels} pixels of "
+                    f"{file.resolution:g} m; scale the picture, or set its resolution"
                 )
         else:
             used = np.flatnonzero(free.any(axis=axis))
@@ -335,9 +335,10 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
             side = power_of_two(max(last, last - first + OUTSIDE, SHORTEST_SIDE) * CELLS_PER_M)
         sides.append(side)
     columns, rows = sides
+    width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
     if columns * rows > MEMORY_LIMIT_CELLS:
         raise ValueError(
-            f"a world of {columns / CELLS_PER_M:,.0f} m x {rows / CELLS_PER_M:,.0f} m (its sides are powers of two) is too large: "
+            f"a world of {width:,.0f} m x {height:,.0f} m (its sides are powers of two) is too large: "
             f"at most {MEMORY_LIMIT_CELLS / CELLS_PER_M**2:,.0f} square metres; check the resolution, or crop it"
         )
     return columns, rows

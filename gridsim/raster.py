@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
@@ -207,8 +207,8 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     )
 
 
-def complete_starts(nodes: np.ndarray, poses: Sequence[Sequence[float]], vehicle: VehicleConfig) -> np.ndarray:
-    """Poses float64 [n, 3] (x, y, heading) whose headings, where they are NaN, are set along the road.
+def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """Poses [n, 3] (x, y, heading) float64, their headings set along the road where they are NaN.
 
     Raises: ValueError with one line where a car would be off the road.
     """
@@ -224,5 +224,7 @@ def complete_starts(nodes: np.ndarray, poses: Sequence[Sequence[float]], vehicle
             ways = np.array([pose, pose + _BACK])
             pose[:] = ways[np.argmax(_straight(nodes, ways, vehicle, 50.0))]
         if not inside or not _fits(nodes, pose[None], vehicle, _TOUCH)[0]:
-            raise ValueError(f"at {pose[0]:g} m, {pose[1]:g} m from the lower left corner a car is not all on the road")
+            raise ValueError(
+                f"starts: at {pose[0]:g} m, {pose[1]:g} m from the lower left corner a car is not all on the road"
+            )
     return complete
