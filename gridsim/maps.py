@@ -131,9 +131,10 @@ def read_map_file(path: Path) -> MapFile:
 def _shown(value: object) -> str:
     """A value in a few characters of one line, however large or nested it is."""
     try:
-        return " ".join(reprlib.repr(value).split())
+        text = " ".join(reprlib.repr(value).split())
     except ValueError:  # a number of more digits than Python prints
         return "what it is"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _stamp(path: Path) -> tuple[str, int, int]:
@@ -332,7 +333,7 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
         else:
             used = np.flatnonzero(free.any(axis=axis))
             first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
-            side = power_of_two(max(last, last - first + OUTSIDE, SHORTEST_SIDE) * CELLS_PER_M)
+            side = power_of_two(max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE) * CELLS_PER_M)
         sides.append(side)
     columns, rows = sides
     width, height = columns / CELLS_PER_M, rows / CELLS_PER_M

@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from gridsim.config import VehicleConfig
 from gridsim.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
 
-OUTSIDE = 4.0  # m of wall at least, between one side of a picture and the other
+OUTSIDE = -FIELD_FLOOR  # m of wall around what is road, at least: it must not show through the sides of the field
 _FINE = 0.25  # m, largest pixels that distances are measured on; larger ones are cut up
-_WALL = 0.3  # m, half of what walls are thickened to: the thinnest that no line of the field's nodes can miss
+_WALL = 0.4  # m, half of what walls are thickened to: above 0.36 m, no speck lies unseen between four nodes
 _TIP = 0.25  # m that a corner may stick out of where a disc of that radius fits, and is no thin wall
 _DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m of clearance, beyond which all is the same
 _HALO = _DEEPEST + 2.0  # m around a tile that may matter to it
@@ -73,15 +73,16 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
     halo = math.ceil(_HALO / resolution) + 1
     cut = max(math.ceil(resolution / _FINE - 1e-9), 1)
     padded = np.pad(free, halo, mode="wrap") if torus else np.pad(free, halo)
-    # The outside of a picture that is no torus is partly kept behind the far end: the last nodes are those before 0.
-    first = 0 if torus else -round(OUTSIDE / 2 * CELLS_PER_M)
+    # Road that begins at the picture's edge has its wall behind the far end: the last nodes are those before 0.
+    used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
+    first = [0 if torus else min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
     per_node = [n / side if torus else _NODE / resolution for n, side in zip(free.shape, (rows, columns), strict=True)]
     nodes = np.full((rows, columns), FIELD_FLOOR, dtype=np.float32)
     for j in range(0, rows, _TILE):
         for i in range(0, columns, _TILE):
             index, window, at = [], [], []
             for k, (start, side) in enumerate(((j, rows), (i, columns))):
-                node = first + np.arange(start, min(start + _TILE, side))
+                node = first[k] + np.arange(start, min(start + _TILE, side))
                 pixel = node * per_node[k]  # from the picture's lower left corner
                 low = min(max(math.floor(pixel[0]), 0), padded.shape[k])
                 high = min(max(math.ceil(pixel[-1]) + 2 * halo, 0), padded.shape[k])
@@ -155,6 +156,15 @@ def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig
     return angles[np.argmax(ways, axis=1)]
 
 
+def _longest(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
+    """The heading (rad) with the longest way straight on from a pose's point; in the middle of those that are like it."""
+    headings = np.arange(72) * math.pi / 36
+    ways = _straight(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
+    best = int(np.argmax(ways))
+    sector = best + np.arange(-6, 7)
+    return float((sector * math.pi / 36)[ways[sector % 72] >= 0.9 * ways[best]].mean())
+
+
 def _large(wide: np.ndarray) -> np.ndarray:
     """Which nodes belong to a connected part that extends some tens of metres; over the sides of the field as well."""
     labels, count = ndimage.label(wide)
@@ -219,8 +229,7 @@ def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig
         inside = bool((pose[:2] >= 0.0).all() and (pose[:2] < size).all())
         if inside and math.isnan(pose[2]):
             column, row = (pose[:2] * CELLS_PER_M).round().astype(int) % nodes.shape[::-1]
-            straight = coherence[row, column] >= _COHERENCE
-            pose[2] = angle[row, column] if straight else _open_headings(nodes, pose[None, :2], vehicle)[0]
+            pose[2] = angle[row, column] if coherence[row, column] >= _COHERENCE else _longest(nodes, pose, vehicle)
             ways = np.array([pose, pose + _BACK])
             pose[:] = ways[np.argmax(_straight(nodes, ways, vehicle, 50.0))]
         if not inside or not _fits(nodes, pose[None], vehicle, _TOUCH)[0]:
