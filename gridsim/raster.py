@@ -157,7 +157,7 @@ def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig
 
 
 def _longest(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
-    """The heading (rad) with the longest way straight on from a pose's point; in the middle of those that are like it."""
+    """The heading (rad) with the longest way straight on from a pose's point, amid those that are like it."""
     headings = np.arange(72) * math.pi / 36
     ways = _straight(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
     best = int(np.argmax(ways))
