@@ -24,7 +24,7 @@ from evolution.policy import PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY
+from gridsim.scenarios import HELD_OUT_SEED, check_name, default_traffic
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,7 @@ def evaluate(
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
     name = scenario or champion.scenario
-    if name not in REGISTRY:
-        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    check_name(name)
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
     if traffic is not None and not 0 <= traffic <= MAX_TRAFFIC:
@@ -124,7 +123,7 @@ def evaluate(
     maps = Maps(name, champion.sim)
     try:
         if traffic is None:
-            traffic = champion.traffic if name == champion.scenario else REGISTRY[name].traffic
+            traffic = champion.traffic if name == champion.scenario else default_traffic(name)
         held_out = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)
         episode = champion.sim.episode
         limits = Limits(episode.target, round(episode.time_limit / episode.control_period))

@@ -19,6 +19,7 @@ import tyro
 from rich.console import Console
 
 from cluster.settings import EvolveSettings, SettingsError
+from gridsim.scenarios import is_map_file
 
 if TYPE_CHECKING:
     from cluster.coordinator import Maps
@@ -212,6 +213,9 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
         flags = parse(EvolveFlags, prog, arguments, base)
+    if flags.traffic and is_map_file(flags.scenario):
+        print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
+        flags = dataclasses.replace(flags, traffic=0)
     if not 0 <= flags.workers <= MAX_WORKERS:
         raise UsageError(f"--workers must be 0 to {MAX_WORKERS:,}, not {flags.workers}")
     if flags.workers == 0 and flags.address:

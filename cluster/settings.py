@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
 from evolution.policy import PolicySpec
-from gridsim.scenarios import REGISTRY
+from gridsim.scenarios import build, check_name, default_traffic, is_map_file
 
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
@@ -25,9 +26,9 @@ class EvolveSettings:
     """What an evolution run depends on: two runs with equal settings have the same champion."""
 
     scenario: str = "seamless"
-    """Road to learn to drive on."""
+    """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
     traffic: int = -1
-    """Other cars on the road; -1: as many as the scenario has by default."""
+    """Other cars on the road; -1: as many as the scenario has by default. A map from a file has no lanes for them."""
     seed: int = 0
     """Seed of every random number of the run."""
     policy: str = "mlp:6,7"
@@ -60,8 +61,10 @@ class EvolveSettings:
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
     def __post_init__(self) -> None:
-        if self.traffic == -1 and self.scenario in REGISTRY:
-            object.__setattr__(self, "traffic", REGISTRY[self.scenario].traffic)
+        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
+            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
+        if self.traffic == -1 or (self.traffic > 0 and is_map_file(self.scenario)):
+            object.__setattr__(self, "traffic", default_traffic(self.scenario))
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""
@@ -69,8 +72,12 @@ class EvolveSettings:
 
     def check(self) -> None:
         """Raises SettingsError, one line that says what to change."""
-        if self.scenario not in REGISTRY:
-            raise SettingsError(f"unknown scenario {self.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+        try:
+            check_name(self.scenario)
+            if is_map_file(self.scenario):
+                build(self.scenario, 0)  # kept, so that it is read once
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
         if not 0 <= self.traffic <= MAX_TRAFFIC:
             raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
         if not 0 <= self.seed < 1 << 63:

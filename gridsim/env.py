@@ -28,7 +28,7 @@ from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
 from gridsim.jit import njit
 from gridsim.roads import clearance
-from gridsim.scenarios import REGISTRY, TRAINING_SEED, Scenario, build, starts_at
+from gridsim.scenarios import REGISTRY, TRAINING_SEED, Scenario, build, check_name, is_map_file, map_of, starts_at
 from gridsim.simulator import DISTANCE, End, Simulator
 from gridsim.vehicle import Action
 
@@ -98,20 +98,21 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Args:
             num_envs: cars.
-            scenario: name in the registry of scenarios.
+            scenario: name in the registry of scenarios, or a map's file (`gridsim.maps`), which is one map.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first of them; the others' follow.
             max_episode_steps: time limit in control steps; None is the configuration's.
             config: vehicle, sensors and episode.
         Raises: ValueError with one line where an argument makes no sense.
         """
-        if scenario not in REGISTRY:
-            raise ValueError(f"unknown scenario {scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+        check_name(scenario)
         if map_seed < 0:
             raise ValueError(f"map_seed must be 0 or more, not {map_seed}")
         self.num_envs = num_envs
         self.config = config or SimConfig()
         self.scenario = scenario
+        if isinstance(maps, int) and is_map_file(scenario):
+            maps = [build(scenario, map_seed, self.config)] * min(maps, 1)
         given = [] if isinstance(maps, int) else list(maps)
         self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in given]
         if not self._seeds:
@@ -198,6 +199,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _map(self, seed: int) -> int:
         """Index among the simulator's scenarios of the map of a seed, built where it is not there yet."""
+        seed = map_of(self.scenario, seed)
         if seed not in self._index:
             self.simulator.scenarios.append(build(self.scenario, seed, self.config))
             self._index[seed] = len(self.simulator.scenarios) - 1

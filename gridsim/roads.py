@@ -91,6 +91,25 @@ class Lanes:
     junction: np.ndarray
     limits: np.ndarray
 
+    @classmethod
+    def none(cls) -> Lanes:
+        """No lanes: a map from a file has none."""
+        empty = freeze(np.zeros(0, dtype=np.int32))
+        none = freeze(np.zeros(0, dtype=np.float32))
+        return cls(
+            points=freeze(np.zeros((0, 2), dtype=np.float32)),
+            offsets=freeze(np.zeros(1, dtype=np.int32)),
+            successors=freeze(np.zeros((0, 1), dtype=np.int32)),
+            steps=none,
+            lengths=none,
+            left=empty,
+            right=empty,
+            crossing_offsets=freeze(np.zeros(1, dtype=np.int32)),
+            crossings=empty,
+            junction=freeze(np.zeros(0, dtype=np.uint8)),
+            limits=none,
+        )
+
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
