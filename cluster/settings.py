@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
-from evolution.policy import PolicySpec
+from evolution.policy import Observation, PolicySpec
 from gridsim.scenarios import REGISTRY
 
 MAX_POPULATION = 1_000_000
+DEFAULT_POLICY: dict[Observation, str] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
 
 
 class SettingsError(ValueError):
@@ -29,8 +30,11 @@ class EvolveSettings:
     """Other cars on the road."""
     seed: int = 0
     """Seed of every random number of the run."""
-    policy: str = "mlp:6,7"
-    """Network: mlp: and the sizes of its hidden layers."""
+    observation: Observation = "rays"
+    """What the network sees: 31 ranges, or the occupancy grid; and the speed."""
+    policy: str = ""
+    """Network: mlp: and the sizes of its hidden layers, by default mlp:6,7; on the grid cnn: with the channels of two
+    convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 120
@@ -58,6 +62,10 @@ class EvolveSettings:
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
+    def __post_init__(self) -> None:
+        if not self.policy:
+            object.__setattr__(self, "policy", DEFAULT_POLICY.get(self.observation, ""))
+
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""
         return CurriculumConfig()
@@ -84,10 +92,15 @@ class EvolveSettings:
         if not self.until > 0.0:
             raise SettingsError(f"--until must be above 0, not {self.until}")
         try:
-            PolicySpec.parse(self.policy)
+            spec = PolicySpec.parse(self.policy)
             GeneticConfig(self.population, self.elites, self.tournament, self.parents, self.crossover).check()
         except ValueError as error:
             raise SettingsError(str(error)) from error
+        if spec.observation != self.observation:
+            raise SettingsError(
+                f"policy {self.policy} sees the {spec.observation}; "
+                f"give --observation {spec.observation}, or a policy such as {DEFAULT_POLICY[self.observation]}"
+            )
 
 
 def to_dict(settings: EvolveSettings) -> dict[str, Any]:
@@ -111,5 +124,7 @@ def from_dict(values: dict[str, Any]) -> EvolveSettings:
     settings = EvolveSettings(**values)
     if settings.ranking not in ("scalar", "pareto") or settings.search not in ("evolution", "random"):
         raise SettingsError("ranking is scalar or pareto, search is evolution or random")
+    if settings.observation not in DEFAULT_POLICY:
+        raise SettingsError("observation is rays or grid")
     settings.check()
     return settings

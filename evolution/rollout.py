@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
+from evolution.policy import BLOCK, CnnSpec, PolicySpec, decide, encode, pack, packed_size
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.roads import VISIT_CELL, freeze
@@ -142,6 +142,10 @@ def evaluate(
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
     if not 0 < limits.steps <= MAX_STEPS:
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
+    if isinstance(spec, CnnSpec):
+        from evolution import grid_rollout  # here, because it is made of this file's parts
+
+        return grid_rollout.evaluate(spec, genomes, scenarios, episodes, limits, config, rewind)
     if spec.inputs != config.sensors.rays + 1:
         raise ValueError(f"{spec} sees {spec.inputs - 1} rays, the sensor has {config.sensors.rays}")
     k = constants(config)
@@ -174,6 +178,10 @@ def trajectory(
 
     Returns: (RESULT [], states float32 [steps, FIELDS] before each step; fields as in `gridsim.simulator`).
     """
+    if isinstance(spec, CnnSpec):
+        from evolution import grid_rollout  # here, because it is made of this file's parts
+
+        return grid_rollout.trajectory(spec, genome, scenario, start, limits, config)
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
     result, states = _trajectory(

@@ -8,7 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution.policy import ACTIONS, BLOCK, INPUTS, PolicySpec, decide, encode, forward, pack, packed_size, squash
+from evolution.policy import (
+    ACTIONS,
+    BLOCK,
+    INPUTS,
+    MlpSpec,
+    PolicySpec,
+    decide,
+    encode,
+    forward,
+    pack,
+    packed_size,
+    squash,
+)
 
 F = np.float32
 TEXTS = ["mlp:6,7", "mlp:3", "mlp:16,16", "mlp:9,1,20", "mlp:8", "mlp:17,5,3,11", "mlp:1"]
@@ -128,7 +140,7 @@ def test_what_the_network_sees():
 
 def test_sizes():
     spec = PolicySpec.parse("mlp:6,7")
-    assert spec == PolicySpec()
+    assert spec == MlpSpec()
     assert spec.size == 311
     assert spec.layers.tolist() == [32, 6, 7, 8]
     assert spec.layers.dtype == np.int32
