@@ -85,6 +85,14 @@ class PolicySpec(ABC):
         """(inputs of a unit, units) of each layer, the output's included."""
 
     @property
+    def views(self) -> np.ndarray:
+        """How the inputs of each layer's units lie in the plane: int32 [layers, 6].
+
+        Planes, rows, columns, channels; inputs beside these; units. Empty where inputs have no such order.
+        """
+        return freeze(np.zeros((0, 6), dtype=np.int32))
+
+    @property
     def size(self) -> int:
         """Genes of a genome."""
         return sum((n + 1) * m for n, m in self.shapes())
@@ -155,6 +163,21 @@ class CnnSpec(PolicySpec):
     def layers(self) -> np.ndarray:
         """Frames, channels, channels, units, outputs: int32 [5]."""
         return freeze(np.array([self.frames, *self.hidden, self.outputs], dtype=np.int32))
+
+    @property
+    def views(self) -> np.ndarray:
+        first, second, dense = self.hidden
+        return freeze(
+            np.array(
+                [
+                    [self.frames, KERNEL_1, KERNEL_1, 1, 0, first],
+                    [1, KERNEL_2, KERNEL_2, first, 0, second],
+                    [1, SIDE_2, SIDE_2, second, 1, dense],
+                    [1, 1, 1, dense, 0, self.outputs],
+                ],
+                dtype=np.int32,
+            )
+        )
 
     def shapes(self) -> tuple[tuple[int, int], ...]:
         first, second, dense = self.hidden
