@@ -92,10 +92,9 @@ def _fresh_views(genome, views, scales, stream, scale):
     for k in range(views.shape[0]):
         planes, rows, columns, channels = views[k, 0], views[k, 1], views[k, 2], views[k, 3]
         units = views[k, 5]
-        spread = scale * scales[at] * _F(math.sqrt(_F(1.0) - NOISE * NOISE))
-        spread /= math.sqrt((_F(4.0) - _F(1.0) / _F(rows * rows)) * (_F(4.0) - _F(1.0) / _F(columns * columns))) / _F(
-            3.0
-        )
+        # The mean of (1 + u^2) (1 + v^2), so that the whole has the variance that it should.
+        mean = (_F(4.0) - _F(1.0) / _F(rows * rows)) * (_F(4.0) - _F(1.0) / _F(columns * columns)) / _F(9.0)
+        spread = scale * scales[at] * _F(math.sqrt((_F(1.0) - NOISE * NOISE) / mean))
         if rows > 1:
             for plane in range(planes):
                 for channel in range(channels):

@@ -1,5 +1,7 @@
 """Children from recipes: what is inherited, what is changed, and that a recipe is its child."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -172,7 +174,7 @@ def test_new_convolutional_genomes_are_as_large_as_genes_are():
     children = breed(np.zeros((0, CNN.size), dtype=F), many(FRESH, FRESH, 300), 1, CNN, Mutation()).astype(float)
     assert len({child.tobytes() for child in children}) == 300
     scaled = children / gene_scales(CNN)
-    for first, last in zip(EDGES[:-1], EDGES[1:], strict=True):
+    for first, last in itertools.pairwise(EDGES):
         assert scaled[:, first:last].mean() == pytest.approx(0.0, abs=0.05)
         assert scaled[:, first:last].std() == pytest.approx(1.0, abs=0.05)
     # Biases and the speed's weights have no neighbours, and are normal.

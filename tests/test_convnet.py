@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from evolution import convnet
 from evolution.breeding import FRESH, RECIPE, Mutation, breed
 from evolution.episodes import lane_starts
-from evolution.policy import PolicySpec
+from evolution.policy import CnnSpec, PolicySpec
 from evolution.rollout import Limits, evaluate, trajectory
 from evolution.tiles import plain_tile, vector_tile
 from gridsim.config import SensorConfig, SimConfig
@@ -41,6 +41,12 @@ def decide(genome, layers, speed, room):
 @numba.njit
 def push(grid, begun, room):
     convnet.push(grid, begun, room)
+
+
+def cnn(text):
+    spec = PolicySpec.parse(text)
+    assert isinstance(spec, CnnSpec)
+    return spec
 
 
 def new_genomes(spec, n, seed=1):
@@ -84,7 +90,7 @@ def in_torch(spec, genome, frames, speed):
 
 @pytest.mark.parametrize("text", TEXTS)
 def test_forward_is_pytorchs(text):
-    spec = PolicySpec.parse(text)
+    spec = cnn(text)
     rng = np.random.default_rng(2)
     room = convnet.scratch(spec)
     for genome in new_genomes(spec, 4):
@@ -118,7 +124,7 @@ def test_vector_code_is_the_plain_tile(positions, lanes, rectify):
 
 
 def test_a_gene_that_is_not_a_number_is_no_action():
-    spec = PolicySpec.parse("cnn:8,8,16@1")
+    spec = cnn("cnn:8,8,16@1")
     rng = np.random.default_rng(4)
     genome, room = new_genomes(spec, 1)[0], convnet.scratch(spec)
     room.frames[:] = rng.uniform(0.1, 1, room.frames.size)
@@ -136,7 +142,7 @@ def test_a_gene_that_is_not_a_number_is_no_action():
 
 
 def test_the_first_of_equal_outputs_acts():
-    spec = PolicySpec.parse("cnn:8,8,8@1")
+    spec = cnn("cnn:8,8,8@1")
     genome, room = np.zeros(spec.size, dtype=F), convnet.scratch(spec)
     assert decide(genome, spec.layers, F(0), room) == 0
     genome[-3:] = 1.0
@@ -146,7 +152,7 @@ def test_the_first_of_equal_outputs_acts():
 @given(begins=st.lists(st.booleans(), min_size=1, max_size=8))
 @settings(max_examples=20, derandomize=True, deadline=None)
 def test_frames_are_the_last_ones_newest_last(begins):
-    spec = PolicySpec.parse("cnn:8,8,8@3")
+    spec = cnn("cnn:8,8,8@3")
     room = convnet.scratch(spec)
     rng = np.random.default_rng(5)
     stack = np.zeros((1, 3, 80, 80), dtype=np.uint8)
@@ -185,7 +191,7 @@ def by_hand(spec, genome, scenario, start, limits, config):
 @pytest.mark.parametrize("text", ["cnn:8,8,16@1", "cnn:8,8,8@4"])
 def test_a_rollout_is_the_simulator_the_grid_and_the_network(task, text):
     maps, episodes = task
-    spec, limits, config = PolicySpec.parse(text), Limits(60.0, 80), SimConfig()
+    spec, limits, config = cnn(text), Limits(60.0, 80), SimConfig()
     genomes = new_genomes(spec, 24)
     results, _ = evaluate(spec, genomes, maps, episodes, limits, config)
     longest = np.argsort(-results["steps"].sum(axis=1))[:3]
@@ -205,7 +211,7 @@ def test_a_rollout_is_the_simulator_the_grid_and_the_network(task, text):
 @settings(max_examples=10, derandomize=True, deadline=None)
 def test_results_do_not_depend_on_the_chunk(task, data):
     maps, episodes = task
-    spec, limits, config = PolicySpec.parse("cnn:8,8,8@2"), Limits(80.0, 100), SimConfig()
+    spec, limits, config = cnn("cnn:8,8,8@2"), Limits(80.0, 100), SimConfig()
     genomes = new_genomes(spec, 12, seed=8)
     whole, rewound = evaluate(spec, genomes, maps, episodes, limits, config, rewind=8)
     members = data.draw(st.lists(st.integers(0, 11), min_size=1, max_size=5))
@@ -217,7 +223,7 @@ def test_results_do_not_depend_on_the_chunk(task, data):
 
 def test_a_rewound_state_is_on_the_way(task):
     maps, episodes = task
-    spec, limits, config = PolicySpec.parse("cnn:8,8,8@1"), Limits(80.0, 100), SimConfig()
+    spec, limits, config = cnn("cnn:8,8,8@1"), Limits(80.0, 100), SimConfig()
     genomes = new_genomes(spec, 16, seed=9)
     results, rewound = evaluate(spec, genomes, maps, episodes, limits, config, rewind=10)
     member, column = np.unravel_index(results["steps"].argmax(), results.shape)
@@ -233,7 +239,7 @@ def test_an_episodes_own_target_and_steps_count(task):
     maps, episodes = task
     episodes = episodes.copy()
     episodes["steps"][:3] = 5
-    spec = PolicySpec.parse("cnn:8,8,8@1")
+    spec = cnn("cnn:8,8,8@1")
     results, _ = evaluate(spec, new_genomes(spec, 8), maps, episodes, Limits(500.0, 50), SimConfig())
     assert results["steps"][:, :3].max() == 5
     assert (results["end"][:, :3] == End.TIME).any()
@@ -242,7 +248,7 @@ def test_an_episodes_own_target_and_steps_count(task):
 
 def test_a_genome_that_is_not_a_number_stands_still(task):
     maps, episodes = task
-    spec = PolicySpec.parse("cnn:8,8,8@1")
+    spec = cnn("cnn:8,8,8@1")
     results, _ = evaluate(spec, np.full((1, spec.size), np.nan, F), maps, episodes, Limits(80.0, 100), SimConfig())
     assert (results["steps"] == 0).all()
     assert (results["end"] == End.IDLE).all()
@@ -250,7 +256,7 @@ def test_a_genome_that_is_not_a_number_stands_still(task):
 
 def test_the_grid_is_there_for_any_number_of_rays(task):
     maps, episodes = task
-    spec, config = PolicySpec.parse("cnn:8,8,8@1"), SimConfig(sensors=SensorConfig(rays=61))
+    spec, config = cnn("cnn:8,8,8@1"), SimConfig(sensors=SensorConfig(rays=61))
     results, _ = evaluate(spec, new_genomes(spec, 4), maps, episodes, Limits(80.0, 100), config)
     assert (results["steps"] > 0).all()
 
@@ -261,12 +267,12 @@ def test_the_grid_is_there_for_any_number_of_rays(task):
 def test_act_on_takes_one_or_many():
     rng = np.random.default_rng(7)
     for text in ("cnn:8,16,32@1", "cnn:8,8,8@4"):
-        spec = PolicySpec.parse(text)
+        spec = cnn(text)
         genome = new_genomes(spec, 1)[0]
         stack = random_grids(5 * spec.frames, rng).reshape(5, spec.frames, 80, 80)
         stack = stack[:, 0] if spec.frames == 1 else stack
         speeds = rng.uniform(0, 20, 5).astype(F)
-        actions = convnet.act_on(spec, genome, stack, speeds)
+        actions = np.asarray(convnet.act_on(spec, genome, stack, speeds))
         assert actions.shape == (5,)
         for grid, speed, action in zip(stack, speeds, actions, strict=True):
             assert convnet.act_on(spec, genome, grid, float(speed)) == action
@@ -283,6 +289,6 @@ def test_act_on_takes_one_or_many():
     ],
 )
 def test_other_observations_are_refused(text, shape, kind):
-    spec = PolicySpec.parse(text)
+    spec = cnn(text)
     with pytest.raises(ValueError, match=r"^cnn:8,8,8@\d sees grids uint8"):
         convnet.act_on(spec, np.zeros(spec.size, F), np.zeros(shape, kind), 1.0)
