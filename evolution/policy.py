@@ -195,14 +195,16 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
 
     1 for a perceptron, whose few inputs are alike. In a convolutional network the standard deviation of He et al.
     (2015), sqrt(2 / inputs of the unit), so that a step means as much in a layer of 64 inputs as in one of 2,000; half
-    the variance in the linear output layer.
+    the variance in the linear output layer. The speed's weights are of size 1: it is one input beside a thousand, and
+    would go unheard.
     """
     if spec.observation == "rays":
         return freeze(np.ones(spec.size, dtype=np.float32))
-    shapes = spec.shapes()
-    parts = [
-        np.full((n + 1) * m, np.sqrt((2.0 if k < len(shapes) - 1 else 1.0) / n)) for k, (n, m) in enumerate(shapes)
-    ]
+    parts = []
+    for k, (planes, rows, columns, channels, beside, units) in enumerate(spec.views.tolist()):
+        n = planes * rows * columns * channels
+        size = np.sqrt((2.0 if k < len(spec.views) - 1 else 1.0) / n)
+        parts += [np.full(n * units, size), np.ones(beside * units), np.full(units, size)]
     return freeze(np.concatenate(parts).astype(np.float32))
 
 

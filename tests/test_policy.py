@@ -233,6 +233,8 @@ def test_genes_are_as_large_as_he_et_al_have_them():
     assert scales.shape == (spec.size,)
     assert scales[0] == pytest.approx(math.sqrt(2 / 64))
     assert scales[65 * 8] == pytest.approx(math.sqrt(2 / 128))
-    assert scales[65 * 8 + 129 * 16] == pytest.approx(math.sqrt(2 / 1025))
+    assert scales[65 * 8 + 129 * 16] == pytest.approx(math.sqrt(2 / 1024))
     assert scales[-1] == pytest.approx(math.sqrt(1 / 32))
+    speed = 65 * 8 + 129 * 16 + 1024 * 32
+    assert (scales[speed : speed + 32] == 1.0).all()
     assert (gene_scales(PolicySpec.parse("mlp:6,7")) == 1.0).all()
