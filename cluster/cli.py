@@ -193,6 +193,7 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
     from cluster import run as runs
     from cluster.champion import load_champion
     from cluster.checkpoint import CheckpointError
+    from evolution.policy import PolicySpec
 
     prog = "gridsim-evolve"
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
@@ -244,7 +245,7 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
             champion = load_champion(flags.init)
         except CheckpointError as error:
             raise UsageError(f"--init {error}") from error
-        if champion.policy != settings.policy:
+        if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
             raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
         digest = champion.sha256
     try:

@@ -10,11 +10,12 @@ from typing import Any, Literal
 
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
-from evolution.policy import PolicySpec
+from evolution.policy import Observation, PolicySpec
 from gridsim.scenarios import build, check_name, default_traffic, is_map_file
 
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
+DEFAULT_POLICY: dict[Observation, str] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
 
 
 class SettingsError(ValueError):
@@ -31,8 +32,11 @@ class EvolveSettings:
     """Other cars on the road; -1: as many as the scenario has by default. A map from a file has no lanes for them."""
     seed: int = 0
     """Seed of every random number of the run."""
-    policy: str = "mlp:6,7"
-    """Network: mlp: and the sizes of its hidden layers."""
+    observation: Observation = "rays"
+    """What the network sees: 31 ranges, or the occupancy grid; and the speed."""
+    policy: str = ""
+    """Network: mlp: and the sizes of its hidden layers, by default mlp:6,7; on the grid cnn: with the channels of two
+    convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 120
@@ -63,8 +67,10 @@ class EvolveSettings:
     def __post_init__(self) -> None:
         if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
             object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
-        if self.traffic == -1 or (self.traffic > 0 and is_map_file(self.scenario)):
+        if self.traffic == -1:
             object.__setattr__(self, "traffic", default_traffic(self.scenario))
+        if not self.policy:
+            object.__setattr__(self, "policy", DEFAULT_POLICY.get(self.observation, ""))
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""
@@ -80,6 +86,8 @@ class EvolveSettings:
             raise SettingsError(str(error)) from error
         if not 0 <= self.traffic <= MAX_TRAFFIC:
             raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
+        if self.traffic and is_map_file(self.scenario):
+            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
         if not 0 <= self.seed < 1 << 63:
             raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
         if self.car_steps < 0:
@@ -96,10 +104,15 @@ class EvolveSettings:
         if not self.until > 0.0:
             raise SettingsError(f"--until must be above 0, not {self.until}")
         try:
-            PolicySpec.parse(self.policy)
+            spec = PolicySpec.parse(self.policy)
             GeneticConfig(self.population, self.elites, self.tournament, self.parents, self.crossover).check()
         except ValueError as error:
             raise SettingsError(str(error)) from error
+        if spec.observation != self.observation:
+            raise SettingsError(
+                f"policy {self.policy} sees the {spec.observation}; "
+                f"give --observation {spec.observation}, or a policy such as {DEFAULT_POLICY[self.observation]}"
+            )
 
 
 def to_dict(settings: EvolveSettings) -> dict[str, Any]:
@@ -123,5 +136,7 @@ def from_dict(values: dict[str, Any]) -> EvolveSettings:
     settings = EvolveSettings(**values)
     if settings.ranking not in ("scalar", "pareto") or settings.search not in ("evolution", "random"):
         raise SettingsError("ranking is scalar or pareto, search is evolution or random")
+    if settings.observation not in DEFAULT_POLICY:
+        raise SettingsError("observation is rays or grid")
     settings.check()
     return settings
