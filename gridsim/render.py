@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from gridsim.config import SimConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import leaf, njit
 from gridsim.marks import lane_marks
 from gridsim.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, freeze
 from gridsim.scenarios import Scenario
@@ -39,6 +39,7 @@ RAY, PATH = (92, 225, 200), (233, 172, 86)
 FREE, OCCUPIED, UNKNOWN = (92, 225, 200), (255, 70, 90), (16, 18, 24)
 HUD = (20, 22, 28)
 
+BLOCK = 8  # pixels, side of the blocks that are looked at together
 SQUARE = 32  # cells of the field, side of the ground's squares
 EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and half that line's width
 VERGE_WIDTH = 0.7  # m
@@ -54,6 +55,21 @@ class NoDisplayError(RuntimeError):
     """There is nowhere to open a window; the message is one line that says what to do."""
 
 
+@leaf
+def _clear(field, columns, rows, wrap, turn, x, y):
+    """Clearance (m) at a place in cells of the field, from `turn` tiles before the first; deep in a wall off the map."""
+    ix, iy = _I(x), _I(y)
+    mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
+    if not wrap and (_U(ix - _I(turn) * _I(columns)) > mask_x or _U(iy - _I(turn) * _I(rows)) > mask_y):
+        return _F(FIELD_FLOOR)
+    ux, uy = x - _F(ix), y - _F(iy)
+    word = field[_U((_U(iy) & mask_y) * _U(columns) + (_U(ix) & mask_x))]
+    q00, q10 = _F(_I(word & _U(255))), _F(_I((word >> _U(8)) & _U(255)))
+    q01, q11 = _F(_I((word >> _U(16)) & _U(255))), _F(_I(word >> _U(24)))
+    low, high = q00 + ux * (q10 - q00), q01 + ux * (q11 - q01)
+    return (low + uy * (high - low)) * _F(1.0 / FIELD_UNITS) + _F(FIELD_FLOOR)
+
+
 @njit(nogil=True)
 def _draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels_per_m, colours, image):
     """Ground and road.
@@ -63,46 +79,46 @@ def _draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixel
     none is below 0; pixels_per_m; colours float32 [5, 3]: ground, its other squares, verge, asphalt, edge line.
     Writes: image uint8 [h, w, 3].
     """
-    mask_x, mask_y, columns = _U(columns - 1), _U(rows - 1), _U(columns)
     zero, half, one = _F(0.0), _F(0.5), _F(1.0)
     scale = _F(pixels_per_m)
     line_half = _F(EDGE_HALF) * scale
     inner = _F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge where there is nothing but asphalt
-    tile_x, tile_y = _I(turn) * _I(columns), _I(turn) * _I(rows)
-    for j in range(image.shape[0]):
-        x0, y0 = _F(origin[0] + j * step_y[0]), _F(origin[1] + j * step_y[1])
-        right_x, right_y = _F(step_x[0]), _F(step_x[1])
-        for i in range(image.shape[1]):
-            x, y = x0 + _F(i) * right_x, y0 + _F(i) * right_y
-            ix, iy = _I(x), _I(y)
-            clear = _F(FIELD_FLOOR)
-            if wrap or (_U(ix - tile_x) <= mask_x and _U(iy - tile_y) <= mask_y):
-                ux, uy = x - _F(ix), y - _F(iy)
-                word = field[_U((_U(iy) & mask_y) * columns + (_U(ix) & mask_x))]
-                q00, q10 = _F(_I(word & _U(255))), _F(_I((word >> _U(8)) & _U(255)))
-                q01, q11 = _F(_I((word >> _U(16)) & _U(255))), _F(_I(word >> _U(24)))
-                low, high_side = q00 + ux * (q10 - q00), q01 + ux * (q11 - q01)
-                clear += (low + uy * (high_side - low)) * _F(1.0 / FIELD_UNITS)
-            if clear > inner:
-                for c in range(3):
-                    image[j, i, c] = np.uint8(colours[3, c])
-                continue
-            base = (ix // _I(SQUARE) + iy // _I(SQUARE)) & 1
-            if clear < _F(-VERGE_WIDTH) and clear * scale < -one:
-                for c in range(3):
-                    image[j, i, c] = np.uint8(colours[base, c])
-                continue
-            edge = clear * scale  # pixels from the road's edge, positive on it
-            road = min(max(edge + half, zero), one)
-            verge = min(max(one + clear * _F(1.0 / VERGE_WIDTH), zero), one)
-            off = abs(edge - _F(EDGE_AT) * scale)
-            line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * _F(0.85)
-            for c in range(3):
-                value = colours[base, c]
-                value += verge * (colours[2, c] - value)
-                value += road * (colours[3, c] - value)
-                value += line * (colours[4, c] - value)
-                image[j, i, c] = np.uint8(value + half)
+    outer = -max(_F(VERGE_WIDTH), one / scale)  # ... and nothing but ground
+    reach = _F(0.75 * BLOCK) / scale  # m from a block's middle to its corners; clearance changes no faster than that
+    ax, ay, bx, by = _F(step_x[0]), _F(step_x[1]), _F(step_y[0]), _F(step_y[1])
+    for top in range(0, image.shape[0], BLOCK):
+        for left in range(0, image.shape[1], BLOCK):
+            x0 = _F(origin[0] + left * step_x[0] + top * step_y[0])
+            y0 = _F(origin[1] + left * step_x[1] + top * step_y[1])
+            middle = _F((BLOCK - 1) / 2)
+            clear = _clear(field, columns, rows, wrap, turn, x0 + middle * (ax + bx), y0 + middle * (ay + by))
+            known = clear > inner + reach or clear < outer - reach
+            for j in range(top, min(top + BLOCK, image.shape[0])):
+                for i in range(left, min(left + BLOCK, image.shape[1])):
+                    across, down = _F(i - left), _F(j - top)
+                    x, y = x0 + across * ax + down * bx, y0 + across * ay + down * by
+                    if not known:
+                        clear = _clear(field, columns, rows, wrap, turn, x, y)
+                    if clear > inner:
+                        for c in range(3):
+                            image[j, i, c] = np.uint8(colours[3, c])
+                        continue
+                    base = (_I(x) // _I(SQUARE) + _I(y) // _I(SQUARE)) & 1
+                    if clear < outer:
+                        for c in range(3):
+                            image[j, i, c] = np.uint8(colours[base, c])
+                        continue
+                    edge = clear * scale  # pixels from the road's edge, positive on it
+                    road = min(max(edge + half, zero), one)
+                    verge = min(max(one + clear * _F(1.0 / VERGE_WIDTH), zero), one)
+                    off = abs(edge - _F(EDGE_AT) * scale)
+                    line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * _F(0.85)
+                    for c in range(3):
+                        value = colours[base, c]
+                        value += verge * (colours[2, c] - value)
+                        value += road * (colours[3, c] - value)
+                        value += line * (colours[4, c] - value)
+                        image[j, i, c] = np.uint8(value + half)
 
 
 def _smoothed(scenario: Scenario) -> np.ndarray:
@@ -132,13 +148,14 @@ def _draw_shapes(shapes, image):
         wide = abs(dx) * length + abs(dy) * across + one
         if not (tall < 32768.0 and wide < 32768.0 and abs(x0) < 32768.0 and abs(y0) < 32768.0):
             continue
-        for j in range(max(_I(math.floor(y0 - tall)), 0), min(_I(math.ceil(y0 + tall)) + 1, height)):
+        top, bottom = max(int(y0 - tall) - 1, 0), min(int(y0 + tall) + 2, height)
+        for j in range(top, bottom):
             y = _F(j) - y0
             first, last = x0 - wide, x0 + wide
             if abs(dy) > _F(0.01):  # of a slanted shape, only the stretch that this line of pixels crosses
                 middle, reach = x0 + y * dx / dy, (across + one) / abs(dy)
                 first, last = max(first, middle - reach), min(last, middle + reach)
-            for i in range(max(_I(math.floor(first)), 0), min(_I(math.ceil(last)) + 1, width)):
+            for i in range(max(int(first) - 1, 0), min(int(last) + 2, width)):
                 x = _F(i) - x0
                 u = abs(x * dx + y * dy) - length + radius
                 v = abs(y * dx - x * dy) - across + radius
@@ -152,7 +169,7 @@ def _draw_shapes(shapes, image):
 
 def _car_parts(
     length: float, width: float, front_axle: float, rear_axle: float, steering: float, colour: Sequence[int]
-):
+) -> np.ndarray:
     """Shapes [k, 11] of a car at the origin heading along +x, in m."""
     a, b = length / 2, width / 2
     c, s = math.cos(steering), math.sin(steering)
@@ -238,7 +255,7 @@ class Renderer:
 
     def _near(self, pixels: np.ndarray, margin: float) -> np.ndarray:
         """Which of pixels [n, 2] are in the picture, or `margin` pixels from it."""
-        return ((pixels > -margin) & (pixels < np.array(self.size) + margin)).all(axis=1)
+        return np.all((pixels > -margin) & (pixels < np.array(self.size) + margin), axis=1)
 
     # ------------------------------------------------------------------------------------------------- drawing
 
