@@ -170,7 +170,8 @@ def _encode(
         stderr=subprocess.PIPE,
         start_new_session=True,  # Ctrl-C is ours to handle
     )
-    assert process.stdin is not None and process.stderr is not None
+    assert process.stdin is not None
+    assert process.stderr is not None
     count = 0
     try:
         with contextlib.suppress(BrokenPipeError):  # ffmpeg says below why it left

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -57,7 +58,7 @@ class NoDisplayError(RuntimeError):
 
 @leaf
 def _clear(field, columns, rows, wrap, turn, x, y):
-    """Clearance (m) at a place in cells of the field, from `turn` tiles before the first; deep in a wall off the map."""
+    """Clearance (m) at a place in cells of the field, from `turn` tiles before the first; off the map, a wall."""
     ix, iy = _I(x), _I(y)
     mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
     if not wrap and (_U(ix - _I(turn) * _I(columns)) > mask_x or _U(iy - _I(turn) * _I(rows)) > mask_y):
@@ -501,7 +502,7 @@ class Window:
                 f"no window can be opened ({error}): set DISPLAY to a running display, or draw without a window"
             ) from error
         pygame.display.set_caption(caption)
-        self._clock = pygame.time.Clock()
+        self._due = 0.0
         self.closed = False
 
     def show(self, image: np.ndarray, fps: float = 0.0) -> None:
@@ -511,7 +512,11 @@ class Window:
         self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB"), (0, 0))
         pygame.display.flip()
         if fps > 0:
-            self._clock.tick(fps)
+            now = time.perf_counter()
+            if not now - 0.25 < self._due < now + 1.0:  # the first picture, or one after a pause
+                self._due = now
+            time.sleep(max(self._due - now, 0.0))
+            self._due += 1.0 / fps
 
     def keys(self) -> tuple[set[str], set[str]]:
         """Names of the keys that went down since the last call, and of those that are down or were in between.
