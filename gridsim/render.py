@@ -8,10 +8,12 @@ and opens the window.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -483,23 +485,40 @@ def between(before: np.ndarray, after: np.ndarray, part: float, scenario: Scenar
     return state.astype(np.float32)
 
 
+@contextlib.contextmanager
+def _driver_for_display(chosen: str | None) -> Iterator[None]:
+    """On Linux, let SDL try no driver whose display is not there: some of them complain on stderr by themselves."""
+    x11, wayland = os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY")
+    if chosen or wayland or not sys.platform.startswith("linux"):
+        yield
+    elif not x11:
+        raise _pygame().error("no display")
+    else:
+        os.environ["SDL_VIDEODRIVER"] = "x11"
+        try:
+            yield
+        finally:
+            del os.environ["SDL_VIDEODRIVER"]
+
+
 class Window:
     """A window on a display, and the keys that are pressed in it."""
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
         """Open it. Raises: NoDisplayError with one line that says what to do."""
         pygame = self._pygame = _pygame()
+        chosen = os.environ.get("SDL_VIDEODRIVER")
         try:
-            pygame.display.init()
-            driver = pygame.display.get_driver()
+            with _driver_for_display(chosen):
+                pygame.display.init()
             # SDL falls back on drivers that show nothing; that is right only for who asked for one.
-            if driver in ("dummy", "offscreen", "evdev") and not os.environ.get("SDL_VIDEODRIVER"):
+            if not chosen and pygame.display.get_driver() in ("dummy", "offscreen", "evdev"):
                 raise pygame.error("no display")
             self._screen = pygame.display.set_mode(size)
         except pygame.error as error:
             pygame.display.quit()
             raise NoDisplayError(
-                f"no window can be opened ({error}): set DISPLAY to a running display, or draw without a window"
+                f"no window can be opened ({error}): set DISPLAY to a running display, or do without the window"
             ) from error
         pygame.display.set_caption(caption)
         self._due = 0.0
