@@ -142,6 +142,7 @@ def write_video(path: str | os.PathLike[str], pictures: Iterator[np.ndarray], si
         coding += ["-movflags", "+faststart", "-f", "mp4"]
     try:
         try:
+            temporary.touch()  # what is wrong with the place is said better here than by ffmpeg
             count = _encode(temporary, pictures, size, fps, coding)
             os.replace(temporary, path)
         except BaseException:
