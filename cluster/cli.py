@@ -352,7 +352,7 @@ def _run(
         session.on_row = shown.row
         session.evolution.on_progress = shown.members
         session.evolve()
-        shown.note("measuring the champion on held-out roads")
+        shown.note("measuring and filming the champion on held-out roads")
         summary = session.finish(flags.workers)
         shown.note("logging to MLflow")
         if not summary["mlflow_run_id"]:
@@ -360,12 +360,14 @@ def _run(
                 summary["mlflow_run_id"] = tracker.wait_ready(30.0)
         session.write_summary(summary)
         tracker.log_artifacts(run.path)
+    if session.lost:
+        print(f"gridsim-evolve: warning: {session.lost}", file=sys.stderr)
     console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))
     found = "solved" if summary["solved"] else "the best so far"
     return (
         f"{found} after {summary['generations']} generations, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
         f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
-        f"look at it: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
+        f"watch it: gridsim-watch {_shown(run.path)}\ncompare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
     )
 
 

@@ -33,10 +33,10 @@ from cluster.tracking import Tracker, git_commit
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
 from gridsim.maps import map_digest
-from gridsim.scenarios import is_map_file, label
+from gridsim.scenarios import Scenario, is_map_file, label
 
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
-HISTORY, ELITES, SUMMARY = "history.csv", "elites.npz", "summary.json"
+HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
 CONFIG_FORMAT = 1
 METRICS = tuple(name for name in COLUMNS if name not in ("target_m",))
 
@@ -191,6 +191,7 @@ class Session:
         tracker: who logs to MLflow.
         process_started: time.perf_counter() of the process's start.
         on_row: told each generation's number and row.
+        lost: one line about what could not be written, beside what matters.
     """
 
     run: RunFolder
@@ -201,6 +202,7 @@ class Session:
     initial: np.ndarray | None = None
     on_row: Callable[[int, dict[str, float]], None] | None = None
     on_progress: Callable[[str, int, int], None] | None = None
+    lost: str = ""
     evolution: Evolution = field(init=False)
 
     def __post_init__(self) -> None:
@@ -263,6 +265,7 @@ class Session:
             scenario, states, path / "trajectory.png",
             f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
+        self._film(champion, scenario, episodes.rows[0]["start"])
         wall = evolution.wall_before_s + now() - self.process_started
         summary = {
             "name": self.run.name,
@@ -283,6 +286,19 @@ class Session:
         self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
         self.write_summary(summary)
         return summary
+
+    def _film(self, champion: Champion, scenario: Scenario, start: np.ndarray) -> None:
+        """Write champion.mp4. A film is no reason to lose a run: why there is none is kept in `lost`."""
+        from cluster.video import VideoError, champion_video
+
+        try:
+            champion_video(
+                champion, scenario, start, self.run.path / VIDEO,
+                f"{champion.scenario}, held-out map {scenario.seed:,}", self.evolution.on_progress,
+            )  # fmt: skip
+        except VideoError as error:
+            (self.run.path / VIDEO).unlink(missing_ok=True)
+            self.lost = f"no {VIDEO}: {error}"
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write summary.json, the mark of a finished run."""

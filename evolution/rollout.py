@@ -313,8 +313,8 @@ def trajectory(
     """Drive one genome through one episode and keep its path.
 
     Args: as `evaluate`'s; start float32 [5], world float32 [cars, traffic.FIELDS].
-    Returns: (RESULT [], states float32 [steps, FIELDS] before each step, with fields as in `gridsim.simulator`, and
-    the traffic then, float32 [steps, cars, traffic.FIELDS]).
+    Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
+    `gridsim.simulator`, and the traffic then, float32 [steps + 1, cars, traffic.FIELDS]).
     """
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
@@ -335,7 +335,7 @@ def trajectory(
     )
     row = np.zeros((), dtype=RESULT)
     row["distance"], row["paced"], row["steps"], row["end"] = result
-    return row, states[: int(row["steps"])], worlds[: int(row["steps"])]
+    return row, states[: int(row["steps"]) + 1], worlds[: int(row["steps"]) + 1]
 
 
 @njit(nogil=True)
@@ -347,10 +347,10 @@ def _trajectory(road, network, constants, drivers, fan, genome, layers, start, t
     ranges = np.empty(rays, dtype=np.float32)
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
     packed = _packed(genome, layers, eye)
-    ring = np.zeros((max_steps, FIELDS), dtype=np.float32)
+    ring = np.zeros((max_steps + 1, FIELDS), dtype=np.float32)
     world = None if traffic is None else traffic.copy()
     cars = 0 if traffic is None else traffic.shape[0]
-    world_ring = np.zeros((max_steps, cars, TRAFFIC_FIELDS), dtype=np.float32)
+    world_ring = np.zeros((max_steps + 1, cars, TRAFFIC_FIELDS), dtype=np.float32)
     end = _run(
         road,
         network,
@@ -372,4 +372,7 @@ def _trajectory(road, network, constants, drivers, fan, genome, layers, start, t
         ring,
         world_ring,
     )
+    ring[int(car[STEPS])] = car
+    if traffic is not None:
+        world_ring[int(car[STEPS])] = world
     return (car[DISTANCE], car[PACED], car[STEPS], end), ring, world_ring

@@ -169,7 +169,7 @@ def test_frames_are_the_last_ones_newest_last(begins):
 @pytest.fixture(scope="module")
 def task():
     maps = [build("seamless", seed) for seed in (1, 2)]
-    episodes = lane_starts(maps, np.arange(6) % 2, np.random.default_rng(6))
+    episodes, _ = lane_starts(maps, np.arange(6) % 2, np.random.default_rng(6))
     episodes["start"][:, 3] = 6.0
     return maps, episodes
 
@@ -202,7 +202,7 @@ def test_a_rollout_is_the_simulator_the_grid_and_the_network(task, text):
             state = by_hand(spec, genomes[member], scenario, episode["start"], limits, config)
             assert (row["steps"], row["end"]) == (state.cars[0, 11], state.ends[0])
             assert row["distance"] == state.cars[0, 6]
-    one, states = trajectory(spec, genomes[longest[0]], maps[0], episodes[0]["start"], limits, config)
+    one, states, _ = trajectory(spec, genomes[longest[0]], maps[0], episodes[0]["start"], limits, config)
     assert one == results[longest[0], 0]
     assert len(states) == one["steps"]
 
@@ -216,7 +216,7 @@ def test_results_do_not_depend_on_the_chunk(task, data):
     whole, rewound, _ = evaluate(spec, genomes, maps, episodes, limits, config, rewind=8)
     members = data.draw(st.lists(st.integers(0, 11), min_size=1, max_size=5))
     columns = data.draw(st.lists(st.integers(0, 5), min_size=1, max_size=4))
-    part, back = evaluate(spec, genomes[members], maps, episodes[columns], limits, config, rewind=8)
+    part, back, _ = evaluate(spec, genomes[members], maps, episodes[columns], limits, config, rewind=8)
     assert part.tobytes() == whole[np.ix_(members, columns)].tobytes()
     assert back.tobytes() == rewound[np.ix_(members, columns)].tobytes()
 
