@@ -97,8 +97,8 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
         """A piece of street from (x, y), with its lanes, bays and parked cars."""
         (ux, uy), heading = DIRECTIONS[d], d * math.pi / 2
 
-        def place(along: float, left: float) -> list[float]:
-            return [x + along * ux - left * uy, y + along * uy + left * ux]
+        def place(along: float, left: float) -> tuple[float, float]:
+            return x + along * ux - left * uy, y + along * uy + left * ux
 
         lines.append([*place(0.0, 0.0), *place(length, 0.0), half_road])
         right, left = place(0.0, -LANE_WIDTH / 2), place(length, LANE_WIDTH / 2)
