@@ -21,7 +21,7 @@ TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
 START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
-ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high")
+ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Scenario:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Scenario:
         """The inverse of `arrays`; arrays are used as they are, read-only."""
         frozen = {key: freeze(value) for key, value in arrays.items()}
-        columns, rows, width, height, low, high, seed, torus = frozen["scalars"]
+        columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
         f = np.float32
         return cls(
             name=frozen["name"].tobytes().decode(),
@@ -84,6 +84,7 @@ class Scenario:
                 f(height),
                 f(low),
                 f(high),
+                np.uint32(thin),
             ),
             lanes=Lanes(**{field.name: frozen[field.name] for field in fields(Lanes)}),
             strips=Strips(**{field.name: frozen[field.name] for field in fields(Strips)}),
@@ -98,15 +99,16 @@ class ScenarioSpec:
     summary: str
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int  # cars beside the ego car, unless told otherwise
+    thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
 
 REGISTRY: dict[str, ScenarioSpec] = {
-    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, highway_layout),
-    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, curved_layout),
-    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, seamless_layout),
-    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, roundabout_layout),
-    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, city_layout),
+    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, False, highway_layout),
+    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, False, curved_layout),
+    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, False, seamless_layout),
+    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, True, roundabout_layout),
+    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, True, city_layout),
 }
 
 
@@ -127,7 +129,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     return Scenario(
         name=name,
         seed=seed,
-        road=make_road(nodes, spec.speed_interval, config.sensors.range),
+        road=make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls),
         lanes=Lanes(**{name: freeze(array) for name, array in vars(lanes).items()}),
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
     )

@@ -7,6 +7,7 @@ into whatever the machine has.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from llvmlite import ir
@@ -27,8 +28,11 @@ def march_intrinsic(
     close: float,
     slope_min: float,
     leap: float,
+    gap: float,
 ) -> Any:
     """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; numbers as in `sensors`.
+
+    With a gap of infinity nothing is looked back at, and no code for that is emitted.
 
     beams float32 [3, LANES], C-contiguous: direction x, direction y, and the range, which is read and written.
     """
@@ -87,9 +91,10 @@ def march_intrinsic(
             builder.branch(loop)
             builder.position_at_end(loop)
             k = builder.phi(i32)
-            t = builder.phi(vf)
+            t, safe = builder.phi(vf), builder.phi(vf)
             k.add_incoming(ir.Constant(i32, 0), before)
             t.add_incoming(first, before)
+            safe.add_incoming(first, before)
             px, py = add(x0, mul(t, sx)), add(y0, mul(t, sy))
             fx, fy = builder.call(floor_of, [px]), builder.call(floor_of, [py])
             ux, uy = sub(px, fx), sub(py, fy)
@@ -126,12 +131,22 @@ def march_intrinsic(
             t_next = add(t, builder.select(running, step, const(0.0)))
             size = builder.select(builder.fcmp_ordered("<", clear, const(0.0)), builder.fsub(const(0.0), clear), clear)
             active = builder.and_(running, builder.fcmp_ordered(">=", size, const(close)))
+            safe_next = safe
+            if gap != math.inf:
+                seen = add(safe, const(gap))
+                blind = builder.fcmp_ordered(">", sub(t, size), seen)
+                t_next = builder.select(blind, seen, t_next)
+                further = add(t, clear)
+                further = builder.select(builder.fcmp_ordered(">", further, safe), further, safe)
+                safe_next = builder.select(blind, safe, further)
+                active = builder.or_(active, blind)
             bits = ir.IntType(LANES)
             any_active = builder.icmp_unsigned("!=", builder.bitcast(active, bits), ir.Constant(bits, 0))
             k_next = builder.add(k, one)
             more = builder.and_(any_active, builder.icmp_unsigned("<", k_next, ir.Constant(i32, steps)))
             k.add_incoming(k_next, builder.block)
             t.add_incoming(t_next, builder.block)
+            safe.add_incoming(safe_next, builder.block)
             builder.cbranch(more, loop, done)
             builder.position_at_end(done)
             t_last = builder.select(builder.fcmp_ordered(">", t_next, const(0.0)), t_next, const(0.0))
