@@ -5,7 +5,7 @@ long steps while the road is wide and Newton steps near the edge; slopes are tho
 
 A step is longer than the clearance it starts from, so that a wall may lie within it. Where a map has walls thinner than
 such a step, steps are shorter and each is looked back at: what is neither within the clearance before it nor behind it
-is blind, and if that is more than GAP, the ray goes back. So no ray passes a wall of 1 m or more.
+is blind, and if that is more than _GAP, the ray goes back. So no ray passes a wall of 1 m or more.
 """
 
 from __future__ import annotations
@@ -42,9 +42,11 @@ _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
 _SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance ...
 _LEAP = _F(2.0)  # ... and at most this many m longer than a stretched one, so as not to jump over an island
 _STEPS = 16  # at most
-# Steps, leap and gap (m) of a march, plain and among thin walls. Plain, 3 m of wall may be passed.
-PLAIN = (_STEPS, _LEAP, _F(math.inf))
-AMONG_THIN_WALLS = (24, _F(0.9), _F(0.95))
+_GAP = _F(0.95)  # m of a step that may be blind, among thin walls
+# How to march, plain and among thin walls: steps at most, leap in m, whether steps are looked back at. Plain, 3 m of
+# wall may be passed.
+PLAIN = (_STEPS, _LEAP, False)
+AMONG_THIN_WALLS = (24, _F(0.9), True)
 
 
 def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:
@@ -67,7 +69,7 @@ def march(field, columns, rows, px0, py0, reach, beams, how):
     Args: packed field with its sides; origin in cells; reach m; beams float32 [3, LANES]: direction x, direction y and
     range, the start on entry and the result on return, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
     """
-    steps, leap, gap = how
+    steps, leap, look_back = how
     mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
     for r in range(LANES):
         dx, dy, t = beams[0, r], beams[1, r], beams[2, r]
@@ -82,26 +84,33 @@ def march(field, columns, rows, px0, py0, reach, beams, how):
             rise_low, rise_high = q10 - q00, q11 - q01
             low, high = q00 + ux * rise_low, q01 + ux * rise_high
             clear = (low + uy * (high - low)) * _UNIT + _FLOOR
-            if t - abs(clear) > safe + gap:
-                t = safe + gap
-                continue
+            if look_back:
+                if t - abs(clear) > safe + _GAP:
+                    t = safe + _GAP
+                    continue
+                if clear > _F(0.0):
+                    safe = max(safe, t + clear)
             if t >= reach:
                 break
-            safe = max(safe, t + clear)
             if clear > _NEAR:
                 t += _STRETCH * clear
             else:
                 slope = -(dx * (rise_low + uy * (rise_high - rise_low)) + dy * (high - low)) * _SLOPE
                 t += min(clear / min(max(slope, _SLOPE_MIN), _F(1.0)), max(_STRETCH * clear, _F(0.0)) + leap)
+                if look_back:
+                    t = max(t, safe)
                 if abs(clear) < _CLOSE:
                     break
+        if look_back:
+            t = min(t, safe + _GAP)
         beams[2, r] = min(max(t, _F(0.0)), reach)
 
 
 def _compiled(how: tuple) -> Any:
     """The vector code for `march`, all lanes until the last has arrived."""
-    numbers = (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, *how[1:])
-    return march_intrinsic(how[0], *map(float, numbers))
+    steps, leap, look_back = how
+    numbers = (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, leap)
+    return march_intrinsic(steps, *map(float, numbers), float(_GAP) if look_back else None)
 
 
 @leaf

@@ -7,7 +7,6 @@ into whatever the machine has.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from llvmlite import ir
@@ -28,11 +27,11 @@ def march_intrinsic(
     close: float,
     slope_min: float,
     leap: float,
-    gap: float,
+    gap: float | None,
 ) -> Any:
     """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; numbers as in `sensors`.
 
-    With a gap of infinity nothing is looked back at, and no code for that is emitted.
+    Without a gap steps are not looked back at, and no code for that is emitted.
 
     beams float32 [3, LANES], C-contiguous: direction x, direction y, and the range, which is read and written.
     """
@@ -132,13 +131,15 @@ def march_intrinsic(
             size = builder.select(builder.fcmp_ordered("<", clear, const(0.0)), builder.fsub(const(0.0), clear), clear)
             active = builder.and_(running, builder.fcmp_ordered(">=", size, const(close)))
             safe_next = safe
-            if gap != math.inf:
+            if gap is not None:
                 seen = add(safe, const(gap))
                 blind = builder.fcmp_ordered(">", sub(t, size), seen)
-                t_next = builder.select(blind, seen, t_next)
                 further = add(t, clear)
-                further = builder.select(builder.fcmp_ordered(">", further, safe), further, safe)
-                safe_next = builder.select(blind, safe, further)
+                free = builder.fcmp_ordered(">", clear, const(0.0))
+                known = builder.and_(free, builder.fcmp_ordered(">", further, safe))
+                safe_next = builder.select(builder.and_(known, builder.not_(blind)), further, safe)
+                t_next = builder.select(builder.fcmp_ordered(">", t_next, safe_next), t_next, safe_next)
+                t_next = builder.select(blind, seen, t_next)
                 active = builder.or_(active, blind)
             bits = ir.IntType(LANES)
             any_active = builder.icmp_unsigned("!=", builder.bitcast(active, bits), ir.Constant(bits, 0))
@@ -149,6 +150,9 @@ def march_intrinsic(
             safe.add_incoming(safe_next, builder.block)
             builder.cbranch(more, loop, done)
             builder.position_at_end(done)
+            if gap is not None:
+                seen = add(safe_next, const(gap))
+                t_next = builder.select(builder.fcmp_ordered("<", t_next, seen), t_next, seen)
             t_last = builder.select(builder.fcmp_ordered(">", t_next, const(0.0)), t_next, const(0.0))
             t_last = builder.select(builder.fcmp_ordered("<", t_last, limit), t_last, limit)
             builder.store(t_last, beam(2), align=4)
