@@ -106,11 +106,11 @@ def march(field, columns, rows, px0, py0, reach, beams, how):
         beams[2, r] = min(max(t, _F(0.0)), reach)
 
 
-def _compiled(how: tuple) -> Any:
+def _compiled(how: tuple[int, np.float32, bool]) -> Any:
     """The vector code for `march`, all lanes until the last has arrived."""
     steps, leap, look_back = how
     numbers = (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, leap)
-    return march_intrinsic(steps, *map(float, numbers), float(_GAP) if look_back else None)
+    return march_intrinsic(steps, *map(float, numbers), gap=float(_GAP) if look_back else None)
 
 
 @leaf
