@@ -109,8 +109,9 @@ def march(field, columns, rows, px0, py0, reach, beams, how):
 def _compiled(how: tuple[int, np.float32, bool]) -> Any:
     """The vector code for `march`, all lanes until the last has arrived."""
     steps, leap, look_back = how
-    numbers = (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, leap)
-    return march_intrinsic(steps, *map(float, numbers), gap=float(_GAP) if look_back else None)
+    numbers = map(float, (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, leap))
+    arguments: list[Any] = [*numbers, float(_GAP) if look_back else None]
+    return march_intrinsic(steps, *arguments)
 
 
 @leaf
