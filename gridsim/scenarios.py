@@ -25,7 +25,7 @@ VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
 START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight as a share of the interval's two ends together: its middle
-ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high")
+ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Scenario:
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Scenario:
         """The inverse of `arrays`; arrays are used as they are, read-only."""
         frozen = {key: freeze(value) for key, value in arrays.items()}
-        columns, rows, width, height, low, high, seed, torus = frozen["scalars"]
+        columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
         f = np.float32
         lanes = Lanes(**{f.name: frozen[f.name] for f in fields(Lanes)})
         return cls(
@@ -96,6 +96,7 @@ class Scenario:
                 f(height),
                 f(low),
                 f(high),
+                np.uint32(thin),
             ),
             lanes=lanes,
             strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
@@ -112,15 +113,16 @@ class ScenarioSpec:
     summary: str
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int  # cars beside the ego car, unless told otherwise
+    thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
 
 REGISTRY: dict[str, ScenarioSpec] = {
-    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, highway_layout),
-    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, curved_layout),
-    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, seamless_layout),
-    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, roundabout_layout),
-    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, city_layout),
+    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, False, highway_layout),
+    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, False, curved_layout),
+    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, False, seamless_layout),
+    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, True, roundabout_layout),
+    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, True, city_layout),
 }
 
 
@@ -172,7 +174,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     return Scenario(
         name=name,
         seed=seed,
-        road=make_road(nodes, spec.speed_interval, config.sensors.range),
+        road=make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls),
         lanes=lanes,
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
         network=make_network(lanes, width, height, TRAFFIC_PACE * sum(spec.speed_interval), config.traffic),
