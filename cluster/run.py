@@ -265,7 +265,7 @@ class Session:
             scenario, states, path / "trajectory.png",
             f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
-        self._film(champion, scenario, episodes.rows[0]["start"])
+        self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
         wall = evolution.wall_before_s + now() - self.process_started
         summary = {
             "name": self.run.name,
@@ -287,14 +287,14 @@ class Session:
         self.write_summary(summary)
         return summary
 
-    def _film(self, champion: Champion, scenario: Scenario, start: np.ndarray) -> None:
+    def _film(self, champion: Champion, scenario: Scenario, start: np.ndarray, world: np.ndarray) -> None:
         """Write champion.mp4. A film is no reason to lose a run: why there is none is kept in `lost`."""
         from cluster.video import VideoError, champion_video
 
         try:
             champion_video(
                 champion, scenario, start, self.run.path / VIDEO,
-                f"{champion.scenario}, held-out map {scenario.seed:,}", self.evolution.on_progress,
+                f"{champion.scenario}, held-out map {scenario.seed:,}", self.evolution.on_progress, world,
             )  # fmt: skip
         except VideoError as error:
             (self.run.path / VIDEO).unlink(missing_ok=True)

@@ -12,9 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from cluster.champion import Champion
+from evolution.policy import PolicySpec
+from evolution.rollout import Limits, trajectory
 from gridsim.render import Renderer, between
 from gridsim.scenarios import Scenario
-from gridsim.simulator import DISTANCE, SPEED, End, Simulator, X, Y
+from gridsim.simulator import DISTANCE, SPEED, End, X, Y, views
+from gridsim.traffic import LANE
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, FPS, SECONDS = (640, 360), 15, 60.0  # of champion.mp4, which a run waits for: a few seconds of one core
@@ -50,27 +53,30 @@ class Recording:
         return (len(self.cars) - 1) * self.period
 
 
-def record(champion: Champion, scenario: Scenario, start: np.ndarray, seconds: float) -> Recording:
-    """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for so many seconds."""
-    sim = champion.sim
-    simulator = Simulator([scenario], 1, sim)
-    ranges, speeds = simulator.reset(np.asarray(start, dtype=np.float32)[None])
-    cars, views = [simulator.state.cars[0].copy()], [ranges[0]]
-    end = End.RUNNING
-    observation = np.empty(ranges.shape[1] + 1, dtype=np.float32)
-    for _ in range(round(seconds / sim.episode.control_period)):
-        observation[:-1], observation[-1] = ranges[0] / sim.sensors.range, speeds[0] / sim.vehicle.speed_limit
-        action = champion.act(observation)
-        if action < 0:  # the network gives no number
-            break
-        ranges, speeds, _, ends = simulator.step(np.array([action]))
-        cars.append(simulator.state.cars[0].copy())
-        views.append(ranges[0])
-        end = End(ends[0])
-        if end != End.RUNNING:
-            break
-    boxes = np.zeros((len(cars), 0, 4), dtype=np.float32)
-    return Recording(scenario, np.array(cars), np.array(views), boxes, end, sim.episode.control_period)
+def record(
+    champion: Champion, scenario: Scenario, start: np.ndarray, seconds: float, world: np.ndarray | None = None
+) -> Recording:
+    """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for so many seconds.
+
+    Args: world float32 [others, traffic.FIELDS], the traffic at the start.
+    """
+    episode = champion.sim.episode
+    steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
+    result, cars, worlds = trajectory(
+        PolicySpec.parse(champion.policy), champion.genome, scenario, np.asarray(start, dtype=np.float32),
+        Limits(episode.target, steps), champion.sim, world,
+    )  # fmt: skip
+    end = End(int(result["end"]))
+    if end == End.TIME and steps < round(episode.time_limit / episode.control_period):
+        end = End.RUNNING
+    return Recording(
+        scenario, cars, views(scenario, cars, worlds, champion.sim), others(worlds), end, episode.control_period
+    )
+
+
+def others(worlds: np.ndarray) -> np.ndarray:
+    """The other cars' x, y (m) and heading (cosine, sine) [steps, others, 4] of traffic [steps, others, FIELDS]."""
+    return worlds[:, (worlds[:, :, LANE] >= 0.0).all(axis=0), :4]
 
 
 def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "") -> np.ndarray:
@@ -105,9 +111,10 @@ def champion_video(
     path: str | os.PathLike[str],
     title: str,
     on_progress: Callable[[str, int, int], None] | None = None,
+    world: np.ndarray | None = None,
 ) -> Recording:
-    """Film the first SECONDS of a champion's drive from `start` float32 [5]. Raises VideoError with one line."""
-    drive = record(champion, scenario, start, SECONDS)
+    """Film the first SECONDS of a champion's drive, which begins as `record`'s. Raises VideoError with one line."""
+    drive = record(champion, scenario, start, SECONDS, world)
     renderer = Renderer(scenario, SIZE, config=champion.sim)
     total = max(1, round(drive.seconds * FPS))
 

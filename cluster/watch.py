@@ -21,13 +21,15 @@ from cluster.champion import Champion, load_champion
 from cluster.checkpoint import CheckpointError
 from cluster.cli import INTERRUPTED, UsageError, fail, parse
 from cluster.run import CHAMPION, CHECKPOINT, CONFIG, ELITES, RunError, read_config
-from cluster.video import SUFFIXES, Recording, VideoError, frames, picture, record, write_video
+from cluster.settings import MAX_TRAFFIC
+from cluster.video import SUFFIXES, Recording, VideoError, frames, others, picture, record, write_video
 from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.drive import DriveError, Recorder, drive, read_drive, replay
 from gridsim.render import NoDisplayError, Renderer, Window
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build, sample_starts
+from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, check_name, default_traffic, label, sample_starts
 from gridsim.simulator import End
+from gridsim.traffic import spawn
 
 FILM_S = 60.0  # s of a film, unless told
 FOLLOW_S = 10.0  # s that an elite is watched before a newer one may take its place
@@ -51,6 +53,8 @@ class WatchFlags:
     """Watch the newest elite, while the run is still going."""
     scenario: str = ""
     """Road to drive on; by default the one it learned on."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
     seed: int = HELD_OUT_SEED
     """Seed of the first map and of the starts; those of held-out maps begin at 2,000,000."""
     seconds: float = 0.0
@@ -70,7 +74,9 @@ class DriveFlags:
     """
 
     scenario: str = "seamless"
-    """Road to drive on."""
+    """Road to drive on: its name, or a map's file."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as the scenario has by default."""
     record: str = ""
     """Keep the drive in this new CSV file."""
     seed: int = 0
@@ -79,6 +85,15 @@ class DriveFlags:
     """End after so many seconds of driving; 0: when the window is closed."""
     size: str = "960x640"
     """Width x height of the window, in pixels."""
+
+
+@contextlib.contextmanager
+def _as_usage_error() -> Iterator[None]:
+    """What is wrong with a map or its name is the user's to put right."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -97,12 +112,17 @@ def _seconds(value: float) -> float:
     return value
 
 
+def _traffic(value: int, default: int) -> int:
+    """Raises UsageError for a number of cars that is none."""
+    if not -1 <= value <= MAX_TRAFFIC:
+        raise UsageError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {value}")
+    return default if value == -1 else value
+
+
 def _map(name: str, seed: int, config: SimConfig) -> tuple[Scenario, np.ndarray]:
     """A map and a start float32 [5] on it, both of this seed. Raises UsageError."""
-    try:
+    with _as_usage_error():
         scenario = build(name, seed, config)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
     return scenario, sample_starts(scenario, 1, np.random.default_rng(np.random.SeedSequence([seed, 7])))[0]
 
 
@@ -144,7 +164,8 @@ class Elites:
         number = len(genomes) - 1 if generation is None else generation
         if not 0 <= number < len(genomes):
             raise UsageError(f"--generation {number}: the run has generations 0 to {len(genomes) - 1}")
-        champion = Champion(genomes[number], self.settings.policy, self.settings.scenario, SimConfig())
+        settings = self.settings
+        champion = Champion(genomes[number], settings.policy, settings.scenario, SimConfig(), settings.traffic)
         return champion, f"elite of generation {number}"
 
 
@@ -188,22 +209,25 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
         champion, name = driver()
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, flags.seed + k, champion.sim)
-        yield record(champion, scenario, start, seconds), f"{name}    {road}, map {scenario.seed:,}"
+        traffic = _traffic(flags.traffic, champion.traffic if road == champion.scenario else default_traffic(road))
+        world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim.traffic)[0]
+        drive = record(champion, scenario, start, seconds, world)
+        yield drive, f"{name}    {label(road)}, map {scenario.seed:,}"
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     """The episodes of a recorded drive."""
-    if flags.generation is not None or flags.follow or flags.scenario:
-        raise UsageError("a recorded drive has its own driver and road; leave out --generation, --follow, --scenario")
+    if flags.generation is not None or flags.follow or flags.scenario or flags.traffic != -1:
+        raise UsageError("a recorded drive has its own driver and road; leave out all but --output and how it looks")
     kept = read_drive(flags.source)
     config = SimConfig()
     scenario, _ = _map(kept.scenario, kept.map_seed, config)
-    _, cars, ranges = replay(kept, scenario, config)
+    _, cars, ranges, worlds = replay(kept, scenario, config)
+    boxes = others(worlds)
     for episode in range(int(kept.episodes[-1]) + 1):
         own = kept.episodes == episode
-        boxes = np.zeros((int(own.sum()), 0, 4), dtype=np.float32)
-        drive = Recording(scenario, cars[own], ranges[own], boxes, End.RUNNING, config.episode.control_period)
-        yield drive, f"{Path(flags.source).name}    {scenario.name}, map {scenario.seed:,}"
+        drive = Recording(scenario, cars[own], ranges[own], boxes[own], End.RUNNING, config.episode.control_period)
+        yield drive, f"{Path(flags.source).name}    {label(scenario.name)}, map {scenario.seed:,}"
 
 
 def _film(flags: WatchFlags, console: Console) -> str:
@@ -274,8 +298,10 @@ def watch_main() -> None:
         try:
             if not 0 <= flags.fps <= 120:
                 raise UsageError(f"--fps must be 1 to 120, not {flags.fps}")
-            if flags.scenario and flags.scenario not in REGISTRY:
-                raise UsageError(f"unknown scenario {flags.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+            _traffic(flags.traffic, 0)
+            if flags.scenario:
+                with _as_usage_error():
+                    check_name(flags.scenario)
             if flags.output:
                 console = Console()
                 console.print(_film(flags, console), soft_wrap=True)
@@ -305,11 +331,14 @@ def drive_main() -> None:
             size, seconds = _size(flags.size), _seconds(flags.seconds) or math.inf
             config = SimConfig()
             scenario, start = _map(flags.scenario, flags.seed, config)
+            traffic = _traffic(flags.traffic, default_traffic(flags.scenario))
             with contextlib.ExitStack() as stack:
                 window = stack.enter_context(Window(size, f"GridSim: {flags.scenario}"))
                 if flags.record:
-                    recorder = stack.enter_context(Recorder(flags.record, scenario, config.episode.control_period))
-                done = drive(scenario, start, window, Renderer(scenario, size), recorder, config, seconds)
+                    period = config.episode.control_period
+                    recorder = stack.enter_context(Recorder(flags.record, scenario, period, traffic))
+                view = Renderer(scenario, size)
+                done = drive(scenario, start, window, view, recorder, config, seconds, traffic)
             print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
         except NoDisplayError as error:
             fail(prog, str(error))

@@ -19,15 +19,17 @@ import numpy as np
 
 from gridsim.config import SimConfig
 from gridsim.render import Renderer, Window, between
-from gridsim.scenarios import REGISTRY, Scenario
+from gridsim.scenarios import Scenario, check_name
 from gridsim.simulator import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, Simulator, X, Y
+from gridsim.traffic import LANE
 from gridsim.vehicle import Action
 
 COLUMNS = (
-    "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "scenario", "map_seed",
+    "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "traffic",
+    "scenario", "map_seed",
 )  # fmt: skip
 """Time since the episode's start, pose, speed, steering and action (`vehicle.Action`); then which episode of the file
-(a restart begins the next one), and the map."""
+(a restart begins the next one), how many other cars there were, and the map."""
 MAX_BYTES = 1 << 28  # of a file that is read
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which down means reverse and no longer brake
@@ -48,6 +50,7 @@ class Drive:
     Attributes:
         scenario: the map's name in the registry.
         map_seed: the seed it is built from.
+        traffic: other cars there were; map and episode say where they began.
         episodes: int64 [n], 0 first; each begins where its first row says.
         times: float64 [n], s since the episode's start.
         poses: float32 [n, 5]: x, y (m), heading (rad), speed (m/s), steering (rad) before each step.
@@ -56,6 +59,7 @@ class Drive:
 
     scenario: str
     map_seed: int
+    traffic: int
     episodes: np.ndarray
     times: np.ndarray
     poses: np.ndarray
@@ -71,9 +75,14 @@ def unhurried(config: SimConfig | None = None) -> SimConfig:
     return dataclasses.replace(config, episode=dataclasses.replace(config.episode, patience=_ENDLESS))
 
 
-def _simulator(scenario: Scenario, config: SimConfig | None) -> Simulator:
-    """One car, whose episode ends with a collision and with nothing else."""
-    return Simulator([scenario], 1, unhurried(config), target=math.inf, max_steps=_ENDLESS)
+def _simulator(scenario: Scenario, config: SimConfig | None, traffic: int) -> Simulator:
+    """One car among so many others, whose episode ends with a collision and with nothing else."""
+    return Simulator([scenario], 1, unhurried(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
+
+
+def _key(scenario: Scenario, episode: int) -> int:
+    """What the traffic of an episode is spawned from."""
+    return int(np.random.SeedSequence([scenario.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
 
 
 def pose(car: np.ndarray) -> np.ndarray:
@@ -102,9 +111,9 @@ def action_for(keys: set[str], speed: float) -> Action:
 class Recorder:
     """Writes a drive to a new file, row by row, so that whatever ends it, what was driven is there."""
 
-    def __init__(self, path: str | os.PathLike[str], scenario: Scenario, period: float):
+    def __init__(self, path: str | os.PathLike[str], scenario: Scenario, period: float, traffic: int = 0):
         """Make the file. Raises: DriveError with one line if it is there already or cannot be made."""
-        self._map = (scenario.name, scenario.seed)
+        self._map = (traffic, scenario.name, scenario.seed)
         self._period = period
         self.path, self.rows = Path(path), 0
         try:
@@ -158,7 +167,7 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
     numbers, actions, episodes = [], [], []
     line = 1
     try:
-        name, map_seed = rows[1][-2:] if len(rows[1]) == len(COLUMNS) else ("", "0")
+        cars, name, map_seed = rows[1][-3:] if len(rows[1]) == len(COLUMNS) else ("0", "", "0")
         for row in rows[1:]:
             line += 1
             numbers.append(_numbers(row))
@@ -169,15 +178,15 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
                 raise ValueError(f"episode {episodes[-1]} does not follow the one before")
             if (numbers[-1][0] <= numbers[-2][0]) if follows == 0 else (numbers[-1][0] != 0.0):
                 raise ValueError(f"time_s {row[0]} does not follow the time before")
-            if row[-2:] != [name, map_seed]:
-                raise ValueError("scenario and map_seed must be the same in all rows")
-        if name not in REGISTRY:
-            raise ValueError(f"unknown scenario {name[:40]!r}; there are: {', '.join(sorted(REGISTRY))}")
-        seed = _whole(rows[1], 9, (1 << 63) - 1)
+            if row[-3:] != [cars, name, map_seed]:
+                raise ValueError("traffic, scenario and map_seed must be the same in all rows")
+        check_name(name[:1000])
+        traffic, seed = _whole(rows[1], 8, 1000), _whole(rows[1], 10, (1 << 63) - 1)
     except ValueError as error:
         raise DriveError(f"{path}, line {line}: {error}") from error
     table = np.array(numbers, dtype=np.float64)
-    return Drive(name, seed, np.array(episodes), table[:, 0].copy(), table[:, 1:].astype(np.float32), np.array(actions))
+    poses = table[:, 1:].astype(np.float32)
+    return Drive(name, seed, traffic, np.array(episodes), table[:, 0].copy(), poses, np.array(actions))
 
 
 def _numbers(row: Sequence[str]) -> list[float]:
@@ -207,24 +216,26 @@ def _whole(row: Sequence[str], column: int, most: int) -> int:
 def replay(drive: Drive, scenario: Scenario, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
     """Drive a recorded drive again, by its actions alone.
 
-    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m).
+    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
+    traffic float32 [n, others, traffic.FIELDS]).
     Raises: DriveError with one line if an episode has a collision before its end: map and drive do not belong together.
     """
-    simulator = _simulator(scenario, config)
+    simulator = _simulator(scenario, config, drive.traffic)
     n, rays = len(drive), simulator.config.sensors.rays
     poses, cars = np.empty((n, 5), np.float32), np.empty((n, FIELDS), np.float32)
     views = np.empty((n, rays), np.float32)
+    worlds = np.empty((n, *simulator.state.worlds.shape[1:]), np.float32)
     for k in range(n):
         if k == 0 or drive.episodes[k] != drive.episodes[k - 1]:
-            ranges, _ = simulator.reset(drive.poses[k : k + 1])
+            ranges, _ = simulator.reset(drive.poses[k : k + 1], keys=_key(scenario, int(drive.episodes[k])))
             poses[k] = drive.poses[k]
         else:
             ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
             poses[k] = pose(simulator.state.cars[0])
             if ends[0] != End.RUNNING:
                 raise DriveError(f"replayed, the drive ends at row {k} of {n}: it was driven on another map")
-        cars[k], views[k] = simulator.state.cars[0], ranges[0]
-    return poses, cars, views
+        cars[k], views[k], worlds[k] = simulator.state.cars[0], ranges[0], simulator.state.worlds[0]
+    return poses, cars, views, worlds
 
 
 # ---------------------------------------------------------------------------------------------------------- driving
@@ -238,6 +249,7 @@ def drive(
     recorder: Recorder | None = None,
     config: SimConfig | None = None,
     seconds: float = math.inf,
+    traffic: int = 0,
 ) -> dict[str, float]:
     """Let a person drive at true speed until the window is closed, or for so many seconds of simulated time.
 
@@ -245,13 +257,13 @@ def drive(
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
     Raises: DriveError with one line if the recording cannot be written.
     """
-    simulator = _simulator(scenario, config)
+    simulator = _simulator(scenario, config, traffic)
     period = simulator.config.episode.control_period
     pictures = max(1, round(period * FPS))
     start = np.asarray(start, dtype=np.float32)
     title = f"{scenario.name}, map {scenario.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
-    ranges, _ = simulator.reset(start[None])
+    ranges, _ = simulator.reset(start[None], keys=_key(scenario, 0))
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
@@ -260,9 +272,10 @@ def drive(
         if "r" in pressed:
             if simulator.state.cars[0, STEPS] > 0:
                 episode += 1
-            ranges, _ = simulator.reset(start[None])
+            ranges, _ = simulator.reset(start[None], keys=_key(scenario, episode))
             path = [start[:2].copy()]
         before, view = simulator.state.cars[0].copy(), ranges[0]
+        there = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
         ended = simulator.state.ends[0] != End.RUNNING
         if not ended:
             step = int(before[STEPS])
@@ -272,6 +285,7 @@ def drive(
             ranges, _, _, _ = simulator.step(np.array([int(action)]))
             steps += 1
         after = simulator.state.cars[0]
+        then = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
         best = max(best, float(after[DISTANCE]))
         for k in range(1, pictures + 1):
             part = k / pictures
@@ -281,7 +295,8 @@ def drive(
                 text += "    collision: R restarts"
             trace = np.array([*path, car[[X, Y]]])
             image = renderer.draw(
-                car, ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title)
-            )
+                car, boxes=between(there, then, part, scenario) if len(then) else None,
+                ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title),
+            )  # fmt: skip
             window.show(image, pictures / period)
         path.append(after[[X, Y]].copy())

@@ -60,7 +60,7 @@ _TIME = int(End.TIME)  # a plain number: comparing arrays with an IntEnum is slo
 
 @njit
 def _draw(keys, episodes, which, numbers, drawn):
-    """For each of cars `which` [k] and its episode: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
+    """For cars `which` [k] in their episodes: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
     for k in range(which.shape[0]):
         i = which[k]
         episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)

@@ -83,7 +83,7 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
     assert (drive.scenario, drive.map_seed, len(drive)) == ("seamless", 11, len(poses))
     assert set(drive.episodes.tolist()) == {0, 1}
     assert drive.poses.tobytes() == poses.tobytes()  # nine digits lose nothing
-    again, cars, ranges = replay(drive, build(drive.scenario, drive.map_seed))
+    again, cars, ranges, _ = replay(drive, build(drive.scenario, drive.map_seed))
     assert again.tobytes() == poses.tobytes()
     assert np.ptp(again[:, 0]) > 1.0
     assert (len(cars), len(ranges)) == (len(poses), len(poses))
@@ -262,7 +262,7 @@ def test_real_keys_drive_a_real_window(display, tmp_path):
     assert drive.episodes[-1] == 1  # R began anew, where the first one began
     assert drive.poses[drive.episodes == 1][0].tobytes() == drive.poses[0].tobytes()
     assert took > 2.7  # 30 steps of 0.1 s at true speed (a slow machine may take longer)
-    again, _, _ = replay(drive, build("seamless", 11))
+    again, *_ = replay(drive, build("seamless", 11))
     assert again.tobytes() == drive.poses.tobytes()
 
 
