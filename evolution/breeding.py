@@ -23,7 +23,6 @@ MAX_PARENTS = 65_535
 
 _F, _U = np.float32, np.uint64
 _UNIT24 = _F(1.0 / (1 << 24))
-NOISE = _F(0.5)  # of a new convolutional network's weights: its standard deviation's share
 
 
 @dataclass(frozen=True)
@@ -79,61 +78,10 @@ def _fresh(genome, layers, stream, scale):
 
 
 @njit
-def _fresh_views(genome, views, scales, stream, scale):
-    """A new genome of a convolutional network: as large as genes are by nature, and mostly smooth in the plane.
-
-    A unit's weights for one plane and channel are (a + b u)(c + d v) with normal products and u, v in (-1, 1) over the
-    columns and rows, so that a new unit tells left from right and near from far, and some noise.
-    """
+def _fresh_scaled(genome, scales, stream, scale):
+    """A new genome of a convolutional network: normal, and as large as its genes are by nature."""
     for i in range(genome.shape[0]):
         genome[i] = scale * scales[i] * normal(mix(stream + _U(i + 1) * GOLDEN))
-    draw = mix(stream + GOLDEN)
-    at = 0
-    for k in range(views.shape[0]):
-        planes, rows, columns, channels = views[k, 0], views[k, 1], views[k, 2], views[k, 3]
-        units = views[k, 5]
-        # The mean of (1 + u^2) (1 + v^2), so that the whole has the variance that it should.
-        mean = (_F(4.0) - _F(1.0) / _F(rows * rows)) * (_F(4.0) - _F(1.0) / _F(columns * columns)) / _F(9.0)
-        spread = scale * scales[at] * _F(math.sqrt((_F(1.0) - NOISE * NOISE) / mean))
-        if rows > 1:
-            for plane in range(planes):
-                for channel in range(channels):
-                    for unit in range(units):
-                        draw += GOLDEN * _U(4)
-                        level, across = normal(mix(draw)), normal(mix(draw + GOLDEN))
-                        along, both = normal(mix(draw + GOLDEN * _U(2))), normal(mix(draw + GOLDEN * _U(3)))
-                        for row in range(rows):
-                            v = _F(2 * row + 1) / _F(rows) - _F(1.0)
-                            for column in range(columns):
-                                u = _F(2 * column + 1) / _F(columns) - _F(1.0)
-                                i = at + (((plane * rows + row) * columns + column) * channels + channel) * units + unit
-                                genome[i] = NOISE * genome[i] + spread * (level + across * u + (along + both * u) * v)
-        at += (planes * rows * columns * channels + views[k, 4] + 1) * units
-
-
-@njit
-def _bump_view(genome, views, scales, bits, sigma):
-    """Change one unit's view: a Gaussian bump somewhere in the plane, of its own height in each plane and channel."""
-    k = int((mix(bits) >> _U(33)) % _U(views.shape[0] - 1))
-    at = 0
-    for before in range(k):
-        inputs = views[before, 0] * views[before, 1] * views[before, 2] * views[before, 3] + views[before, 4]
-        at += (inputs + 1) * views[before, 5]
-    planes, rows, columns, channels, units = views[k, 0], views[k, 1], views[k, 2], views[k, 3], views[k, 5]
-    unit = int((mix(bits + _U(1)) >> _U(33)) % _U(units))
-    centre_row = uniform(mix(bits + _U(2))) * _F(rows - 1)
-    centre_column = uniform(mix(bits + _U(3))) * _F(columns - 1)
-    width = _F(0.7) + (_F(0.5) * _F(rows) - _F(0.7)) * uniform(mix(bits + _U(4)))
-    slope = _F(-0.5) / (width * width)
-    for plane in range(planes):
-        for channel in range(channels):
-            height = sigma * scales[at] * normal(mix(bits + GOLDEN * _U(plane * channels + channel + 5)))
-            for row in range(rows):
-                y = _F(row) - centre_row
-                for column in range(columns):
-                    x = _F(column) - centre_column
-                    i = at + (((plane * rows + row) * columns + column) * channels + channel) * units + unit
-                    genome[i] += height * math.exp((x * x + y * y) * slope)
 
 
 @njit
@@ -147,9 +95,8 @@ def _cross(a, b, stream, threshold, child, marked):
 
 
 @njit(nogil=True)
-def _breed(parents, recipes, key, layers, scales, views, rate, sigma, bump_rate, bump_width, scale, children):
-    """Children of recipes; scales [genes] are `policy.gene_scales`, views [layers, 6] `PolicySpec.views`."""
-    rays = views.shape[0] == 0
+def _breed(parents, recipes, key, layers, scales, rays, rate, sigma, bump_rate, bump_width, scale, children):
+    """Children of recipes; scales [genes] are `policy.gene_scales`, `rays` is whether the first layer sees rays."""
     genes = children.shape[1]
     threshold = _U(rate * _F(1 << 24))
     marked = np.empty(genes, dtype=np.uint8)
@@ -162,7 +109,7 @@ def _breed(parents, recipes, key, layers, scales, views, rate, sigma, bump_rate,
             if rays:
                 _fresh(child, layers, stream, scale)
             else:
-                _fresh_views(child, views, scales, stream, scale)
+                _fresh_scaled(child, scales, stream, scale)
             continue
         a, b = parents[recipe["a"]], parents[recipe["b"]]
         if recipe["seed"] == 0:
@@ -179,15 +126,11 @@ def _breed(parents, recipes, key, layers, scales, views, rate, sigma, bump_rate,
             i = chosen[k]
             child[i] += sigma * scales[i] * normal(mix(mix(stream + _U(i + 1) * GOLDEN)))
         bits = mix(stream + _U(genes + 1) * GOLDEN)
-        if uniform(bits) >= bump_rate:
-            continue
-        if rays:
+        if rays and uniform(bits) < bump_rate:
             unit = int((mix(bits) >> _U(33)) % _U(layers[1]))
             centre = uniform(mix(bits + _U(1))) * _F(layers[0] - 1)
             width = _F(0.7) + (bump_width - _F(0.7)) * uniform(mix(bits + _U(2)))
             _bump(child, layers[0], layers[1], unit, centre, width, sigma * normal(mix(bits + _U(3))))
-        else:
-            _bump_view(child, views, scales, mix(bits + GOLDEN), sigma)
 
 
 def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, mutation: Mutation) -> np.ndarray:
@@ -208,7 +151,7 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, 
         _U(key),
         spec.layers,
         gene_scales(spec),
-        spec.views,
+        spec.observation == "rays",
         _F(mutation.rate),
         _F(mutation.sigma),
         _F(mutation.bump_rate),

@@ -85,14 +85,6 @@ class PolicySpec(ABC):
         """(inputs of a unit, units) of each layer, the output's included."""
 
     @property
-    def views(self) -> np.ndarray:
-        """How the inputs of each layer's units lie in the plane: int32 [layers, 6].
-
-        Planes, rows, columns, channels; inputs beside these; units. Empty where inputs have no such order.
-        """
-        return freeze(np.zeros((0, 6), dtype=np.int32))
-
-    @property
     def size(self) -> int:
         """Genes of a genome."""
         return sum((n + 1) * m for n, m in self.shapes())
@@ -164,21 +156,6 @@ class CnnSpec(PolicySpec):
         """Frames, channels, channels, units, outputs: int32 [5]."""
         return freeze(np.array([self.frames, *self.hidden, self.outputs], dtype=np.int32))
 
-    @property
-    def views(self) -> np.ndarray:
-        first, second, dense = self.hidden
-        return freeze(
-            np.array(
-                [
-                    [self.frames, KERNEL_1, KERNEL_1, 1, 0, first],
-                    [1, KERNEL_2, KERNEL_2, first, 0, second],
-                    [1, SIDE_2, SIDE_2, second, 1, dense],
-                    [1, 1, 1, dense, 0, self.outputs],
-                ],
-                dtype=np.int32,
-            )
-        )
-
     def shapes(self) -> tuple[tuple[int, int], ...]:
         first, second, dense = self.hidden
         return (
@@ -200,11 +177,12 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
     """
     if spec.observation == "rays":
         return freeze(np.ones(spec.size, dtype=np.float32))
+    shapes = spec.shapes()
     parts = []
-    for k, (planes, rows, columns, channels, beside, units) in enumerate(spec.views.tolist()):
-        n = planes * rows * columns * channels
-        size = np.sqrt((2.0 if k < len(spec.views) - 1 else 1.0) / n)
-        parts += [np.full(n * units, size), np.ones(beside * units), np.full(units, size)]
+    for k, (n, m) in enumerate(shapes):
+        beside = 1 if k == len(shapes) - 2 else 0  # the speed
+        size = np.sqrt((2.0 if k < len(shapes) - 1 else 1.0) / (n - beside))
+        parts += [np.full((n - beside) * m, size), np.ones(beside * m), np.full(m, size)]
     return freeze(np.concatenate(parts).astype(np.float32))
 
 

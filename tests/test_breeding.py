@@ -177,29 +177,7 @@ def test_new_convolutional_genomes_are_as_large_as_genes_are():
     for first, last in itertools.pairwise(EDGES):
         assert scaled[:, first:last].mean() == pytest.approx(0.0, abs=0.05)
         assert scaled[:, first:last].std() == pytest.approx(1.0, abs=0.05)
-    # Biases and the speed's weights have no neighbours, and are normal.
-    tail = scaled[:, EDGES[3] - 2 * 16 : EDGES[3]]
-    assert stats.kstest(tail.ravel(), "norm").pvalue > 1e-3
-
-
-@pytest.mark.parametrize(
-    ("layer", "side", "channels", "units"), [(0, 8, 1, 8), (1, 4, 8, 8), (2, 8, 8, 16)]
-)  # fmt: skip
-def test_new_units_see_smoothly(layer, side, channels, units):
-    children = breed(np.zeros((0, CNN.size), dtype=F), many(FRESH, FRESH, 300), 1, CNN, Mutation()).astype(float)
-    weights = children[:, EDGES[layer] : EDGES[layer] + side * side * channels * units]
-    plane = weights.reshape(-1, side, side, channels * units)
-
-    def alike(a, b):
-        return np.corrcoef(a.ravel(), b.ravel())[0, 1]
-
-    middle = side // 2
-    near = alike(plane[:, middle, middle], plane[:, middle, middle - 1])
-    far = alike(plane[:, 0, 0], plane[:, -1, -1])
-    assert near > 0.5
-    assert abs(far) < 0.3
-    others = alike(plane[:, middle, middle, 0], plane[:, middle, middle, 1])  # of another unit
-    assert abs(others) < 0.2
+    assert stats.kstest(scaled[:, ::20].ravel(), "norm").pvalue > 1e-3
 
 
 @pytest.mark.parametrize("sigma", [0.5, 2.0])
@@ -212,25 +190,9 @@ def test_a_mutation_is_as_large_as_its_gene(sigma):
     assert stats.kstest(noise[:20_000] / sigma, "norm").pvalue > 1e-3
 
 
-def test_a_bump_changes_one_units_view():
+def test_bumps_are_for_rays_alone():
     zero = np.zeros((1, CNN.size), dtype=F)
-    children = breed(zero, many(0, 0, 2000), 8, CNN, Mutation(rate=0.0, sigma=0.5, bump_rate=0.3)).astype(float)
-    bumped = children[(children != 0).any(axis=1)]
-    assert len(bumped) / 2000 == pytest.approx(0.3, abs=0.05)
-    seen = set()
-    for child in bumped:
-        genes = np.flatnonzero(child)
-        layer = int(np.searchsorted(EDGES, genes[0], side="right")) - 1
-        units = CNN.shapes()[layer][1]
-        at = genes - EDGES[layer]
-        assert genes[-1] < EDGES[layer + 1] - units  # no bias
-        assert len(set(at % units)) == 1
-        seen.add((layer, int(at[0] % units)))
-        side, channels = ((8, 1), (4, 8), (8, 8))[layer]
-        assert len(genes) <= side * side * channels
-        assert np.abs(child).max() < 0.5 * 5 * gene_scales(CNN)[genes[0]]
-    assert {layer for layer, _ in seen} == {0, 1, 2}
-    assert len(seen) == 8 + 8 + 16
+    assert (breed(zero, many(0, 0, 50), 8, CNN, Mutation(rate=0.0, bump_rate=1.0)) == 0.0).all()
 
 
 def test_convolutional_children_are_their_recipes():

@@ -223,8 +223,6 @@ def test_cnn_text_and_back(hidden, frames):
     assert PolicySpec.parse(str(spec)) == spec
     assert PolicySpec.parse(text.partition("@")[0]).layers[0] == 4
     assert spec.size == sum((n + 1) * m for n, m in spec.shapes())
-    views = spec.views.astype(int)
-    assert spec.size == sum((p * r * c * k + e + 1) * m for p, r, c, k, e, m in views)
 
 
 def test_genes_are_as_large_as_he_et_al_have_them():
