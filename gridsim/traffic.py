@@ -388,6 +388,11 @@ def _may_enter(network, drivers, world, i, ego):
     car = world[i]
     lane, beyond = _I(car[NEXT]), _I(car[AFTER])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
+    # Who enters must be able to leave, or junctions would block each other. Before another junction there is room for
+    # one, else for as many as the lane beyond holds.
+    chained = network.crossing_offsets[beyond + 1] > network.crossing_offsets[beyond]
+    place = _F(2.0) * drivers.half_length + drivers.jam
+    room, needed = max(_lane_length(network, beyond), place), place
     for j in range(world.shape[0]):
         if j == i or world[j, LANE] < _ZERO:
             continue
@@ -402,9 +407,24 @@ def _may_enter(network, drivers, world, i, ego):
                 network.clear[c] + _HALF
             ):
                 return False
-        room = _F(3.0) * drivers.half_length + drivers.jam
-        if there == beyond and world[j, ALONG] < room and world[j, SPEED] < _F(2.0):
-            return False
+        if there == _I(car[LANE]) and world[j, ALONG] > car[ALONG] and permit != _I(world[j, NEXT]):
+            return False  # who is in front of this one waits for others, who must not wait for this one
+        if chained:
+            if there == lane or permit == lane:
+                return False
+            for k in range(network.successors.shape[1]):
+                if there == network.successors[lane, k] and world[j, SPEED] < _F(2.0):
+                    if world[j, ALONG] < place + drivers.half_length:
+                        return False
+        elif there == beyond:
+            rear = world[j, ALONG] - drivers.half_length
+            room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
+        elif permit >= 0 and _I(world[j, AFTER]) == beyond:
+            needed += place
+        elif _I(world[j, NEXT]) == beyond and network.crossing_offsets[there + 1] > network.crossing_offsets[there]:
+            needed += place
+    if not chained and room < needed:
+        return False
     # The ego car goes first, unless it is behind this one.
     if ego[COS] == _ZERO and ego[SIN] == _ZERO:
         return True
