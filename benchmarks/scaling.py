@@ -119,7 +119,7 @@ def last_generations(
 
 def children_per_s(maps: Maps) -> float:
     """Members a second that the coordinator selects, writes recipes for, sends and collects."""
-    spec, sim = PolicySpec(), SimConfig()
+    spec, sim = PolicySpec.parse("mlp:6,7"), SimConfig()
     genetic = Genetic(spec, GeneticConfig(population=CHILDREN), 0)
     pool = RayPool(2, maps.build, worker_factory=InstantWorker)
     rng = np.random.default_rng(0)

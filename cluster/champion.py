@@ -19,12 +19,13 @@ from cluster import checkpoint
 from cluster.checkpoint import CheckpointError
 from cluster.coordinator import Maps, summarise
 from cluster.settings import MAX_TRAFFIC
+from evolution import convnet
 from evolution.curriculum import HELD_OUT_MAPS, spread_starts
-from evolution.policy import PolicySpec, act_on
+from evolution.policy import CnnSpec, Observation, PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY
+from gridsim.scenarios import HELD_OUT_SEED, check_name, default_traffic
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,26 @@ class Champion:
         """Of the genome's bytes."""
         return hashlib.sha256(self.genome.tobytes()).hexdigest()
 
-    def act(self, observation: np.ndarray) -> int | np.ndarray:
-        """The action for an observation [32] of the environment, or actions [n] for [n, 32]."""
+    @property
+    def observation(self) -> Observation:
+        """What it sees: rays or grid."""
+        return PolicySpec.parse(self.policy).observation
+
+    def act(self, observation: np.ndarray, speed: float | np.ndarray | None = None) -> int | np.ndarray:
+        """The action for an observation, or actions [n] for n of them.
+
+        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed. Of the grid, what
+        `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which a grid does not show:
+        the environment's `info["speed_mps"]`.
+        Raises: ValueError with one line for an observation that this champion does not see.
+        """
+        spec = PolicySpec.parse(self.policy)
+        if isinstance(spec, CnnSpec):
+            if speed is None:
+                raise ValueError(f'{spec} needs the speed beside the grid: act(observation, info["speed_mps"])')
+            return convnet.act_on(spec, self.genome, observation, speed)
         return act_on(
-            PolicySpec.parse(self.policy),
+            spec,
             self.genome,
             observation,
             self.sim.sensors.range,
@@ -115,8 +132,7 @@ def evaluate(
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
     name = scenario or champion.scenario
-    if name not in REGISTRY:
-        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    check_name(name)
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
     if traffic is not None and not 0 <= traffic <= MAX_TRAFFIC:
@@ -124,7 +140,7 @@ def evaluate(
     maps = Maps(name, champion.sim)
     try:
         if traffic is None:
-            traffic = champion.traffic if name == champion.scenario else REGISTRY[name].traffic
+            traffic = champion.traffic if name == champion.scenario else default_traffic(name)
         held_out = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)
         episode = champion.sim.episode
         limits = Limits(episode.target, round(episode.time_limit / episode.control_period))

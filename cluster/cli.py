@@ -19,6 +19,7 @@ import tyro
 from rich.console import Console
 
 from cluster.settings import EvolveSettings, SettingsError
+from gridsim.scenarios import is_map_file
 
 if TYPE_CHECKING:
     from cluster.coordinator import Maps
@@ -192,6 +193,7 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
     from cluster import run as runs
     from cluster.champion import load_champion
     from cluster.checkpoint import CheckpointError
+    from evolution.policy import PolicySpec
 
     prog = "gridsim-evolve"
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
@@ -212,6 +214,9 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
         flags = parse(EvolveFlags, prog, arguments, base)
+    if flags.traffic and is_map_file(flags.scenario):
+        print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
+        flags = dataclasses.replace(flags, traffic=0)
     if not 0 <= flags.workers <= MAX_WORKERS:
         raise UsageError(f"--workers must be 0 to {MAX_WORKERS:,}, not {flags.workers}")
     if flags.workers == 0 and flags.address:
@@ -240,7 +245,7 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
             champion = load_champion(flags.init)
         except CheckpointError as error:
             raise UsageError(f"--init {error}") from error
-        if champion.policy != settings.policy:
+        if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
             raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
         digest = champion.sha256
     try:
@@ -347,7 +352,7 @@ def _run(
         session.on_row = shown.row
         session.evolution.on_progress = shown.members
         session.evolve()
-        shown.note("measuring the champion on held-out roads")
+        shown.note("measuring and filming the champion on held-out roads")
         summary = session.finish(flags.workers)
         shown.note("logging to MLflow")
         if not summary["mlflow_run_id"]:
@@ -355,12 +360,14 @@ def _run(
                 summary["mlflow_run_id"] = tracker.wait_ready(30.0)
         session.write_summary(summary)
         tracker.log_artifacts(run.path)
+    if session.lost:
+        print(f"gridsim-evolve: warning: {session.lost}", file=sys.stderr)
     console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))
     found = "solved" if summary["solved"] else "the best so far"
     return (
         f"{found} after {summary['generations']} generations, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
         f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
-        f"look at it: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
+        f"watch it: gridsim-watch {_shown(run.path)}\ncompare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
     )
 
 

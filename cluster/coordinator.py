@@ -29,7 +29,7 @@ from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, targets
 from gridsim.config import SimConfig
-from gridsim.scenarios import HELD_OUT_SEED, Scenario, build
+from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, map_of
 from gridsim.simulator import End
 
 COLUMNS = (
@@ -171,7 +171,7 @@ class Evolution:
             mutation=self._mutation(),
             episodes=episodes.rows,
             worlds=episodes.worlds,
-            maps=tuple((self.settings.scenario, seed) for seed in episodes.maps),
+            maps=tuple((self.settings.scenario, map_of(self.settings.scenario, seed)) for seed in episodes.maps),
             limits=limits,
             config=self.sim,
             rewind=rewind,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 
 
-def _enter(name: str) -> None:
+def _enter(name: str, module: str = "cluster.cli") -> None:
     try:
-        from cluster import cli
+        commands = import_module(module)
     except KeyboardInterrupt:
         sys.exit(130)
-    getattr(cli, name)()
+    getattr(commands, name)()
 
 
 def evolve_main() -> None:
@@ -21,3 +22,13 @@ def evolve_main() -> None:
 def evaluate_main() -> None:
     """Run `gridsim-evaluate`."""
     _enter("evaluate_main")
+
+
+def watch_main() -> None:
+    """Run `gridsim-watch`."""
+    _enter("watch_main", "cluster.watch")
+
+
+def drive_main() -> None:
+    """Run `gridsim-drive`."""
+    _enter("drive_main", "cluster.watch")

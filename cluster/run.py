@@ -32,9 +32,11 @@ from cluster.settings import EvolveSettings, SettingsError, from_dict, to_dict
 from cluster.tracking import Tracker, git_commit
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
+from gridsim.maps import map_digest
+from gridsim.scenarios import Scenario, is_map_file, label
 
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
-HISTORY, ELITES, SUMMARY = "history.csv", "elites.npz", "summary.json"
+HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
 CONFIG_FORMAT = 1
 METRICS = tuple(name for name in COLUMNS if name not in ("target_m",))
 
@@ -52,6 +54,7 @@ class RunFolder:
         settings: what decides its champion.
         init: path of the champion it started from, or "".
         init_sha256: digest of that genome, or "".
+        map_sha256: digest of the map's file, or "".
         saved: arrays and meta of its checkpoint, where it is resumed.
         tracking_key: by which MLflow's run is found again, even if a process was killed before it knew the run's id.
     """
@@ -60,6 +63,7 @@ class RunFolder:
     settings: EvolveSettings
     init: str = ""
     init_sha256: str = ""
+    map_sha256: str = ""
     saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None
     tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)
 
@@ -78,6 +82,7 @@ class RunFolder:
             "simulator": dataclasses.asdict(SimConfig()),
             "init": self.init,
             "init_sha256": self.init_sha256,
+            **({"map_sha256": self.map_sha256} if self.map_sha256 else {}),
         }
 
     def digest(self) -> str:
@@ -101,7 +106,10 @@ def read_config(path: Path) -> tuple[EvolveSettings, str]:
         config = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(config, dict) or config.get("format") != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim")
-        return from_dict(dict(config["settings"])), str(config.get("init", ""))
+        settings = from_dict(dict(config["settings"]))
+        if config.get("map_sha256", "") != _map_sha256(settings):
+            raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
+        return settings, str(config.get("init", ""))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
     except SettingsError as error:
@@ -110,12 +118,20 @@ def read_config(path: Path) -> tuple[EvolveSettings, str]:
         raise RunError(f"{path}: not a run's {CONFIG}: {type(error).__name__}") from error
 
 
+def _map_sha256(settings: EvolveSettings) -> str:
+    """Digest of the map's file, or "". Raises SettingsError."""
+    try:
+        return map_digest(settings.scenario) if is_map_file(settings.scenario) else ""
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+
+
 def open_run(folder: Path) -> RunFolder:
     """A run's folder to be resumed, its checkpoint read and checked. Raises RunError."""
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
     settings, init = read_config(folder / CONFIG)
-    run = RunFolder(folder.resolve(), settings, init)
+    run = RunFolder(folder.resolve(), settings, init, map_sha256=_map_sha256(settings))
     if not (folder / CHECKPOINT).is_file():
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from; start it anew with --config {folder / CONFIG}")
     try:
@@ -134,7 +150,8 @@ def new_run(output: Path, name: str, settings: EvolveSettings, init: str = "", i
     if not name:
         stamp = time.strftime("%Y%m%d-%H%M%S")
         kind = "evolution" if settings.search == "evolution" else "random"
-        name = f"{settings.scenario}-{kind}-s{settings.seed}-{stamp}"
+        road = re.sub(r"[^\w.+=@-]", "_", label(settings.scenario))
+        name = f"{road}-{kind}-s{settings.seed}-{stamp}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
@@ -147,7 +164,7 @@ def new_run(output: Path, name: str, settings: EvolveSettings, init: str = "", i
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise RunError(f"--output {output}: cannot be written; choose another folder")
-    return RunFolder(path.absolute(), settings, init, init_sha256)
+    return RunFolder(path.absolute(), settings, init, init_sha256, _map_sha256(settings))
 
 
 def is_finished(run: RunFolder) -> bool:
@@ -174,6 +191,7 @@ class Session:
         tracker: who logs to MLflow.
         process_started: time.perf_counter() of the process's start.
         on_row: told each generation's number and row.
+        lost: one line about what could not be written, beside what matters.
     """
 
     run: RunFolder
@@ -184,6 +202,7 @@ class Session:
     initial: np.ndarray | None = None
     on_row: Callable[[int, dict[str, float]], None] | None = None
     on_progress: Callable[[str, int, int], None] | None = None
+    lost: str = ""
     evolution: Evolution = field(init=False)
 
     def __post_init__(self) -> None:
@@ -244,8 +263,9 @@ class Session:
         )  # fmt: skip
         report.trajectory(
             scenario, states, path / "trajectory.png",
-            f"{self.run.settings.scenario}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
+            f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
+        self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
         wall = evolution.wall_before_s + now() - self.process_started
         summary = {
             "name": self.run.name,
@@ -266,6 +286,19 @@ class Session:
         self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
         self.write_summary(summary)
         return summary
+
+    def _film(self, champion: Champion, scenario: Scenario, start: np.ndarray, world: np.ndarray) -> None:
+        """Write champion.mp4. A film is no reason to lose a run: why there is none is kept in `lost`."""
+        from cluster.video import VideoError, champion_video
+
+        try:
+            champion_video(
+                champion, scenario, start, self.run.path / VIDEO,
+                f"{champion.scenario}, held-out map {scenario.seed:,}", self.evolution.on_progress, world,
+            )  # fmt: skip
+        except VideoError as error:
+            (self.run.path / VIDEO).unlink(missing_ok=True)
+            self.lost = f"no {VIDEO}: {error}"
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Write summary.json, the mark of a finished run."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
-from evolution.policy import PolicySpec
-from gridsim.scenarios import REGISTRY
+from evolution.policy import Observation, PolicySpec
+from gridsim.scenarios import build, check_name, default_traffic, is_map_file
 
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
+DEFAULT_POLICY: dict[Observation, str] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
 
 
 class SettingsError(ValueError):
@@ -25,13 +27,16 @@ class EvolveSettings:
     """What an evolution run depends on: two runs with equal settings have the same champion."""
 
     scenario: str = "seamless"
-    """Road to learn to drive on."""
+    """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
     traffic: int = -1
-    """Other cars on the road; -1: as many as the scenario has by default."""
+    """Other cars on the road; -1: as many as the scenario has by default. A map from a file has no lanes for them."""
     seed: int = 0
     """Seed of every random number of the run."""
-    policy: str = "mlp:6,7"
-    """Network: mlp: and the sizes of its hidden layers."""
+    observation: Observation = "rays"
+    """What the network sees: 31 ranges, or the occupancy grid; and the speed."""
+    policy: str = ""
+    """Network: mlp: and the sizes of its hidden layers, by default mlp:6,7; on the grid cnn: with the channels of two
+    convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 120
@@ -60,8 +65,12 @@ class EvolveSettings:
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
     def __post_init__(self) -> None:
-        if self.traffic == -1 and self.scenario in REGISTRY:
-            object.__setattr__(self, "traffic", REGISTRY[self.scenario].traffic)
+        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
+            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
+        if self.traffic == -1:
+            object.__setattr__(self, "traffic", default_traffic(self.scenario))
+        if not self.policy:
+            object.__setattr__(self, "policy", DEFAULT_POLICY.get(self.observation, ""))
 
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run."""
@@ -69,10 +78,16 @@ class EvolveSettings:
 
     def check(self) -> None:
         """Raises SettingsError, one line that says what to change."""
-        if self.scenario not in REGISTRY:
-            raise SettingsError(f"unknown scenario {self.scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+        try:
+            check_name(self.scenario)
+            if is_map_file(self.scenario):
+                build(self.scenario, 0)  # kept, so that it is read once
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
         if not 0 <= self.traffic <= MAX_TRAFFIC:
             raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
+        if self.traffic and is_map_file(self.scenario):
+            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
         if not 0 <= self.seed < 1 << 63:
             raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
         if self.car_steps < 0:
@@ -89,10 +104,15 @@ class EvolveSettings:
         if not self.until > 0.0:
             raise SettingsError(f"--until must be above 0, not {self.until}")
         try:
-            PolicySpec.parse(self.policy)
+            spec = PolicySpec.parse(self.policy)
             GeneticConfig(self.population, self.elites, self.tournament, self.parents, self.crossover).check()
         except ValueError as error:
             raise SettingsError(str(error)) from error
+        if spec.observation != self.observation:
+            raise SettingsError(
+                f"policy {self.policy} sees the {spec.observation}; "
+                f"give --observation {spec.observation}, or a policy such as {DEFAULT_POLICY[self.observation]}"
+            )
 
 
 def to_dict(settings: EvolveSettings) -> dict[str, Any]:
@@ -116,5 +136,7 @@ def from_dict(values: dict[str, Any]) -> EvolveSettings:
     settings = EvolveSettings(**values)
     if settings.ranking not in ("scalar", "pareto") or settings.search not in ("evolution", "random"):
         raise SettingsError("ranking is scalar or pareto, search is evolution or random")
+    if settings.observation not in DEFAULT_POLICY:
+        raise SettingsError("observation is rays or grid")
     settings.check()
     return settings

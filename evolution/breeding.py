@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evolution.policy import PolicySpec
+from evolution.policy import PolicySpec, gene_scales
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.jit import njit
 from gridsim.roads import freeze
@@ -30,8 +30,10 @@ class Mutation:
     """How a child differs from its parents."""
 
     rate: float = 0.03  # share of genes that get Gaussian noise
-    sigma: float = 0.5  # its standard deviation
-    bump_rate: float = 0.3  # children of which one first-layer unit gets a smooth bump across neighbouring rays
+    sigma: float = 0.5  # its standard deviation, in units of `policy.gene_scales`
+    bump_rate: float = (
+        0.3  # children of which one first-layer unit gets a smooth bump across neighbouring rays; not cnn
+    )
     bump_width: float = 4.0  # rays, the bump's greatest standard deviation
     first_scale: float = 1.0  # scale of a new genome's weights
 
@@ -76,6 +78,13 @@ def _fresh(genome, layers, stream, scale):
 
 
 @njit
+def _fresh_scaled(genome, scales, stream, scale):
+    """A new genome of a convolutional network: normal, and as large as its genes are by nature."""
+    for i in range(genome.shape[0]):
+        genome[i] = scale * scales[i] * normal(mix(stream + _U(i + 1) * GOLDEN))
+
+
+@njit
 def _cross(a, b, stream, threshold, child, marked):
     """Uniform crossover, and which genes are to mutate: no branches, so that it becomes vector code."""
     for i in range(child.shape[0]):
@@ -86,7 +95,8 @@ def _cross(a, b, stream, threshold, child, marked):
 
 
 @njit(nogil=True)
-def _breed(parents, recipes, key, layers, rate, sigma, bump_rate, bump_width, scale, children):
+def _breed(parents, recipes, key, layers, scales, rays, rate, sigma, bump_rate, bump_width, scale, children):
+    """Children of recipes; scales [genes] are `policy.gene_scales`, `rays` is whether the first layer sees rays."""
     genes = children.shape[1]
     threshold = _U(rate * _F(1 << 24))
     marked = np.empty(genes, dtype=np.uint8)
@@ -96,7 +106,10 @@ def _breed(parents, recipes, key, layers, rate, sigma, bump_rate, bump_width, sc
         child = children[n]
         stream = mix(key ^ mix(_U(recipe["seed"]) + GOLDEN))
         if recipe["a"] == FRESH:
-            _fresh(child, layers, stream, scale)
+            if rays:
+                _fresh(child, layers, stream, scale)
+            else:
+                _fresh_scaled(child, scales, stream, scale)
             continue
         a, b = parents[recipe["a"]], parents[recipe["b"]]
         if recipe["seed"] == 0:
@@ -111,9 +124,9 @@ def _breed(parents, recipes, key, layers, rate, sigma, bump_rate, bump_width, sc
         # A loop of their own: under an `if` LLVM would compute a logarithm and a cosine for every gene (tenfold time).
         for k in range(count):
             i = chosen[k]
-            child[i] += sigma * normal(mix(mix(stream + _U(i + 1) * GOLDEN)))
+            child[i] += sigma * scales[i] * normal(mix(mix(stream + _U(i + 1) * GOLDEN)))
         bits = mix(stream + _U(genes + 1) * GOLDEN)
-        if uniform(bits) < bump_rate:
+        if rays and uniform(bits) < bump_rate:
             unit = int((mix(bits) >> _U(33)) % _U(layers[1]))
             centre = uniform(mix(bits + _U(1))) * _F(layers[0] - 1)
             width = _F(0.7) + (bump_width - _F(0.7)) * uniform(mix(bits + _U(2)))
@@ -137,6 +150,8 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, 
         freeze(recipes),
         _U(key),
         spec.layers,
+        gene_scales(spec),
+        spec.observation == "rays",
         _F(mutation.rate),
         _F(mutation.sigma),
         _F(mutation.bump_rate),

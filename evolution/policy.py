@@ -1,17 +1,23 @@
 """Networks: what a policy's text means, how a flat genome is laid out, and the forward pass.
 
 This is the one file that knows layer shapes. A genome is a flat float32 vector: for each layer the weights, input-major
-[inputs, outputs], then the biases [outputs].
+[inputs, outputs], then the biases [outputs]. The forward pass here is the perceptron's; `convnet` has the other one.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar, Literal
 
 import numpy as np
 
+from gridsim.grid import CELLS
 from gridsim.jit import leaf, njit
+from gridsim.roads import freeze
 
 INPUTS = 32  # 31 rays and the speed
 ACTIONS = 8
@@ -21,42 +27,163 @@ RAY_HALF = _F(8.0)  # m, the range whose input is 0
 SPEED_SCALE = _F(10.0)  # m/s, the speed whose input is 0
 
 
-@dataclass(frozen=True)
-class PolicySpec:
-    """A multi-layer perceptron: tanh hidden layers, a linear output, the greatest output acts."""
+Observation = Literal["rays", "grid"]
 
-    hidden: tuple[int, ...] = (6, 7)
-    inputs: int = INPUTS
+
+@dataclass(frozen=True)
+class PolicySpec(ABC):
+    """A network's shape. Two kinds: `MlpSpec` on the rays, `CnnSpec` on the occupancy grid.
+
+    Attributes:
+        hidden: units, or channels, of the hidden layers.
+        outputs: one for each action; the greatest acts.
+    """
+
+    observation: ClassVar[Observation]
+
+    hidden: tuple[int, ...]
     outputs: int = ACTIONS
 
-    @classmethod
-    def parse(cls, text: str) -> PolicySpec:
-        """Read `mlp:6,7`. Raises ValueError with one line for anything else."""
-        match = re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)", text)
-        if not match:
-            raise ValueError(f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7")
-        spec = cls(tuple(int(n) for n in match[1].split(",")))
-        if min(spec.hidden) < 1 or spec.size > MAX_GENES:
-            raise ValueError(
-                f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
-            )
-        return spec
+    @staticmethod
+    def parse(text: str) -> PolicySpec:
+        """Read `mlp:6,7` or `cnn:16,32,256@4`. Raises ValueError with one line for anything else."""
+        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)", text):
+            spec: PolicySpec = MlpSpec(tuple(int(n) for n in match[1].split(",")))
+            if min(spec.hidden) < 1 or spec.size > MAX_GENES:
+                raise ValueError(
+                    f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
+                )
+            return spec
+        if match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
+            hidden = tuple(int(n) for n in match.groups()[:3]) if match[1] else CnnSpec.hidden
+            spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
+            if any(n < LANES or n % LANES for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
+                raise ValueError(
+                    f"policy {text!r}: layers of a cnn have {LANES} units or a multiple of it, "
+                    f"and it sees 1 to {MAX_FRAMES} frames"
+                )
+            if spec.size > MAX_GENES:
+                raise ValueError(f"policy {text!r} has {spec.size:,} genes; {MAX_GENES:,} are the most")
+            return spec
+        raise ValueError(
+            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, "
+            "or cnn for the grid, as in cnn:8,16,32@1"
+        )
+
+    @property
+    @abstractmethod
+    def inputs(self) -> int:
+        """Numbers that the network sees."""
+
+    @property
+    @abstractmethod
+    def layers(self) -> np.ndarray:
+        """Sizes as the kernels read them, int32."""
+
+    @abstractmethod
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        """(inputs of a unit, units) of each layer, the output's included."""
+
+    @property
+    def size(self) -> int:
+        """Genes of a genome."""
+        return sum((n + 1) * m for n, m in self.shapes())
+
+
+@dataclass(frozen=True)
+class MlpSpec(PolicySpec):
+    """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts."""
+
+    observation = "rays"
+
+    hidden: tuple[int, ...] = (6, 7)
 
     def __str__(self) -> str:
         return "mlp:" + ",".join(map(str, self.hidden))
 
     @property
-    def layers(self) -> np.ndarray:
-        """Units of each layer, inputs and outputs included: int32 [layers + 1]."""
-        layers = np.array([self.inputs, *self.hidden, self.outputs], dtype=np.int32)
-        layers.setflags(write=False)
-        return layers
+    def inputs(self) -> int:
+        """The rays and the speed."""
+        return INPUTS
 
     @property
-    def size(self) -> int:
-        """Genes of a genome."""
-        layers = self.layers.astype(int)
-        return int(((layers[:-1] + 1) * layers[1:]).sum())
+    def layers(self) -> np.ndarray:
+        """Units of each layer, inputs and outputs included: int32 [layers + 1]."""
+        return freeze(np.array([self.inputs, *self.hidden, self.outputs], dtype=np.int32))
+
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        units = (self.inputs, *self.hidden, self.outputs)
+        return tuple(itertools.pairwise(units))
+
+
+# The convolutions of Mnih et al. (2015), which the paper's authors took over for their grid: kernels and strides.
+KERNEL_1, STRIDE_1 = 8, 4
+KERNEL_2, STRIDE_2 = 4, 2
+SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
+SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
+LANES = 8  # channels and units come in multiples of it, so that layers are whole vectors
+MAX_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class CnnSpec(PolicySpec):
+    """A convolutional network on the occupancy grid and the speed: ReLU hidden layers, the greatest output acts.
+
+    Two convolutions (8 x 8 with stride 4, 4 x 4 with stride 2), a dense layer that sees the speed beside the second
+    one's output, and the outputs. `cnn:16,32,256@4` names the channels of the convolutions, the units of the dense
+    layer, and the frames: grids of so many control steps in a row, the newest last. `cnn` alone is that network, which
+    but for the speed is the one of the paper's authors; without `@` there are 4 frames.
+
+    A unit's inputs are ordered (frame, row, column) in the first layer, (row, column, channel) in the others; the
+    speed is the dense layer's last.
+    """
+
+    observation = "grid"
+
+    hidden: tuple[int, ...] = (16, 32, 256)
+    frames: int = 4
+
+    def __str__(self) -> str:
+        return f"cnn:{','.join(map(str, self.hidden))}@{self.frames}"
+
+    @property
+    def inputs(self) -> int:
+        """The cells of all frames, and the speed."""
+        return self.frames * CELLS * CELLS + 1
+
+    @property
+    def layers(self) -> np.ndarray:
+        """Frames, channels, channels, units, outputs: int32 [5]."""
+        return freeze(np.array([self.frames, *self.hidden, self.outputs], dtype=np.int32))
+
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        first, second, dense = self.hidden
+        return (
+            (self.frames * KERNEL_1 * KERNEL_1, first),
+            (KERNEL_2 * KERNEL_2 * first, second),
+            (SIDE_2 * SIDE_2 * second + 1, dense),
+            (dense, self.outputs),
+        )
+
+
+@cache
+def gene_scales(spec: PolicySpec) -> np.ndarray:
+    """The size float32 [genes] that genes have by nature: of a new genome's spread and of a mutation's step.
+
+    1 for a perceptron, whose few inputs are alike. In a convolutional network the standard deviation of He et al.
+    (2015), sqrt(2 / inputs of the unit), so that a step means as much in a layer of 64 inputs as in one of 2,000; half
+    the variance in the linear output layer. The speed's weights are of size 1: it is one input beside a thousand, and
+    would go unheard.
+    """
+    if spec.observation == "rays":
+        return freeze(np.ones(spec.size, dtype=np.float32))
+    shapes = spec.shapes()
+    parts = []
+    for k, (n, m) in enumerate(shapes):
+        beside = 1 if k == len(shapes) - 2 else 0  # the speed
+        size = np.sqrt((2.0 if k < len(shapes) - 1 else 1.0) / (n - beside))
+        parts += [np.full((n - beside) * m, size), np.ones(beside * m), np.full(m, size)]
+    return freeze(np.concatenate(parts).astype(np.float32))
 
 
 @leaf

@@ -8,11 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
+from evolution import convnet
+from evolution.policy import BLOCK, CnnSpec, PolicySpec, decide, encode, pack, packed_size
 from gridsim.config import SimConfig, constants
+from gridsim.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.jit import njit
 from gridsim.roads import VISIT_CELL, freeze
 from gridsim.scenarios import Scenario
@@ -61,6 +64,33 @@ class Limits:
     steps: int
 
 
+class Eye(NamedTuple):
+    """What a policy on the occupancy grid needs beside its genome."""
+
+    table: GridTable
+    room: convnet.Scratch
+    grid: np.ndarray  # uint8 [cells]
+
+
+def _eye(spec: PolicySpec, config: SimConfig) -> Eye | None:
+    """None for a policy on rays. Raises: ValueError if it sees another number of them."""
+    if isinstance(spec, CnnSpec):
+        return Eye(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
+    if spec.inputs != config.sensors.rays + 1:
+        raise ValueError(f"{spec} sees {spec.inputs - 1} rays, the sensor has {config.sensors.rays}")
+    return None
+
+
+@njit
+def _packed(genome, layers, eye):
+    """A genome as its network reads it."""
+    if eye is not None:
+        return genome
+    packed = np.empty(packed_size(layers), dtype=np.float32)
+    pack(genome, layers, packed)
+    return packed
+
+
 @njit
 def _run(
     road,
@@ -79,11 +109,13 @@ def _run(
     beams,
     ranges,
     scratch,
+    eye,
     ring,
     world_ring,
 ):
-    """One episode of one car. ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n.
+    """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there is an Eye.
 
+    ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n.
     world_ring float32 [n, cars, fields] is the same of its world.
     """
     place(road, start, car, visits)
@@ -92,8 +124,13 @@ def _run(
     steps = 0
     while end == 0:
         look(road, constants, fan, car, world, beams, ranges)
-        encode(ranges, car[SPEED], scratch)
-        action = decide(packed, layers, scratch)
+        if eye is None:
+            encode(ranges, car[SPEED], scratch)
+            action = decide(packed, layers, scratch)
+        else:
+            fill_grid(eye.table, ranges, eye.grid)
+            convnet.push(eye.grid, steps == 0, eye.room)
+            action = convnet.decide(packed, layers, car[SPEED], eye.room)
         if action < 0:  # not a number: the genome loses what is left
             end = 2
             break
@@ -127,6 +164,8 @@ def _rollout(
     target,
     max_steps,
     rewind,
+    rays,
+    eye,
     results,
     column,
     rewound,
@@ -140,16 +179,15 @@ def _rollout(
     car = np.empty(FIELDS, dtype=np.float32)
     visits = np.empty(cells, dtype=np.float32)
     beams = np.empty((3, LANES), dtype=np.float32)
-    ranges = np.empty(layers[0] - 1, dtype=np.float32)
+    ranges = np.empty(rays, dtype=np.float32)
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    packed = np.empty(packed_size(layers), dtype=np.float32)
     ring = np.zeros((rewind, FIELDS), dtype=np.float32)
     world = None
     world_ring = np.zeros((0, 0, 0), dtype=np.float32)
     if traffic is not None:
         world_ring = np.zeros((rewind, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
     for i in range(genomes.shape[0]):
-        pack(genomes[i], layers, packed)
+        packed = _packed(genomes[i], layers, eye)
         if traffic is not None:
             world = traffic.copy()
         end = _run(
@@ -169,6 +207,7 @@ def _rollout(
             beams,
             ranges,
             scratch,
+            eye,
             ring,
             world_ring,
         )
@@ -221,8 +260,7 @@ def evaluate(
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
     if not 0 < limits.steps <= MAX_STEPS:
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
-    if spec.inputs != config.sensors.rays + 1:
-        raise ValueError(f"{spec} sees {spec.inputs - 1} rays, the sensor has {config.sensors.rays}")
+    eye = _eye(spec, config)
     if worlds is None:
         worlds = no_traffic(len(episodes))
     if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
@@ -248,6 +286,8 @@ def evaluate(
             _F(episode["target"] or limits.target),
             int(episode["steps"] or limits.steps),
             rewind,
+            config.sensors.rays,
+            eye,
             results,
             column,
             rewound,
@@ -273,8 +313,8 @@ def trajectory(
     """Drive one genome through one episode and keep its path.
 
     Args: as `evaluate`'s; start float32 [5], world float32 [cars, traffic.FIELDS].
-    Returns: (RESULT [], states float32 [steps, FIELDS] before each step, with fields as in `gridsim.simulator`, and
-    the traffic then, float32 [steps, cars, traffic.FIELDS]).
+    Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
+    `gridsim.simulator`, and the traffic then, float32 [steps + 1, cars, traffic.FIELDS]).
     """
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
@@ -290,26 +330,27 @@ def trajectory(
         None if world is None or not len(world) else freeze(world.copy()),
         _F(limits.target),
         limits.steps,
+        config.sensors.rays,
+        _eye(spec, config),
     )
     row = np.zeros((), dtype=RESULT)
     row["distance"], row["paced"], row["steps"], row["end"] = result
-    return row, states[: int(row["steps"])], worlds[: int(row["steps"])]
+    return row, states[: int(row["steps"]) + 1], worlds[: int(row["steps"]) + 1]
 
 
 @njit(nogil=True)
-def _trajectory(road, network, constants, drivers, fan, genome, layers, start, traffic, target, max_steps):
+def _trajectory(road, network, constants, drivers, fan, genome, layers, start, traffic, target, max_steps, rays, eye):
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car = np.empty(FIELDS, dtype=np.float32)
     visits = np.empty(cells, dtype=np.float32)
     beams = np.empty((3, LANES), dtype=np.float32)
-    ranges = np.empty(layers[0] - 1, dtype=np.float32)
+    ranges = np.empty(rays, dtype=np.float32)
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    packed = np.empty(packed_size(layers), dtype=np.float32)
-    pack(genome, layers, packed)
-    ring = np.zeros((max_steps, FIELDS), dtype=np.float32)
+    packed = _packed(genome, layers, eye)
+    ring = np.zeros((max_steps + 1, FIELDS), dtype=np.float32)
     world = None if traffic is None else traffic.copy()
     cars = 0 if traffic is None else traffic.shape[0]
-    world_ring = np.zeros((max_steps, cars, TRAFFIC_FIELDS), dtype=np.float32)
+    world_ring = np.zeros((max_steps + 1, cars, TRAFFIC_FIELDS), dtype=np.float32)
     end = _run(
         road,
         network,
@@ -327,7 +368,11 @@ def _trajectory(road, network, constants, drivers, fan, genome, layers, start, t
         beams,
         ranges,
         scratch,
+        eye,
         ring,
         world_ring,
     )
+    ring[int(car[STEPS])] = car
+    if traffic is not None:
+        world_ring[int(car[STEPS])] = world
     return (car[DISTANCE], car[PACED], car[STEPS], end), ring, world_ring

@@ -23,7 +23,7 @@ class Atlas(NamedTuple):
     start_row: np.ndarray  # as `Road.start_row`
     start: np.ndarray  # as `Road.start`
     bounds: np.ndarray  # int64 [maps + 1, 3], where each map's part of these three begins
-    sides: np.ndarray  # uint32 [maps, 2], columns and rows
+    sides: np.ndarray  # uint32 [maps, 3], columns, rows and `Road.thin`
     sizes: np.ndarray  # float32 [maps, 4], width and height (m), lower and upper speed (m/s)
     lanes: Network  # arrays of all maps' networks
     lane_bounds: np.ndarray  # int64 [maps + 1, 3], where each map's points, lanes and crossings begin
@@ -50,7 +50,7 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
         start_row=start_row,
         start=start,
         bounds=freeze(np.concatenate([np.zeros((1, 3), dtype=np.int64), np.cumsum(lengths, axis=0)])),
-        sides=freeze(np.array([[r.columns, r.rows] for r in roads], dtype=np.uint32)),
+        sides=freeze(np.array([[r.columns, r.rows, r.thin] for r in roads], dtype=np.uint32)),
         sizes=freeze(np.array([[r.width, r.height, r.speed_low, r.speed_high] for r in roads], dtype=np.float32)),
         lanes=lanes,
         lane_bounds=freeze(np.concatenate([[[0, 0, 0]], np.cumsum(np.array(sizes, dtype=np.int64), axis=0)])),
@@ -71,6 +71,7 @@ def road_of(atlas: Atlas, m: int) -> Road:
         atlas.sizes[m, 1],
         atlas.sizes[m, 2],
         atlas.sizes[m, 3],
+        atlas.sides[m, 2],
     )
 
 

@@ -24,11 +24,11 @@ CORNER = (8.0, 10.0)  # m, radius of the roads' centre lines round a corner, dra
 GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
 MISSING = 0.2  # of the pieces of streets between crossings, at most
 BAY_SHARE = 0.6  # of the sides of streets
-BAY_DEPTH = 2.2  # m
+BAY_DEPTH = 2.0  # m
 BAY_LENGTH = 12.0  # m, at least, without its slanting ends
 BAY_AWAY = 5.5  # m from the crossing, at least
 CAR = (2.0, 0.9)  # m, half length and half width of a parked car
-CAR_PITCH = (4.9, 6.5)  # m from one parking place to the next
+CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
 CAR_SHARE = 0.7  # of the places
 CAR_SKEW = 0.05  # rad either way
 CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
@@ -97,8 +97,8 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
         """A piece of street from (x, y), with its lanes, bays and parked cars."""
         (ux, uy), heading = DIRECTIONS[d], d * math.pi / 2
 
-        def place(along: float, left: float) -> list[float]:
-            return [x + along * ux - left * uy, y + along * uy + left * ux]
+        def place(along: float, left: float) -> tuple[float, float]:
+            return x + along * ux - left * uy, y + along * uy + left * ux
 
         lines.append([*place(0.0, 0.0), *place(length, 0.0), half_road])
         right, left = place(0.0, -LANE_WIDTH / 2), place(length, LANE_WIDTH / 2)

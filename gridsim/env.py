@@ -3,8 +3,10 @@
 Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and so on; Gymnasium imports it by itself
 for `gymnasium.make("gridsim.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
 
-Observation: float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s. Action: one of
-`vehicle.Action`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
+Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; or
+`grid`, uint8 [80, 80], the occupancy grid of `gridsim.grid`, and with `frames` above 1 [frames, 80, 80], the newest
+last. Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of
+`vehicle.act_continuous`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
 collision. f(distance) is this step's new ground and f(speed) the forward speed, as shares of what the scenario's upper
 speed gives and no more than 1; min(S) is the shortest of the rays.
 
@@ -15,7 +17,7 @@ a single environment meets after `reset(seed=s + i)`, whatever the other cars do
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
@@ -26,14 +28,30 @@ from gymnasium.vector.utils import batch_space
 
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
+from gridsim.grid import CELLS, grid_table, grids, push_frames
 from gridsim.jit import njit
 from gridsim.roads import clearance
-from gridsim.scenarios import REGISTRY, TRAINING_SEED, Scenario, build, starts_at
-from gridsim.simulator import DISTANCE, End, Simulator
+from gridsim.scenarios import (
+    REGISTRY,
+    TRAINING_SEED,
+    Scenario,
+    build,
+    check_name,
+    default_traffic,
+    is_map_file,
+    map_of,
+    starts_at,
+)
+from gridsim.simulator import DISTANCE, SPEED, End, Simulator
+from gridsim.traffic import LANE
 from gridsim.vehicle import Action
+
+if TYPE_CHECKING:
+    from gridsim.render import Renderer, Window
 
 DISTANCE_SHARE, SPEED_SHARE, CLEARANCE_SHARE = 0.15, 0.15, 0.7
 CRASH_REWARD = -1.0
+RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture a control period: true speed
 
 _F, _U = np.float32, np.uint64
 _NAMES = np.array([end.name.lower() for end in End])
@@ -41,26 +59,29 @@ _TIME = int(End.TIME)  # a plain number: comparing arrays with an IntEnum is slo
 
 
 @njit
-def _draw(keys, episodes, which, numbers):
-    """Two uniform numbers in [0, 1) for each of cars `which` [k] and its episode: float64 [k, 2]."""
+def _draw(keys, episodes, which, numbers, drawn):
+    """For cars `which` [k] in their episodes: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
     for k in range(which.shape[0]):
         i = which[k]
         episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)
+        drawn[k] = mix(episode + _U(3) * GOLDEN)
         for j in range(2):
             numbers[k, j] = (mix(episode + _U(j + 1) * GOLDEN) >> _U(11)) * (1.0 / (1 << 53))
 
 
 @njit
 def _observe(ranges, speeds, progress, ends, fastest, begun, reach, slowest, limit, dt, observations, rewards):
-    """Observations [n, rays + 1] and rewards [n]; `fastest` m/s is the upper speed of each car's scenario."""
+    """Observations [n, rays + 1], if not None, and rewards [n]; `fastest` m/s: upper speed of each car's scenario."""
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
         shortest = reach
         for r in range(rays):
-            observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
             shortest = min(shortest, ranges[i, r])
         speed = speeds[i]
-        observations[i, rays] = min(max(speed / limit, slowest), _F(1.0))
+        if observations is not None:
+            for r in range(rays):
+                observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
+            observations[i, rays] = min(max(speed / limit, slowest), _F(1.0))
         if begun[i]:
             rewards[i] = _F(0.0)
         elif ends[i] == 1:
@@ -82,7 +103,11 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     limit, truncates.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012, Gymnasium's own form
+    metadata = {  # noqa: RUF012, Gymnasium's own form
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": RENDER_FPS,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
 
     def __init__(
         self,
@@ -91,6 +116,11 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         scenario: str = "seamless",
         maps: int | Sequence[Scenario] = 8,
         map_seed: int = TRAINING_SEED,
+        traffic: int | None = None,
+        observation: Literal["rays", "grid"] = "rays",
+        frames: int = 1,
+        actions: Literal["discrete", "continuous"] = "discrete",
+        render_mode: Literal["rgb_array", "human"] | None = None,
         max_episode_steps: int | None = None,
         config: SimConfig | None = None,
     ):
@@ -98,30 +128,60 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Args:
             num_envs: cars.
-            scenario: name in the registry of scenarios.
+            scenario: name in the registry of scenarios, or a map's file (`gridsim.maps`), which is one map.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first of them; the others' follow.
+            traffic: other cars in each car's world; None is as many as the scenario has by default.
+            observation: `rays` or `grid`.
+            frames: grids that make an observation, 1 to 16.
+            actions: `discrete` or `continuous`.
+            render_mode: `rgb_array`, or `human`, a window that follows the first car.
             max_episode_steps: time limit in control steps; None is the configuration's.
             config: vehicle, sensors and episode.
         Raises: ValueError with one line where an argument makes no sense.
         """
-        if scenario not in REGISTRY:
-            raise ValueError(f"unknown scenario {scenario!r}; there are: {', '.join(sorted(REGISTRY))}")
+        check_name(scenario)
+        for name, value, known in (
+            ("observation", observation, ("rays", "grid")),
+            ("actions", actions, ("discrete", "continuous")),
+            ("render_mode", render_mode, (None, "rgb_array", "human")),
+        ):
+            if value not in known:
+                raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
+        if not 1 <= frames <= 16 or (frames > 1 and observation == "rays"):
+            raise ValueError(f"frames must be 1 to 16, and more than 1 only for observation='grid', not {frames}")
+        if traffic and is_map_file(scenario):
+            raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         if map_seed < 0:
             raise ValueError(f"map_seed must be 0 or more, not {map_seed}")
         self.num_envs = num_envs
         self.config = config or SimConfig()
         self.scenario = scenario
+        if isinstance(maps, int) and is_map_file(scenario):
+            maps = [build(scenario, map_seed, self.config)] * min(maps, 1)
         given = [] if isinstance(maps, int) else list(maps)
         self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in given]
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
-        self.simulator = Simulator(given, num_envs, self.config, max_steps=max_episode_steps)
+        self.traffic = default_traffic(scenario) if traffic is None else traffic
+        self.simulator = Simulator(given, num_envs, self.config, max_steps=max_episode_steps, traffic=self.traffic)
         self._index = {seed: k for k, seed in enumerate(self._seeds) if given}  # of each map among the simulator's
+        self.render_mode = render_mode
+        self._views: dict[int, Renderer] = {}  # by map
+        self._window: Window | None = None
+        self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
         low = np.zeros(self.config.sensors.rays + 1, dtype=np.float32)
         low[-1] = self._slowest = _F(-self.config.vehicle.reverse_limit / self.config.vehicle.speed_limit)
+        self._table = grid_table(self.config) if observation == "grid" else None
+        self._stack = np.zeros((num_envs, frames, CELLS, CELLS), dtype=np.uint8) if observation == "grid" else None
         self.single_observation_space = Box(low, np.ones_like(low))
-        self.single_action_space = Discrete(len(Action))
+        if observation == "grid":
+            shape = (CELLS, CELLS) if frames == 1 else (frames, CELLS, CELLS)
+            self.single_observation_space = Box(0, 255, shape, dtype=np.uint8)
+        self.single_action_space: Discrete | Box = Discrete(len(Action))
+        if actions == "continuous":
+            self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
+        self._action_axes = 1 if actions == "discrete" else 2
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         #: float32 [n, rays], m: the ranges that the last observations were made of.
@@ -157,8 +217,8 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._episodes += _U(1)
         if map_seed is not None:
             self._keep_own_maps()
-        maps, starts = self._episode(np.arange(self.num_envs), map_seed, start)
-        ranges, speeds = self.simulator.reset(starts, maps)
+        maps, starts, keys = self._episode(np.arange(self.num_envs), map_seed, start)
+        ranges, speeds = self.simulator.reset(starts, maps, keys=keys)
         self._fastest[:] = self._upper_speeds(maps)
         self._started = True
         progress, begun = np.zeros(self.num_envs, dtype=np.float32), np.ones(self.num_envs, dtype=np.bool_)
@@ -168,8 +228,8 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode where the last step ended one.
 
-        Args: actions integers [n], `vehicle.Action`; of no effect where an episode begins.
-        Returns: (observations float32 [n, rays + 1], rewards float32 [n], terminations bool [n], truncations bool [n],
+        Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; of no effect where an episode begins.
+        Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n],
         info).
         Raises: gymnasium.error.ResetNeeded before the first reset; ValueError with one line for anything but an action
         for each car.
@@ -177,12 +237,14 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
         begun = self.simulator.state.ends != 0
+        if np.ndim(actions) != self._action_axes:
+            raise ValueError(f"actions are {self.action_space}, not of shape {np.shape(actions)}")
         ranges, speeds, progress, ends = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
             self._episodes[which] += _U(1)
-            maps, starts = self._episode(which)
-            ranges[which], speeds[which] = self.simulator.reset(starts, maps, which)
+            maps, starts, keys = self._episode(which)
+            ranges[which], speeds[which] = self.simulator.reset(starts, maps, which, keys)
             ends[which] = End.RUNNING
             self._fastest[which] = self._upper_speeds(maps)
         observations, rewards = self._observe(ranges, speeds, progress, ends, begun)
@@ -198,6 +260,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _map(self, seed: int) -> int:
         """Index among the simulator's scenarios of the map of a seed, built where it is not there yet."""
+        seed = map_of(self.scenario, seed)
         if seed not in self._index:
             self.simulator.scenarios.append(build(self.scenario, seed, self.config))
             self._index[seed] = len(self.simulator.scenarios) - 1
@@ -207,10 +270,12 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Upper speed (m/s) of the scenario of each of maps [k]."""
         return np.array([s.road.speed_high for s in self.simulator.scenarios], dtype=np.float32)[maps]
 
-    def _episode(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """The maps [k] and starts [k, 5] of the present episodes of cars `which`, drawn unless they are given."""
-        numbers = np.empty((len(which), 2))
-        _draw(self._keys, self._episodes, which, numbers)
+    def _episode(
+        self, which: np.ndarray, map_seed: Any = None, start: Any = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Maps [k], starts [k, 5] and traffic's keys [k] of the present episodes of cars `which`, drawn or given."""
+        numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
+        _draw(self._keys, self._episodes, which, numbers, keys)
         if map_seed is None:
             drawn = (numbers[:, 0] * len(self._seeds)).astype(np.intp)
             index = {k: self._map(self._seeds[k]) for k in np.unique(drawn)}
@@ -227,7 +292,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 starts[of] = starts_at(self.simulator.scenarios[m], numbers[of, 1])
         else:
             starts[:] = self._checked_start(start, maps)
-        return maps, starts
+        return maps, starts, keys
 
     def _checked_start(self, start: Any, maps: np.ndarray) -> np.ndarray:
         """A caller's start, float32 [n, 5]."""
@@ -252,9 +317,10 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _observe(
         self, ranges: np.ndarray, speeds: np.ndarray, progress: np.ndarray, ends: np.ndarray, begun: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Observations [n, rays + 1] and rewards [n] of a step."""
+        """Observations and rewards [n] of a step."""
         n, rays = ranges.shape
-        observations, rewards = np.empty((n, rays + 1), dtype=np.float32), np.empty(n, dtype=np.float32)
+        rewards = np.empty(n, dtype=np.float32)
+        observations = np.empty((n, rays + 1), dtype=np.float32) if self._table is None else None
         _observe(
             ranges,
             speeds,
@@ -270,7 +336,76 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             rewards,
         )
         self.ranges = ranges
+        if self.render_mode is not None:
+            self._remember(begun)
+        if observations is None:
+            return self._grids(begun), rewards
         return observations, rewards
+
+    def _grids(self, begun: np.ndarray) -> np.ndarray:
+        """Occupancy grids of the present ranges, stacked if so asked; the caller's own."""
+        assert self._table is not None
+        assert self._stack is not None
+        now = grids(self._table, self.ranges)
+        if self._stack.shape[1] == 1:
+            return now
+        push_frames(self._stack, now, begun)
+        return self._stack.copy()
+
+    # ---------------------------------------------------------------------------------------------------- pictures
+
+    def _remember(self, begun: np.ndarray) -> None:
+        """Keep where cars are; where an episode has begun, where it was is forgotten. Shows the window."""
+        for path, car, new in zip(self._paths, self.simulator.state.cars, begun, strict=True):
+            if new:
+                path.clear()
+            path.append(car[:2].copy())
+        if self.render_mode == "human":
+            from gridsim.render import Window
+
+            if self._window is None:
+                self._window = Window(RENDER_SIZE)
+            self._window.show(self._picture(0), RENDER_FPS)
+
+    def _picture(self, i: int) -> np.ndarray:
+        """What car i's world looks like: uint8 [height, width, 3]."""
+        from gridsim.render import Renderer  # here, because nothing else needs pygame
+
+        state = self.simulator.state
+        m = int(state.maps[i])
+        view = self._views.get(m)
+        if view is None or view.scenario is not self.simulator.scenarios[m]:
+            view = self._views[m] = Renderer(self.simulator.scenarios[m], RENDER_SIZE, config=self.config)
+        others = state.worlds[i][state.worlds[i][:, LANE] >= 0.0]
+        speed, distance = float(state.cars[i, SPEED]), float(state.cars[i, DISTANCE])
+        return view.draw(
+            state.cars[i],
+            boxes=others,
+            ranges=self.ranges[i] if self._table is None else None,
+            grid=None if self._table is None else grids(self._table, self.ranges[i : i + 1])[0],
+            path=np.array(self._paths[i]),
+            text=f"{speed:.1f} m/s    {distance:,.0f} m",
+        )
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """A picture uint8 [height, width, 3] of each car's world with `rgb_array`; a window is drawn by step and reset.
+
+        Raises: gymnasium.error.ResetNeeded before the first reset.
+        """
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() without a render_mode; use gymnasium.make(id, render_mode='rgb_array')")
+            return None
+        if not self._started:
+            raise ResetNeeded("render() was called before reset()")
+        if self.render_mode == "human":
+            return None
+        return tuple(self._picture(i) for i in range(self.num_envs))
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
 
     def _info(self, speeds: np.ndarray, ends: np.ndarray) -> dict[str, Any]:
         """Distance, speed and end of every car, in Gymnasium's form: each with a mask of whose it is."""
@@ -285,23 +420,16 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         }
 
 
-class GridSimEnv(gymnasium.Env[np.ndarray, np.int64]):
+class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
     """One car: a `GridSimVectorEnv` of one without its automatic resets; arguments, spaces, reward and info are its."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012, Gymnasium's own form
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012, Gymnasium's own form
 
     def __init__(
-        self,
-        scenario: str = "seamless",
-        *,
-        maps: int | Sequence[Scenario] = 8,
-        map_seed: int = TRAINING_SEED,
-        max_episode_steps: int | None = None,
-        config: SimConfig | None = None,
+        self, scenario: str = "seamless", *, render_mode: Literal["rgb_array", "human"] | None = None, **options: Any
     ):
-        self.cars = GridSimVectorEnv(
-            1, scenario=scenario, maps=maps, map_seed=map_seed, max_episode_steps=max_episode_steps, config=config
-        )
+        self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
+        self.render_mode = render_mode
         self._seeded = False
         self.observation_space = self.cars.single_observation_space
         self.action_space = self.cars.single_action_space
@@ -317,8 +445,8 @@ class GridSimEnv(gymnasium.Env[np.ndarray, np.int64]):
         observations, info = self.cars.reset(seed=seed, options=options)
         return observations[0], self._own(info)
 
-    def step(self, action: np.int64 | int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One control period. Returns: (observation float32 [rays + 1], reward, terminated, truncated, info).
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One control period. Returns: (observation, reward, terminated, truncated, info).
 
         Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError with one line for
         anything but an action.
@@ -327,6 +455,15 @@ class GridSimEnv(gymnasium.Env[np.ndarray, np.int64]):
             raise ResetNeeded("step() was called after the episode's end; call reset() first")
         observations, rewards, terminations, truncations, info = self.cars.step(np.asarray(action)[None])
         return observations[0], float(rewards[0]), bool(terminations[0]), bool(truncations[0]), self._own(info)
+
+    def render(self) -> np.ndarray | None:
+        """A picture uint8 [height, width, 3] with `rgb_array`; None with `human`, whose window step and reset draw."""
+        pictures = self.cars.render()
+        return pictures[0] if pictures else None
+
+    def close(self) -> None:
+        """Close the window."""
+        self.cars.close()
 
     @staticmethod
     def _own(info: dict[str, Any]) -> dict[str, Any]:

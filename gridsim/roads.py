@@ -25,6 +25,7 @@ HEADING_WRAP = 64  # bins repeated behind the last, so that a fan of rays never 
 START_UNITS = 4.0  # steps of a start range byte per metre
 START_CELLS_PER_M = 1  # cells of the ray start table per metre
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
+THIN_WALL = 3.0  # m: a plain ray may pass what is thinner
 MEMORY_LIMIT_CELLS = 1 << 24  # nodes of a field; above this a map is refused
 
 _F, _I, _U = np.float32, np.int32, np.uint32
@@ -42,6 +43,7 @@ class Road(NamedTuple):
     height: np.float32  # m along y
     speed_low: np.float32  # m/s, the scenario's interval
     speed_high: np.float32  # m/s
+    thin: np.uint32 = _U(1)  # 1 where walls may be under THIN_WALL, so that rays look out for them
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,25 @@ class Lanes:
     crossings: np.ndarray
     junction: np.ndarray
     limits: np.ndarray
+
+    @classmethod
+    def none(cls) -> Lanes:
+        """No lanes: a map from a file has none."""
+        empty = freeze(np.zeros(0, dtype=np.int32))
+        none = freeze(np.zeros(0, dtype=np.float32))
+        return cls(
+            points=freeze(np.zeros((0, 2), dtype=np.float32)),
+            offsets=freeze(np.zeros(1, dtype=np.int32)),
+            successors=freeze(np.zeros((0, 1), dtype=np.int32)),
+            steps=none,
+            lengths=none,
+            left=empty,
+            right=empty,
+            crossing_offsets=freeze(np.zeros(1, dtype=np.int32)),
+            crossings=empty,
+            junction=freeze(np.zeros(0, dtype=np.uint8)),
+            limits=none,
+        )
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -303,8 +324,8 @@ def clearance_nodes(strips: Strips, width: float, height: float, torus: bool = T
     return nodes
 
 
-def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float) -> Road:
-    """The kernels' view of a clearance field [rows, columns] in m."""
+def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float, thin: bool = True) -> Road:
+    """The kernels' view of a clearance field [rows, columns] in m; thin: whether walls under THIN_WALL may occur."""
     rows, columns = nodes.shape
     start_row, start = _ray_starts(nodes, columns, rows, _F(ray_range))
     return Road(
@@ -317,4 +338,5 @@ def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range:
         height=_F(rows / CELLS_PER_M),
         speed_low=_F(speed_interval[0]),
         speed_high=_F(speed_interval[1]),
+        thin=_U(thin),
     )

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -23,7 +25,7 @@ VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
 START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight as a share of the interval's two ends together: its middle
-ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high")
+ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Scenario:
         strips: exact geometry of the drivable area, for pictures and tests.
         network: the lanes as traffic reads them.
         torus: whether leaving on one side means entering on the other.
+        starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Scenario:
     strips: Strips
     network: Network
     torus: bool = True
+    starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
 
     @cached_property
     def mileage(self) -> np.ndarray:
@@ -69,15 +73,16 @@ class Scenario:
             **vars(self.strips),
             "speeds": self.network.speeds,
             "clear": self.network.clear,
+            "starts": self.starts,
         }
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Scenario:
         """The inverse of `arrays`; arrays are used as they are, read-only."""
         frozen = {key: freeze(value) for key, value in arrays.items()}
-        columns, rows, width, height, low, high, seed, torus = frozen["scalars"]
+        columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
         f = np.float32
-        lanes = Lanes(**{field.name: frozen[field.name] for field in fields(Lanes)})
+        lanes = Lanes(**{f.name: frozen[f.name] for f in fields(Lanes)})
         return cls(
             name=frozen["name"].tobytes().decode(),
             seed=int(seed),
@@ -91,11 +96,13 @@ class Scenario:
                 f(height),
                 f(low),
                 f(high),
+                np.uint32(thin),
             ),
             lanes=lanes,
-            strips=Strips(**{field.name: frozen[field.name] for field in fields(Strips)}),
+            strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
             network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], width, height),
             torus=bool(torus),
+            starts=frozen["starts"],
         )
 
 
@@ -106,27 +113,58 @@ class ScenarioSpec:
     summary: str
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int  # cars beside the ego car, unless told otherwise
+    thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
 
 REGISTRY: dict[str, ScenarioSpec] = {
-    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, highway_layout),
-    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, curved_layout),
-    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, seamless_layout),
-    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, roundabout_layout),
-    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, city_layout),
+    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, False, highway_layout),
+    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, False, curved_layout),
+    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, False, seamless_layout),
+    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, True, roundabout_layout),
+    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, True, city_layout),
 }
+
+
+def is_map_file(name: str) -> bool:
+    """Whether a scenario is named by a map's file, `gridsim.maps`, and not by the registry."""
+    return "." in name or os.sep in name
+
+
+def check_name(name: str) -> None:
+    """Raises: ValueError with one line for what is neither in the registry nor a map's file."""
+    if name not in REGISTRY and not is_map_file(name):
+        names = ", ".join(sorted(REGISTRY))
+        raise ValueError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
+
+
+def label(name: str) -> str:
+    """A scenario in one word: a map's file is called by its stem."""
+    return Path(name).stem if is_map_file(name) else name
+
+
+def default_traffic(name: str) -> int:
+    """Other cars on a scenario's road unless told otherwise; none on a map from a file, which has no lanes."""
+    return REGISTRY[name].traffic if name in REGISTRY else 0
+
+
+def map_of(name: str, seed: int) -> int:
+    """The seed that stands for the map of a seed: a file has one map."""
+    return 0 if is_map_file(name) else seed
 
 
 def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    Raises: ValueError with one line for an unknown scenario or a seed below 0.
+    Raises: ValueError with one line for an unknown scenario, a seed below 0, or a map's file that is none.
     """
-    if name not in REGISTRY:
-        raise ValueError(f"unknown scenario {name!r}; there are: {', '.join(sorted(REGISTRY))}")
+    check_name(name)
     if seed < 0:
         raise ValueError(f"a seed must be 0 or more, not {seed}")
+    if is_map_file(name):
+        from gridsim.maps import load_map  # here: workers never read files
+
+        return load_map(name, config)
     config = config or SimConfig()
     spec = REGISTRY[name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
@@ -136,7 +174,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     return Scenario(
         name=name,
         seed=seed,
-        road=make_road(nodes, spec.speed_interval, config.sensors.range),
+        road=make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls),
         lanes=lanes,
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
         network=make_network(lanes, width, height, TRAFFIC_PACE * sum(spec.speed_interval), config.traffic),
@@ -158,8 +196,11 @@ def _starts_at(points, mileage, shares, speed, starts):
 def starts_at(scenario: Scenario, shares: np.ndarray) -> np.ndarray:
     """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
 
-    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it.
+    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it. Of a map
+    without lanes, the starts at these shares of `Scenario.starts`.
     """
+    if not len(scenario.lanes):
+        return scenario.starts[(np.asarray(shares) * len(scenario.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
     _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, np.float32(START_SPEED), starts)
     return starts

@@ -138,6 +138,10 @@ def square_strips(arms: list[int], half: float, half_road: float) -> tuple[list[
     """Lines and arcs that join the middles of those sides of a square (of side 2 * half, centred on the origin)."""
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
+    if len(arms) == 3:
+        # Paved already; but where the edges of the other three strips meet, none of them knows how wide the road is.
+        dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
+        lines.append([dx * half, dy * half, 0.0, 0.0, half_road])
     for k, a in enumerate(arms):
         for b in arms[k + 1 :]:
             ax, ay = DIRECTIONS[a]

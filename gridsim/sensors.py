@@ -2,11 +2,16 @@
 
 A ray is the root of the clearance along it. It starts where the table of `roads` says no ray can have ended yet, takes
 long steps while the road is wide and Newton steps near the edge; slopes are those of the bilinear field.
+
+A step is longer than the clearance it starts from, so that a wall may lie within it. Where a map has walls thinner than
+such a step, steps are shorter and each is looked back at: what is neither within the clearance before it nor behind it
+is blind, and if that is more than _GAP, the ray goes back. So no ray passes a wall of 1 m or more.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +42,11 @@ _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
 _SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance ...
 _LEAP = _F(2.0)  # ... and at most this many m longer than a stretched one, so as not to jump over an island
 _STEPS = 16  # at most
+_GAP = _F(0.95)  # m of a step that may be blind, among thin walls
+# How to march, plain and among thin walls: steps at most, leap in m, whether steps are looked back at. Plain, 3 m of
+# wall may be passed.
+PLAIN = (_STEPS, _LEAP, False)
+AMONG_THIN_WALLS = (24, _F(0.9), True)
 
 
 def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:
@@ -53,16 +63,18 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
 
 
 @leaf
-def march(field, columns, rows, px0, py0, reach, beams):
+def march(field, columns, rows, px0, py0, reach, beams, how):
     """Move each of LANES rays from its start range to the edge of the road.
 
     Args: packed field with its sides; origin in cells; reach m; beams float32 [3, LANES]: direction x, direction y and
-    range, the start on entry and the result on return, in [0, reach].
+    range, the start on entry and the result on return, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
     """
+    steps, leap, look_back = how
     mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
     for r in range(LANES):
         dx, dy, t = beams[0, r], beams[1, r], beams[2, r]
-        for _ in range(_STEPS):
+        safe = t  # m, up to which the way is known to be free, but for gaps
+        for _ in range(steps):
             px, py = px0 + t * (dx * _SCALE), py0 + t * (dy * _SCALE)
             fx, fy = math.floor(px), math.floor(py)
             ux, uy = px - fx, py - fy
@@ -72,36 +84,49 @@ def march(field, columns, rows, px0, py0, reach, beams):
             rise_low, rise_high = q10 - q00, q11 - q01
             low, high = q00 + ux * rise_low, q01 + ux * rise_high
             clear = (low + uy * (high - low)) * _UNIT + _FLOOR
+            if look_back:
+                if t - abs(clear) > safe + _GAP:
+                    t = safe + _GAP
+                    continue
+                if clear > _F(0.0):
+                    safe = max(safe, t + clear)
             if t >= reach:
                 break
             if clear > _NEAR:
                 t += _STRETCH * clear
             else:
                 slope = -(dx * (rise_low + uy * (rise_high - rise_low)) + dy * (high - low)) * _SLOPE
-                t += min(clear / min(max(slope, _SLOPE_MIN), _F(1.0)), max(_STRETCH * clear, _F(0.0)) + _LEAP)
+                t += min(clear / min(max(slope, _SLOPE_MIN), _F(1.0)), max(_STRETCH * clear, _F(0.0)) + leap)
+                if look_back:
+                    t = max(t, safe)
                 if abs(clear) < _CLOSE:
                     break
+        if look_back:
+            t = min(t, safe + _GAP)
         beams[2, r] = min(max(t, _F(0.0)), reach)
 
 
-# Compiled, the marching runs as vector code, all lanes until the last has arrived; with
-# `NUMBA_DISABLE_JIT=1` the plain kernel above is taken.
-fast_march = (
-    march
-    if CONFIG.DISABLE_JIT
-    else march_intrinsic(
-        _STEPS,
-        float(_SCALE),
-        float(_UNIT),
-        float(_FLOOR),
-        float(_SLOPE),
-        float(_NEAR),
-        float(_STRETCH),
-        float(_CLOSE),
-        float(_SLOPE_MIN),
-        float(_LEAP),
-    )
-)
+def _compiled(how: tuple[int, np.float32, bool]) -> Any:
+    """The vector code for `march`, all lanes until the last has arrived."""
+    steps, leap, look_back = how
+    numbers = map(float, (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, leap))
+    arguments: list[Any] = [*numbers, float(_GAP) if look_back else None]
+    return march_intrinsic(steps, *arguments)
+
+
+@leaf
+def _plain_march(field, columns, rows, px0, py0, reach, beams):
+    march(field, columns, rows, px0, py0, reach, beams, PLAIN)
+
+
+@leaf
+def _plain_march_thin(field, columns, rows, px0, py0, reach, beams):
+    march(field, columns, rows, px0, py0, reach, beams, AMONG_THIN_WALLS)
+
+
+# With `NUMBA_DISABLE_JIT=1` the plain kernel is taken.
+fast_march = _plain_march if CONFIG.DISABLE_JIT else _compiled(PLAIN)
+fast_march_thin = _plain_march_thin if CONFIG.DISABLE_JIT else _compiled(AMONG_THIN_WALLS)
 
 
 @leaf
@@ -134,6 +159,9 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
             beams[one, r] = sine * fan[zero, at + r] + cosine * fan[one, at + r]
         for r in range(lanes):
             beams[two, r] = _F(road.start[_N(base) + _N(_I(bin0 + fan[two, at + r]))]) * known
-        fast_march(road.field, columns, road.rows, px0, py0, reach, beams)
+        if road.thin:
+            fast_march_thin(road.field, columns, road.rows, px0, py0, reach, beams)
+        else:
+            fast_march(road.field, columns, road.rows, px0, py0, reach, beams)
         for r in range(min(rays - block, LANES)):
             ranges[block + r] = beams[2, r]

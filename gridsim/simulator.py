@@ -542,6 +542,22 @@ class Simulator:
         return ranges, speeds, progress, state.ends.copy()
 
 
+@njit(nogil=True)
+def _views(road, constants, fan, cars, worlds, ranges):
+    beams = np.empty((3, LANES), dtype=np.float32)
+    for i in range(cars.shape[0]):
+        look(road, constants, fan, cars[i], worlds[i], beams, ranges[i])
+
+
+def views(scenario: Scenario, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> np.ndarray:
+    """Ranges float32 [n, rays] (m) that cars in states [n, FIELDS] see among traffic [n, others, traffic.FIELDS]."""
+    k = constants(config)
+    ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
+    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    _views(scenario.road, k, rays, np.ascontiguousarray(cars), np.ascontiguousarray(worlds), ranges)
+    return ranges
+
+
 def _visit_cells(road: Road) -> int:
     """Number of visit cells of a map."""
     return int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)

@@ -27,8 +27,11 @@ def march_intrinsic(
     close: float,
     slope_min: float,
     leap: float,
+    gap: float | None,
 ) -> Any:
     """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; numbers as in `sensors`.
+
+    Without a gap steps are not looked back at, and no code for that is emitted.
 
     beams float32 [3, LANES], C-contiguous: direction x, direction y, and the range, which is read and written.
     """
@@ -87,9 +90,10 @@ def march_intrinsic(
             builder.branch(loop)
             builder.position_at_end(loop)
             k = builder.phi(i32)
-            t = builder.phi(vf)
+            t, safe = builder.phi(vf), builder.phi(vf)
             k.add_incoming(ir.Constant(i32, 0), before)
             t.add_incoming(first, before)
+            safe.add_incoming(first, before)
             px, py = add(x0, mul(t, sx)), add(y0, mul(t, sy))
             fx, fy = builder.call(floor_of, [px]), builder.call(floor_of, [py])
             ux, uy = sub(px, fx), sub(py, fy)
@@ -126,14 +130,29 @@ def march_intrinsic(
             t_next = add(t, builder.select(running, step, const(0.0)))
             size = builder.select(builder.fcmp_ordered("<", clear, const(0.0)), builder.fsub(const(0.0), clear), clear)
             active = builder.and_(running, builder.fcmp_ordered(">=", size, const(close)))
+            safe_next = safe
+            if gap is not None:
+                seen = add(safe, const(gap))
+                blind = builder.fcmp_ordered(">", sub(t, size), seen)
+                further = add(t, clear)
+                free = builder.fcmp_ordered(">", clear, const(0.0))
+                known = builder.and_(free, builder.fcmp_ordered(">", further, safe))
+                safe_next = builder.select(builder.and_(known, builder.not_(blind)), further, safe)
+                t_next = builder.select(builder.fcmp_ordered(">", t_next, safe_next), t_next, safe_next)
+                t_next = builder.select(blind, seen, t_next)
+                active = builder.or_(active, blind)
             bits = ir.IntType(LANES)
             any_active = builder.icmp_unsigned("!=", builder.bitcast(active, bits), ir.Constant(bits, 0))
             k_next = builder.add(k, one)
             more = builder.and_(any_active, builder.icmp_unsigned("<", k_next, ir.Constant(i32, steps)))
             k.add_incoming(k_next, builder.block)
             t.add_incoming(t_next, builder.block)
+            safe.add_incoming(safe_next, builder.block)
             builder.cbranch(more, loop, done)
             builder.position_at_end(done)
+            if gap is not None:
+                seen = add(safe_next, const(gap))
+                t_next = builder.select(builder.fcmp_ordered("<", t_next, seen), t_next, seen)
             t_last = builder.select(builder.fcmp_ordered(">", t_next, const(0.0)), t_next, const(0.0))
             t_last = builder.select(builder.fcmp_ordered("<", t_last, limit), t_last, limit)
             builder.store(t_last, beam(2), align=4)

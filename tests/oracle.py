@@ -26,7 +26,7 @@ STAGES = (16.0,)  # m, to which rays are cast before they are cast to their whol
 
 
 class ExactRoad:
-    """The union of capsules (lines) and round-ended annular sectors (arcs) without rectangles (blocks), on the torus."""
+    """Capsules (lines) and round-ended annular sectors (arcs), united, without rectangles (blocks), on a torus."""
 
     def __init__(self, strips: Strips, width: float, height: float, torus: bool = True):
         self.width, self.height, self.torus = width, height, torus

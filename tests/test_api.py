@@ -103,3 +103,35 @@ def test_bad_champions_are_refused(champion, tmp_path):
 def test_champion_class_is_what_is_returned(champion):
     assert isinstance(champion, Champion)
     assert len(champion.sha256) == 64
+
+
+# --- On the occupancy grid -------------------------------------------------------------------------------------------
+
+ON_THE_GRID = EvolveSettings(observation="grid", policy="cnn:8,8,8@2", population=24, generations=2, elites=2, seed=3)
+
+
+@pytest.fixture(scope="module")
+def seer():
+    return evolve(ON_THE_GRID)[0]
+
+
+def test_a_champion_of_the_grid_is_saved_loaded_and_evaluated(seer, tmp_path):
+    assert (seer.policy, seer.observation) == ("cnn:8,8,8@2", "grid")
+    seer.save(tmp_path / "champion.npz")
+    loaded = load_champion(tmp_path / "champion.npz")
+    assert loaded.genome.tobytes() == seer.genome.tobytes()
+    assert evaluate(loaded, episodes=8) == evaluate(seer, "seamless", episodes=8)
+
+
+def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer):
+    stack = np.random.default_rng(1).choice([0, 127, 255], (3, 2, 80, 80)).astype(np.uint8)
+    actions = seer.act(stack, np.array([0.0, 5.0, 9.0]))
+    assert [seer.act(grid, speed) for grid, speed in zip(stack, (0.0, 5.0, 9.0), strict=True)] == list(actions)
+    with pytest.raises(ValueError, match="needs the speed"):
+        seer.act(stack)
+    with pytest.raises(ValueError, match="sees grids"):
+        seer.act(np.zeros(32, dtype=np.float32), 5.0)
+
+
+def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):
+    assert evolve(ON_THE_GRID, workers=2)[0].sha256 == seer.sha256

@@ -1,5 +1,7 @@
 """Children from recipes: what is inherited, what is changed, and that a recipe is its child."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evolution.breeding import FRESH, RECIPE, Mutation, breed
-from evolution.policy import PolicySpec
+from evolution.policy import PolicySpec, gene_scales
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:6,7")
@@ -160,6 +162,49 @@ def test_new_genomes_grow_with_their_scale():
         for scale in (1.0, 2.0)
     )
     assert two == pytest.approx(2 * one, rel=1e-4, abs=1e-6)
+
+
+# --- Convolutional networks ------------------------------------------------------------------------------------------
+
+CNN = PolicySpec.parse("cnn:8,8,16@1")
+EDGES = np.cumsum([0, *((n + 1) * m for n, m in CNN.shapes())])
+
+
+def test_new_convolutional_genomes_are_as_large_as_genes_are():
+    children = breed(np.zeros((0, CNN.size), dtype=F), many(FRESH, FRESH, 300), 1, CNN, Mutation()).astype(float)
+    assert len({child.tobytes() for child in children}) == 300
+    scaled = children / gene_scales(CNN)
+    for first, last in itertools.pairwise(EDGES):
+        assert scaled[:, first:last].mean() == pytest.approx(0.0, abs=0.05)
+        assert scaled[:, first:last].std() == pytest.approx(1.0, abs=0.05)
+    assert stats.kstest(scaled[:, ::20].ravel(), "norm").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("sigma", [0.5, 2.0])
+def test_a_mutation_is_as_large_as_its_gene(sigma):
+    zero = np.zeros((1, CNN.size), dtype=F)
+    children = breed(zero, many(0, 0, 200), 4, CNN, Mutation(rate=0.2, sigma=sigma, bump_rate=0.0)).astype(float)
+    changed = children != 0
+    assert changed.mean() == pytest.approx(0.2, abs=0.01)
+    noise = (children / gene_scales(CNN))[changed]
+    assert stats.kstest(noise[:20_000] / sigma, "norm").pvalue > 1e-3
+
+
+def test_bumps_are_for_rays_alone():
+    zero = np.zeros((1, CNN.size), dtype=F)
+    assert (breed(zero, many(0, 0, 50), 8, CNN, Mutation(rate=0.0, bump_rate=1.0)) == 0.0).all()
+
+
+def test_convolutional_children_are_their_recipes():
+    parents = np.random.default_rng(5).normal(size=(4, CNN.size)).astype(F)
+    made = np.concatenate([many(1, 2, 6), many(FRESH, FRESH, 3), recipes((0, 0, 0), (3, 3, 7))])
+    whole = breed(parents, made, 11, CNN, Mutation(bump_rate=0.5))
+    assert whole[9].tobytes() == parents[0].tobytes()
+    for chosen in ([3], [10, 0, 7], [8, 8, 2]):
+        assert breed(parents, made[chosen], 11, CNN, Mutation(bump_rate=0.5)).tobytes() == whole[chosen].tobytes()
+    still = breed(parents, many(1, 2, 200), 3, CNN, STILL)
+    assert ((still == parents[1]) | (still == parents[2])).all()
+    assert (still == parents[2]).mean() == pytest.approx(0.5, abs=0.01)
 
 
 # --- A recipe is its child -------------------------------------------------------------------------------------------

@@ -264,6 +264,10 @@ def test_config_repeats_and_init_continues(reference, tmp_path):
 
 
 WRONG = {
+    "rays policy on the grid": (["--observation", "grid", "--policy", "mlp:6,7"], "sees the rays"),
+    "grid policy on rays": (["--policy", "cnn"], "--observation grid"),
+    "other observation": (["--observation", "radar"], "radar"),
+    "odd cnn": (["--observation", "grid", "--policy", "cnn:8,9,8"], "multiple"),
     "unknown scenario": (["--scenario", "moon"], "unknown scenario"),
     "unknown flag": (["--frobnicate"], "frobnicate"),
     "not a number": (["--population", "many"], "--population"),

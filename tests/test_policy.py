@@ -8,7 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution.policy import ACTIONS, BLOCK, INPUTS, PolicySpec, decide, encode, forward, pack, packed_size, squash
+from evolution.policy import (
+    ACTIONS,
+    BLOCK,
+    INPUTS,
+    CnnSpec,
+    MlpSpec,
+    PolicySpec,
+    decide,
+    encode,
+    forward,
+    gene_scales,
+    pack,
+    packed_size,
+    squash,
+)
 
 F = np.float32
 TEXTS = ["mlp:6,7", "mlp:3", "mlp:16,16", "mlp:9,1,20", "mlp:8", "mlp:17,5,3,11", "mlp:1"]
@@ -128,7 +142,7 @@ def test_what_the_network_sees():
 
 def test_sizes():
     spec = PolicySpec.parse("mlp:6,7")
-    assert spec == PolicySpec()
+    assert spec == MlpSpec()
     assert spec.size == 311
     assert spec.layers.tolist() == [32, 6, 7, 8]
     assert spec.layers.dtype == np.int32
@@ -160,7 +174,18 @@ def test_text_and_back(hidden):
         "mlp:6.5",
         "mlp:6,7\n",
         "MLP:6",
-        "cnn",
+        "cnn:",
+        "cnn:16,32",
+        "cnn:8,8,8,8",
+        "cnn:8,12,16",
+        "cnn:0,8,8",
+        "cnn:8,8,8@0",
+        "cnn:8,8,8@9",
+        "cnn:8,8,8@",
+        "cnn:8,8,8@-1",
+        "cnn:8,8,8 @1",
+        "cnn:16,64,1024",
+        "cnn@1",
         "rnn:3",
         "mlp:99999,99999",
         "mlp:1000000",
@@ -170,3 +195,44 @@ def test_text_and_back(hidden):
 def test_other_texts_are_refused_in_one_line(text):
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
         PolicySpec.parse(text)
+
+
+# --- Networks on the grid --------------------------------------------------------------------------------------------
+
+
+def test_cnn_alone_is_the_papers_network():
+    spec = PolicySpec.parse("cnn")
+    assert spec == CnnSpec() == PolicySpec.parse("cnn:16,32,256") == PolicySpec.parse("cnn:16,32,256@4")
+    assert str(spec) == "cnn:16,32,256@4"
+    assert spec.inputs == 4 * 80 * 80 + 1
+    # Weights and biases: 8 x 8 x 4 to 16, 4 x 4 x 16 to 32, 8 x 8 x 32 and the speed to 256, 256 to 8.
+    assert spec.size == (256 + 1) * 16 + (256 + 1) * 32 + (2049 + 1) * 256 + (256 + 1) * 8
+    assert (spec.observation, PolicySpec.parse("mlp:6,7").observation) == ("grid", "rays")
+
+
+@given(
+    hidden=st.tuples(*[st.integers(1, 4)] * 3).map(lambda t: tuple(8 * n for n in t)),
+    frames=st.integers(1, 8),
+)
+def test_cnn_text_and_back(hidden, frames):
+    text = "cnn:" + ",".join(map(str, hidden)) + f"@{frames}"
+    spec = PolicySpec.parse(text)
+    assert str(spec) == text
+    assert spec.hidden == hidden
+    assert spec.layers.tolist() == [frames, *hidden, 8]
+    assert PolicySpec.parse(str(spec)) == spec
+    assert PolicySpec.parse(text.partition("@")[0]).layers[0] == 4
+    assert spec.size == sum((n + 1) * m for n, m in spec.shapes())
+
+
+def test_genes_are_as_large_as_he_et_al_have_them():
+    spec = PolicySpec.parse("cnn:8,16,32@1")
+    scales = gene_scales(spec)
+    assert scales.shape == (spec.size,)
+    assert scales[0] == pytest.approx(math.sqrt(2 / 64))
+    assert scales[65 * 8] == pytest.approx(math.sqrt(2 / 128))
+    assert scales[65 * 8 + 129 * 16] == pytest.approx(math.sqrt(2 / 1024))
+    assert scales[-1] == pytest.approx(math.sqrt(1 / 32))
+    speed = 65 * 8 + 129 * 16 + 1024 * 32
+    assert (scales[speed : speed + 32] == 1.0).all()
+    assert (gene_scales(PolicySpec.parse("mlp:6,7")) == 1.0).all()

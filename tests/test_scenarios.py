@@ -20,7 +20,7 @@ from gridsim.scenarios import REGISTRY, Scenario, build, sample_starts
 from gridsim.seamless import FEWEST_ROUNDABOUTS
 from gridsim.simulator import collides
 
-LAID = range(24)  # seeds of which strips and lanes are looked at
+LAID = range(16)  # seeds of which strips and lanes are looked at
 BUILT = (0, 1)  # ... whole maps
 F = np.float32
 ROUND = 215.0  # m, of the shortest loop: more than the 200 m within which ground driven again counts nothing
@@ -79,13 +79,12 @@ def test_every_lane_goes_on_where_it_ends(laid):
             assert len(set(following)) == len(following)
             for j in following:
                 assert np.abs(wrapped(points[j][0] - points[i][-1], m.sides)).max() < 1e-3
-                assert (
-                    abs(math.remainder(angles[j][0] - angles[i][-1], 2 * math.pi)) < 0.05
-                )  # half a step on a radius of 10 m
+                turn = math.remainder(angles[j][0] - angles[i][-1], 2 * math.pi)
+                assert abs(turn) < 0.06  # two flares of 8 m radius behind 0.3 m of straight, seen in steps of 1 m
 
 
 def test_every_lane_is_found_by_a_predecessor_and_leads_back_to_itself(name, laid):
-    """Each direction of the loop is a network of its own; of the highway each lane, because changes are no successors."""
+    """Each direction of the loop is a network of its own, and each lane of the highway: changes are no successors."""
     for m in laid:
         graph = lane_graph(m.lanes)
         parts, _ = connected_components(graph, connection="strong")

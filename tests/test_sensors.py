@@ -10,7 +10,7 @@ import pytest
 from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.roads import HEADING_BINS, Strips, clearance_nodes, make_road
 from gridsim.scenarios import build
-from gridsim.sensors import fan, fast_march, march, sense
+from gridsim.sensors import AMONG_THIN_WALLS, PLAIN, fan, fast_march, fast_march_thin, march, sense
 from gridsim.vector import LANES
 
 F = np.float32
@@ -25,6 +25,11 @@ MAPS = (0, 1, 2, 3)
 @numba.njit
 def vector_march(field, columns, rows, px, py, reach, beams):
     fast_march(field, columns, rows, px, py, reach, beams)
+
+
+@numba.njit
+def vector_march_thin(field, columns, rows, px, py, reach, beams):
+    fast_march_thin(field, columns, rows, px, py, reach, beams)
 
 
 def look(road, points, headings, k=K, count=31):
@@ -48,12 +53,12 @@ def random_points(exact, n, rng, margin=0.0, side=SIDE):
 class Views:
     """Poses on the road of one map, what the kernel sees there, and what is there."""
 
-    def __init__(self, seed):
-        self.scenario = build("seamless", seed)
+    def __init__(self, seed, name="seamless", count=POSES_A_MAP):
+        self.scenario = build(name, seed)
         self.exact = oracle.ExactRoad(self.scenario.strips, SIDE, SIDE)
         rng = np.random.default_rng(1000 + seed)
-        self.points = random_points(self.exact, POSES_A_MAP, rng)
-        self.headings = rng.uniform(-math.pi, math.pi, POSES_A_MAP).astype(F)
+        self.points = random_points(self.exact, count, rng)
+        self.headings = rng.uniform(-math.pi, math.pi, count).astype(F)
         self.angles = self.headings[:, None].astype(float) + RAYS
         self.seen = look(self.scenario.road, self.points, self.headings).astype(float)
         self.true = self.exact.cast(self.points, self.angles, REACH)
@@ -131,20 +136,71 @@ def test_rays_on_a_ring():
     assert np.quantile(np.abs(look(road, points, headings) - true), 0.99) < 0.1
 
 
-@pytest.mark.parametrize("wall", [2.5, 4.0])
-def test_no_ray_passes_a_wall(wall):
-    """Two roads side by side, a wall between them: rays from one never reach the other.
-
-    Stretched steps may carry a ray over a wall of less than half the clearance before it (2 m on these roads).
-    """
-    road, _ = strip_road([[0, 20, 64, 20, 4.0], [0, 20 + 8 + wall, 64, 20 + 8 + wall, 4.0]])
+@pytest.mark.parametrize(
+    ("half", "wall", "thin"),
+    [
+        *((half, wall, True) for half in (3.0, 4.0, 8.0) for wall in (1.0, 1.3, 2.0)),
+        (4.0, 2.5, False),
+        (4.0, 4.0, False),
+    ],
+)
+def test_no_ray_passes_a_wall(half, wall, thin):
+    """Two roads side by side, a wall between them: rays from one never reach the other, from wherever they start."""
+    strips = [[0, 20.2, 64, 20.2, half], [0, 20.2 + 2 * half + wall, 64, 20.2 + 2 * half + wall, half]]
+    road = strip_road(strips)[0]._replace(thin=np.uint32(thin))
     rng = np.random.default_rng(3)
-    points = np.stack([rng.uniform(0, 64, 400), rng.uniform(16.5, 23.5, 400)], axis=1).astype(F)
-    headings = rng.uniform(0.1, math.pi - 0.1, 400)
+    points = np.stack([rng.uniform(0, 64, 1000), 20.2 + (half - 0.5) * rng.uniform(-1, 1, 1000)], axis=1).astype(F)
+    headings = rng.uniform(0.1, math.pi - 0.1, 1000)
     ranges = look(road, points, headings)
-    top = points[:, 1:] + ranges * np.sin(headings[:, None] + RAYS)
-    assert top.max() < 24.0 + 0.1
-    assert top.max() > 23.9
+    angles = headings[:, None] + RAYS
+    top = points[:, 1:] + ranges * np.sin(angles)
+    assert top.max() < 20.2 + half + 0.1
+    assert top.max() > 20.2 + half - 0.1
+
+
+def test_rays_see_parked_cars():
+    """Posts of 1 m x 1 m and cars of 1.8 m x 4 m on a wide road: a ray that meets one's inner part ends there.
+
+    Inner, by 0.36 m: then the way through the block is 1 m or more even across a corner, and rays look out for that.
+    """
+    rng = np.random.default_rng(8)
+    blocks = []
+    for size in ((0.5, 0.5), (2.0, 0.9)):
+        x, y = np.meshgrid(np.arange(8, 128, 16), np.arange(8, 128, 16))
+        at = np.stack([x.ravel(), y.ravel() + (8.0 if size[0] > 1 else 0.0)], axis=1) + rng.uniform(-2, 2, (64, 2))
+        blocks += [[*p, rng.uniform(0, 3), *size] for p in at]
+    lines = np.array([[0.0, y, 128.0, y, 24.0] for y in (16.0, 48.0, 80.0, 112.0)])
+    strips = Strips(lines, np.zeros((0, 6)), np.array(blocks))
+    exact, inner = oracle.ExactRoad(strips, 128.0, 128.0), oracle.ExactRoad(strips, 128.0, 128.0)
+    inner.blocks[:, 3:5] -= 0.36
+    road = make_road(clearance_nodes(strips, 128.0, 128.0), (5.0, 12.0), REACH)
+    points = random_points(exact, 1500, rng, margin=0.3, side=128.0)
+    headings = rng.uniform(-math.pi, math.pi, len(points))
+    angles = headings[:, None] + RAYS
+    missed = {}
+    for thin in (True, False):
+        seen = look(road._replace(thin=np.uint32(thin)), points, headings)
+        missed[thin] = (seen > inner.cast(points, angles, REACH) + 0.5).mean()
+    print(f"rays that miss a block: {missed[True]:.5f}, without looking out for it {missed[False]:.5f}")
+    assert missed[True] < 2e-4
+    assert missed[False] > 5 * missed[True]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rays_in_the_city(seed):
+    """Corners of parked cars, which the field rounds by 0.1 m, make one ray in a hundred a far one: hence p97."""
+    view = Views(seed, "city", 1200)
+    error = np.abs(view.seen - view.true).ravel()
+    shift = (view.with_edges_moved(0.03) - view.with_edges_moved(-0.03)).ravel()
+    kept = error[np.argsort(shift, kind="stable")[: round(0.995 * error.size)]]
+    print("city rays: p50 {:.3f}, p97 {:.3f}, p99 {:.3f} m".format(*np.quantile(kept, [0.5, 0.97, 0.99])))
+    assert np.quantile(kept, 0.5) <= 0.03
+    assert np.quantile(kept, 0.97) <= 0.2
+    inner = np.flatnonzero(view.exact.clearance(view.points) > 0.2)
+    low, high = view.with_edges_moved(-0.15, inner), view.with_edges_moved(0.15, inner)
+    outside = (view.seen[inner] < low - 0.2) | (view.seen[inner] > high + 0.2)
+    print(f"city rays not explained by edges 0.15 m off: {outside.mean():.5f}")
+    assert outside.mean() < 0.003
 
 
 def test_an_empty_world_and_a_full_one():
@@ -183,23 +239,25 @@ def test_the_sensor_knows_no_border(scenario, views):
     assert np.quantile(np.abs(turned - seen), 0.98) < 1e-3
 
 
-def march_both(road, point, angles, start=0.0):
+def march_both(road, point, angles, start=0.0, thin=False):
     """Ranges [2, LANES] by the plain kernel and by the vector code, of rays from one point."""
     results = []
-    for kernel in (march, vector_march):
+    how, vector = (AMONG_THIN_WALLS, vector_march_thin) if thin else (PLAIN, vector_march)
+    for kernel, more in ((march, (how,)), (vector, ())):
         beams = np.stack([np.cos(angles), np.sin(angles), np.full(LANES, start)]).astype(F)
-        kernel(road.field, road.columns, road.rows, F(2 * point[0]), F(2 * point[1]), F(REACH), beams)
+        kernel(road.field, road.columns, road.rows, F(2 * point[0]), F(2 * point[1]), F(REACH), beams, *more)
         results.append(beams[2])
     return np.array(results)
 
 
-def test_vector_code_is_the_plain_kernel(scenario, views):
+@pytest.mark.parametrize("thin", [False, True])
+def test_vector_code_is_the_plain_kernel(scenario, views, thin):
     """One ray in all lanes: then no lane marches on for another's sake, and the two are the same arithmetic."""
     rng = np.random.default_rng(4)
     inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:400]
     both = []
     for point in views[0].points[inner]:
-        plain, vector = march_both(scenario.road, point, np.full(LANES, rng.uniform(-math.pi, math.pi)))
+        plain, vector = march_both(scenario.road, point, np.full(LANES, rng.uniform(-math.pi, math.pi)), thin=thin)
         assert (vector == vector[0]).all()
         assert (plain == plain[0]).all()
         both.append((plain[0], vector[0]))
@@ -208,13 +266,16 @@ def test_vector_code_is_the_plain_kernel(scenario, views):
     assert np.abs(plain - vector).max() < 2e-3
 
 
-def test_vector_code_is_the_plain_kernel_lane_by_lane(scenario, views):
+@pytest.mark.parametrize("thin", [False, True])
+def test_vector_code_is_the_plain_kernel_lane_by_lane(scenario, views, thin):
     """A ray that has arrived keeps coming closer to the edge while others of its block are on their way."""
     rng = np.random.default_rng(5)
     inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:600]
     points = views[0].points[inner]
     angles = rng.uniform(-math.pi, math.pi, (len(points), 1)) + np.radians(np.linspace(-60, 60, LANES))
-    plain, vector = np.stack([march_both(scenario.road, p, a) for p, a in zip(points, angles, strict=True)], axis=1)
+    plain, vector = np.stack(
+        [march_both(scenario.road, p, a, thin=thin) for p, a in zip(points, angles, strict=True)], axis=1
+    )
     true = views[0].exact.cast(points, angles, REACH)
     away = np.abs(plain - vector)
     print("plain and vector march: p50 {:.1e}, p90 {:.1e}, p99 {:.1e} m".format(*np.quantile(away, [0.5, 0.9, 0.99])))

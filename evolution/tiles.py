@@ -1,0 +1,116 @@
+"""Vector code for `convnet`: a tile of a layer's output, some positions times some units, held in registers.
+
+A position's inputs lie in `planes` x `rows` runs of `run` numbers; `vector_tile` emits LLVM vectors, `plain_tile` is
+the same arithmetic in plain Python, for `NUMBA_DISABLE_JIT=1` and for the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.extending import intrinsic
+
+from gridsim.jit import CONFIG
+
+
+def plain_tile(positions: int, lanes: int, rectify: bool) -> Callable[..., None]:
+    """A tile in plain Python; see `tile`."""
+
+    def plain(
+        x, x_at, x_step, planes, plane_step, rows, row_step, run, w, w_at, width, bias_at, y, y_at, y_step
+    ):  # fmt: skip
+        for p in range(positions):
+            total = w[bias_at : bias_at + lanes].copy()
+            at = w_at
+            for plane in range(planes):
+                for row in range(rows):
+                    first = x_at + p * x_step + plane * plane_step + row * row_step
+                    for i in range(run):
+                        total += x[first + i] * w[at : at + lanes]
+                        at += width
+            y[y_at + p * y_step : y_at + p * y_step + lanes] = np.where(total < 0.0, 0.0, total) if rectify else total
+
+    return plain
+
+
+def vector_tile(positions: int, lanes: int, rectify: bool) -> Any:
+    """A tile as an intrinsic for kernels; see `tile`."""
+
+    @intrinsic
+    def vector(
+        typingctx, x, x_at, x_step, planes, plane_step, rows, row_step, run, w, w_at, width, bias_at, y, y_at, y_step
+    ):  # fmt: skip
+        n = types.int64
+        signature = types.void(x, n, n, n, n, n, n, n, w, n, n, n, y, n, n)
+
+        def codegen(context, builder, sig, args):
+            f32, i32, i64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+            vf = ir.VectorType(f32, lanes)
+            undefined = ir.Constant(vf, ir.Undefined)
+
+            def data(k: int) -> ir.Value:
+                return context.make_array(sig.args[k])(context, builder, args[k]).data
+
+            def vector_at(pointer: ir.Value, at: ir.Value) -> ir.Value:
+                return builder.bitcast(builder.gep(pointer, [at]), vf.as_pointer())
+
+            def load(pointer: ir.Value, at: ir.Value) -> ir.Value:
+                value = builder.load(vector_at(pointer, at))
+                value.align = 4  # a genome begins anywhere
+                return value
+
+            def splat(value: ir.Value) -> ir.Value:
+                single = builder.insert_element(undefined, value, ir.Constant(i32, 0))
+                return builder.shuffle_vector(single, undefined, ir.Constant(ir.VectorType(i32, lanes), [0] * lanes))
+
+            inputs, weights, outputs = data(0), data(8), data(12)
+            x_at, x_step, planes, plane_step, rows, row_step, run = args[1:8]
+            w_at, width, bias_at = args[9:12]
+            y_at, y_step = args[13:15]
+            totals = [cgutils.alloca_once(builder, vf) for _ in range(positions)]
+            bias = load(weights, bias_at)
+            for total in totals:
+                builder.store(bias, total)
+            row_width = builder.mul(run, width)
+            with cgutils.for_range(builder, planes, intp=i64) as plane:
+                plane_at = builder.add(x_at, builder.mul(plane.index, plane_step))
+                plane_w = builder.add(w_at, builder.mul(builder.mul(plane.index, rows), row_width))
+                with cgutils.for_range(builder, rows, intp=i64) as row:
+                    row_at = builder.add(plane_at, builder.mul(row.index, row_step))
+                    row_w = builder.add(plane_w, builder.mul(row.index, row_width))
+                    with cgutils.for_range(builder, run, intp=i64) as i:
+                        weight = load(weights, builder.add(row_w, builder.mul(i.index, width)))
+                        at = builder.add(row_at, i.index)
+                        for total in totals:
+                            value = splat(builder.load(builder.gep(inputs, [at])))
+                            product = builder.fmul(value, weight, flags=("contract",))
+                            builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+                            at = builder.add(at, x_step)
+            zero = ir.Constant(vf, [0.0] * lanes)
+            at = y_at
+            for total in totals:
+                value = builder.load(total)
+                if rectify:  # so compared, not a number stays one
+                    value = builder.select(builder.fcmp_ordered("<", value, zero), zero, value)
+                builder.store(value, vector_at(outputs, at)).align = 4
+                at = builder.add(at, y_step)
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return vector
+
+
+def tile(positions: int, lanes: int, rectify: bool) -> Any:
+    """A function for kernels: biases plus weights times inputs, of `positions` x `lanes` outputs, rectified if so.
+
+    Its arguments: float32 [any] inputs x and, within it, where the first position's begin, how far the next position's
+    are, planes and how far they are apart, rows and how far they are apart, numbers in a row's run; weights w and where
+    they begin, units of the whole layer, where the biases begin; outputs y, where they begin, how far positions are
+    apart. Each output is summed in the order of its inputs, whatever the machine's vectors are.
+    """
+    return plain_tile(positions, lanes, rectify) if CONFIG.DISABLE_JIT else vector_tile(positions, lanes, rectify)

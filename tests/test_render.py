@@ -1,0 +1,244 @@
+"""Pictures are held against the map and the state they show: which pixel is what, and where things are."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gridsim import render
+from gridsim.config import SimConfig
+from gridsim.render import Renderer, between
+from gridsim.roads import clearance
+from gridsim.scenarios import build, sample_starts
+from gridsim.simulator import COS, FIELDS, SIN, SPEED, STEERING, Simulator, X, Y
+
+BARE = {**os.environ}
+for _name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR"):
+    BARE.pop(_name, None)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return build("seamless", 3)
+
+
+@pytest.fixture(scope="module")
+def state(scenario):
+    """A car that stands at a start, and what it sees."""
+    simulator = Simulator([scenario], 1)
+    ranges, _ = simulator.reset(sample_starts(scenario, 1, np.random.default_rng(5)))
+    return simulator.state.cars[0].copy(), ranges[0]
+
+
+def car_at(x, y, heading=0.0):
+    car = np.zeros(FIELDS, dtype=np.float32)
+    car[[X, Y, COS, SIN]] = x, y, np.cos(heading), np.sin(heading)
+    return car
+
+
+def distance(pixels, colour):
+    """How far pixels [..., 3] are from a colour."""
+    return np.abs(pixels.astype(int) - np.array(colour)).max(axis=-1)
+
+
+def world(renderer, car, column, row):
+    """Where pixels' middles are, by the textbook's turning: metres ahead and to the right of the car."""
+    ahead = (renderer.size[1] * render.CAR_AT - (row + 0.5)) / renderer.pixels_per_m
+    right = (column + 0.5 - renderer.size[0] / 2) / renderer.pixels_per_m
+    return (
+        car[X] + ahead * car[COS] + right * car[SIN],
+        car[Y] + ahead * car[SIN] - right * car[COS],
+    )
+
+
+def test_every_pixel_is_road_where_the_map_has_road(scenario):
+    renderer = Renderer(scenario, (320, 240))
+    for pose in sample_starts(scenario, 4, np.random.default_rng(1)):
+        car = car_at(*pose[:3])
+        image = renderer.draw(car)
+        row, column = np.mgrid[0:240, 0:320]
+        x, y = world(renderer, car, column, row)
+        clear = np.array([clearance(scenario.road, a, b) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
+        clear = clear.reshape(x.shape)
+        wall = clear < -render.VERGE_WIDTH - 0.3
+        assert wall.sum() > 10_000
+        ground = np.minimum(distance(image, render.GROUND), distance(image, render.GROUND_OTHER))
+        assert ground[wall].max() <= 1
+        # Well inside, there is asphalt but for the car and the marks.
+        inside = clear > 0.8
+        off = distance(image, render.ASPHALT) > 1
+        near = np.hypot(x - car[X], y - car[Y]) < 3.5
+        assert off[inside & ~near].mean() < 0.05
+        # The white line runs along the inner side of the edge.
+        line = (np.abs(clear - render.EDGE_AT) < 0.04) & ~near
+        assert np.median(image[line].min(axis=-1)) > 130
+
+
+def test_car_covers_its_own_outline(scenario, state):
+    car, _ = state
+    renderer = Renderer(scenario, (640, 480), metres=30.0)
+    without = renderer.draw(car_at(car[X] + 100.0, car[Y], 0.0))  # moves the view; drawn again below with the car
+    image = renderer.draw(car)
+    assert (image != without).any()
+    red = distance(image, render.EGO) < 25
+    row, column = np.nonzero(red)
+    x, y = world(renderer, car, column, row)
+    along = (x - car[X]) * car[COS] + (y - car[Y]) * car[SIN]
+    across = -(x - car[X]) * car[SIN] + (y - car[Y]) * car[COS]
+    assert np.abs(along).max() == pytest.approx(2.0, abs=0.25)
+    assert np.abs(across).max() == pytest.approx(1.0, abs=0.25)
+    # Its front is told by the headlights: pale pixels ahead of the centre, none behind.
+    row, column = np.nonzero(distance(image, render.LIGHT) < 12)
+    x, y = world(renderer, car, column, row)
+    ahead = (x - car[X]) * car[COS] + (y - car[Y]) * car[SIN]
+    near = np.hypot(x - car[X], y - car[Y]) < 2.2
+    assert near.any()
+    assert ahead[near].min() > 1.2
+
+
+def test_other_cars_are_where_the_boxes_are_also_over_the_seam(scenario):
+    renderer = Renderer(scenario, (320, 240))
+    width = float(scenario.road.width)
+    car = car_at(width - 2.0, 128.0)
+    box = np.array([[8.0, 130.0, 1.0, 0.0]])  # 10 m ahead, beyond the edge of the torus, and 2 m to the left
+    blue = distance(renderer.draw(car, boxes=box), render.OTHER) < 25
+    blue &= ~(distance(renderer.draw(car), render.OTHER) < 25)
+    row, column = np.nonzero(blue)
+    assert blue.sum() > 30
+    assert 240 * render.CAR_AT - row.mean() == pytest.approx(10.0 * renderer.pixels_per_m, abs=2.5)
+    assert 160 - column.mean() == pytest.approx(2.0 * renderer.pixels_per_m, abs=2.0)
+
+
+def test_rays_end_where_the_ranges_say(scenario, state):
+    car, ranges = state
+    renderer = Renderer(scenario, (640, 480))
+    image = renderer.draw(car, ranges=ranges)
+    sensors = SimConfig().sensors
+    first, step = -np.radians(sensors.field_of_view) / 2, np.radians(sensors.field_of_view) / (sensors.rays - 1)
+    seen = 0
+    for k, reach in enumerate(ranges):
+        turn = first + step * k
+        ahead, left = 1.25 + reach * np.cos(turn), reach * np.sin(turn)
+        column = 320 - left * renderer.pixels_per_m
+        row = 480 * render.CAR_AT - ahead * renderer.pixels_per_m
+        if reach < 49.0 and 0 <= column < 639 and 0 <= row < 479:
+            seen += 1
+            assert distance(image[int(row), int(column)], render.RAY) < 40
+    assert seen > 15
+
+
+def test_grid_is_drawn_ahead_with_left_on_the_left(scenario, state):
+    car, _ = state
+    renderer = Renderer(scenario, (640, 480), metres=60.0)
+    plain = renderer.draw(car)
+    grid = np.full((80, 80), 127, dtype=np.uint8)
+    grid[40, 10] = 255  # 19.75 m ahead of the front axle, 14.75 m to the left
+    image = renderer.draw(car, grid=grid)
+    reddest = image[..., 0].astype(int) - image[..., 1]
+    car_free = reddest[: int(480 * render.CAR_AT) - 40]
+    row, column = np.unravel_index(car_free.argmax(), car_free.shape)
+    assert 480 * render.CAR_AT - row == pytest.approx((1.25 + 19.75) * renderer.pixels_per_m, abs=4)
+    assert 320 - column == pytest.approx(14.75 * renderer.pixels_per_m, abs=4)
+    assert (image[:10] == plain[:10]).all()  # beyond 41 m there is no grid
+
+
+def test_path_text_and_map_view(scenario, state):
+    car, _ = state
+    renderer = Renderer(scenario, (640, 480))
+    path = np.array([car[[X, Y]] - k * 0.5 * car[[COS, SIN]] for k in range(16)])
+    plain, image = renderer.draw(car), renderer.draw(car, path=path, text=("7.0 m/s", "above"))
+    behind = round(480 * render.CAR_AT + 5.0 * renderer.pixels_per_m)
+    assert distance(image[behind, 318:322], render.PATH).min() < 30
+    assert distance(plain[behind, 318:322], render.PATH).min() > 60
+    assert (image[450:, 16:120].max(axis=-1) > 230).sum() > 40  # bright letters
+    assert (image[6:40, 16:120].max(axis=-1) > 230).sum() > 40
+    whole = Renderer(scenario, (256, 256), follow=False)
+    image = whole.draw(car)
+    row, column = np.nonzero(distance(image, render.EGO) < 60)
+    assert column.mean() == pytest.approx(car[X] * whole.pixels_per_m, abs=2.5)
+    assert 256 - row.mean() == pytest.approx(car[Y] * whole.pixels_per_m, abs=2.5)
+
+
+def test_view_repeats_over_the_torus(scenario):
+    renderer = Renderer(scenario, (320, 240))
+    width = float(scenario.road.width)
+    near, far = renderer.draw(car_at(0.5, 100.0)), renderer.draw(car_at(width + 0.5, 100.0))
+    assert (np.abs(near.astype(int) - far) > 2).mean() < 0.002  # but for rounding of positions
+
+
+def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
+    import dataclasses
+
+    flat = dataclasses.replace(scenario, torus=False)
+    image = Renderer(flat, (320, 240)).draw(car_at(0.0, 100.0, np.pi))  # heading out of the map
+    ahead = image[: int(240 * render.CAR_AT) - 25]
+    ground = np.minimum(distance(ahead, render.GROUND), distance(ahead, render.GROUND_OTHER))
+    assert ground.max() <= 1
+
+
+def test_marks_lie_between_lanes_and_not_in_junctions(scenario):
+    marks = Renderer(scenario)._marks
+    assert len(marks) > 100
+    points = scenario.lanes.points.astype(float)
+    size = np.array([scenario.road.width, scenario.road.height], dtype=float)
+    for x, y in marks[::7, :2]:
+        gap = points - [x, y]
+        gap -= np.round(gap / size) * size
+        assert np.hypot(*gap.T).min() > 1.2  # half a lane from any lane's centre line
+        assert clearance(scenario.road, np.float32(x), np.float32(y)) > 2.0
+
+
+def test_drawing_changes_nothing_and_is_the_same_again(scenario, state):
+    car, ranges = state
+    car.setflags(write=False)
+    renderer = Renderer(scenario, (320, 240))
+    first = renderer.draw(car, ranges=ranges, text="a")
+    renderer.draw(car_at(10.0, 10.0, 2.0))
+    assert (renderer.draw(car, ranges=ranges, text="a") == first).all()
+
+
+def test_between_goes_over_the_seam_and_keeps_the_heading_a_unit(scenario):
+    width = float(scenario.road.width)
+    a, b = car_at(width - 1.0, 5.0, 0.0), car_at(1.0, 5.0, 1.0)
+    b[SPEED], b[STEERING] = 4.0, 0.2
+    half = between(a, b, 0.5, scenario)
+    assert half[X] % width == pytest.approx(0.0, abs=1e-3)
+    assert np.arctan2(half[SIN], half[COS]) == pytest.approx(0.5, abs=1e-3)
+    assert np.hypot(half[SIN], half[COS]) == pytest.approx(1.0, abs=1e-6)
+    assert half[SPEED] == pytest.approx(2.0)
+    assert between(a, b, 0.0, scenario) == pytest.approx(a)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [({"size": (8, 480)}, "pixels"), ({"metres": 0.0}, "metres"), ({"metres": float("nan")}, "metres")],
+)
+def test_wrong_numbers_are_one_line(scenario, arguments, expected):
+    with pytest.raises(ValueError, match=expected):
+        Renderer(scenario, **arguments)
+
+
+WINDOW = "from gridsim.render import NoDisplayError, Window\ntry:\n    Window((320, 240))\n    print('open')\n" + (
+    "except NoDisplayError as error:\n    print(error)\n"
+)
+
+
+def window(**environment):
+    done = subprocess.run(
+        [sys.executable, "-c", WINDOW], env={**BARE, **environment}, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout.strip()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a display")
+def test_no_display_is_one_line_and_a_chosen_driver_is_accepted():
+    for nowhere in ({}, {"DISPLAY": ":77"}):
+        said = window(**nowhere)
+        assert said.startswith("no window can be opened")
+        assert "DISPLAY" in said
+        assert "\n" not in said
+    assert window(SDL_VIDEODRIVER="dummy") == "open"
