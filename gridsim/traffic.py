@@ -383,15 +383,40 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
 
 
 @leaf
+def _is_junction(network, lane):
+    return network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]
+
+
+@leaf
+def _passes(network, drivers, lane, other):
+    """Whether a lane passes where the rear of a car is that waits at the end of another lane with the same beginning."""
+    step = network.steps[other]
+    q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
+    reach = _F(2.0) * drivers.half_width + _F(2.0) * _CAUTION
+    for p in range(network.offsets[lane], network.offsets[lane + 1]):
+        dx = _turned(network.points[p, 0] - network.points[q, 0], network.width)
+        dy = _turned(network.points[p, 1] - network.points[q, 1], network.height)
+        if dx * dx + dy * dy < reach * reach:
+            return True
+    return False
+
+
+@leaf
 def _may_enter(network, drivers, world, i, ego):
     """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
     car = world[i]
-    lane, beyond = _I(car[NEXT]), _I(car[AFTER])
+    here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
+    # Who enters must be able to leave, or junctions would block each other. Before another junction there is room for
+    # one, else for as many as the lane beyond holds.
+    chained = _is_junction(network, beyond)
+    place = _F(2.0) * drivers.half_length + drivers.jam
+    room, needed = max(_lane_length(network, beyond), place), place
     for j in range(world.shape[0]):
         if j == i or world[j, LANE] < _ZERO:
             continue
         there, past, permit = _I(world[j, LANE]), _I(world[j, PAST]), _I(world[j, PERMIT])
+        onward = _I(world[j, NEXT])
         for c in range(first, last):
             other = network.crossings[c]
             if permit == other:
@@ -402,9 +427,34 @@ def _may_enter(network, drivers, world, i, ego):
                 network.clear[c] + _HALF
             ):
                 return False
-        room = _F(3.0) * drivers.half_length + drivers.jam
-        if there == beyond and world[j, ALONG] < room and world[j, SPEED] < _F(2.0):
+        waits = _I(-1)  # lane at whose end the other may have to wait, still in this junction
+        if there == here and world[j, ALONG] > car[ALONG]:
+            if permit != onward:
+                return False  # who is in front of this one waits for others, who must not wait for this one
+            if _is_junction(network, _I(world[j, AFTER])):
+                waits = permit
+        elif permit != onward and _is_junction(network, there) and _is_junction(network, onward):
+            for k in range(network.successors.shape[1]):
+                if there == network.successors[here, k]:
+                    waits = there
+        if waits >= 0 and waits != lane and _passes(network, drivers, lane, waits):
             return False
+        if chained:
+            if there == lane or permit == lane:
+                return False
+            for k in range(network.successors.shape[1]):
+                if there == network.successors[lane, k] and world[j, SPEED] < _F(2.0):
+                    if world[j, ALONG] < place + drivers.half_length:
+                        return False
+        elif there == beyond:
+            rear = world[j, ALONG] - drivers.half_length
+            room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
+        elif permit >= 0 and _I(world[j, AFTER]) == beyond:
+            needed += place
+        elif onward == beyond and _is_junction(network, there):
+            needed += place
+    if not chained and room < needed:
+        return False
     # The ego car goes first, unless it is behind this one.
     if ego[COS] == _ZERO and ego[SIN] == _ZERO:
         return True
@@ -593,7 +643,7 @@ def _go(network, drivers, car):
     if car[ALONG] >= length:
         lane = _I(car[LANE])
         car[ALONG] -= length
-        car[PAST] = car[LANE] if network.crossing_offsets[lane + 1] > network.crossing_offsets[lane] else -_ONE
+        car[PAST] = car[LANE] if _is_junction(network, lane) else -_ONE
         car[LANE], car[NEXT] = car[NEXT], car[AFTER]
         car[PERMIT] = -_ONE
         car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
@@ -618,7 +668,7 @@ def flow(network, drivers, world, ego, step):
         lane, onward = _I(car[LANE]), _I(car[NEXT])
         desired = _desired(network, car)
         pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD])
-        if network.crossing_offsets[onward + 1] > network.crossing_offsets[onward] and car[PERMIT] != car[NEXT]:
+        if _is_junction(network, onward) and car[PERMIT] != car[NEXT]:
             # A junction comes: up to its line without a permit.
             line = _lane_length(network, lane) - car[ALONG] - drivers.half_length
             if line < car[HORIZON]:

@@ -1,0 +1,135 @@
+"""Traffic alone: whether it runs into itself or comes to a stop, hour after hour.
+
+    python benchmarks/traffic.py [--hours 1] [--seeds 20] [--cars N] [--scenario NAME] [--json]
+
+Each scenario's default number of cars (6 where that is 0) drives on so many maps for so many simulated hours, with no
+ego car. A row a scenario:
+
+    cars        a map, of those that found room to start
+    overlaps    pairs of cars that overlap, counted in every control step: must be 0
+    speed       m/s, mean of all cars over all the time
+    worst map   m/s, the same of the slowest map
+    at the end  m/s, the same of the slowest map in the last tenth of the time: what gridlock would bring down
+    open road   m/s, mean speed of one who drives everywhere as fast as the lanes allow
+    stood       s, the longest that any car stood still
+
+Exits with 1 if there is an overlap, or a map where cars are in the end no faster than half of what the road allows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+
+import numpy as np
+
+from gridsim.boxes import boxes_touch
+from gridsim.config import SimConfig, constants
+from gridsim.jit import njit
+from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.traffic import COS, LANE, SIN, SPEED, Network, X, Y, drivers, flow, spawn, wrapped
+
+CARS = 6  # where the scenario's default is none
+
+
+@njit(nogil=True)
+def soak(network, drivers, constants, world, first, steps, stood):
+    """Let traffic flow for so many control steps from number `first` on.
+
+    Args: world [cars, FIELDS], changed; stood int64 [cars], steps for which each car has stood by now, changed.
+    Returns: (overlaps, sum of all cars' speeds over all steps in m/s, most steps for which any car stood).
+    """
+    nobody = np.zeros(5, dtype=np.float32)
+    overlaps, total, longest = 0, 0.0, 0
+    for step in range(first, first + steps):
+        flow(network, drivers, world, nobody, np.int32(step))
+        for i in range(world.shape[0]):
+            car = world[i]
+            if car[LANE] < 0.0:
+                continue
+            total += car[SPEED]
+            stood[i] = stood[i] + 1 if car[SPEED] < 0.1 else 0
+            longest = max(longest, stood[i])
+            for j in range(i):
+                if world[j, LANE] >= 0.0:
+                    dx = wrapped(world[j, X] - car[X], network.width)
+                    dy = wrapped(world[j, Y] - car[Y], network.height)
+                    if dx * dx + dy * dy < 25.0 and boxes_touch(
+                        constants, dx, dy, car[COS], car[SIN], world[j, COS], world[j, SIN]
+                    ):
+                        overlaps += 1
+    return overlaps, total, longest
+
+
+def open_road(network: Network) -> float:
+    """Mean speed (m/s), over all lanes, of one who drives everywhere as fast as they allow."""
+    metres = np.repeat(network.steps.astype(np.float64), np.diff(network.offsets))
+    return float(metres.sum() / (metres / network.speeds).sum())
+
+
+def measure(scenario: str, cars: int, seeds: int, hours: float) -> dict[str, float]:
+    """One row of the table."""
+    sim = SimConfig()
+    k, others, period = constants(sim), drivers(sim), sim.episode.control_period
+    steps = round(hours * 3600 / period)
+    parts = [steps - steps // 10, steps // 10]
+    totals, ends, frees, present, overlaps, longest = [], [], [], [], 0, 0
+    for seed in range(seeds):
+        network = build(scenario, HELD_OUT_SEED + seed, sim).network
+        start = np.full((1, 5), 1e6, dtype=np.float32)
+        world = spawn(network, start, cars, np.array([seed], dtype=np.uint64), sim.traffic)[0]
+        there = max(int((world[:, LANE] >= 0).sum()), 1)
+        stood = np.zeros(cars, dtype=np.int64)
+        means, done = [], 0
+        for part in parts:
+            touched, total, most = soak(network, others, k, world, done, part, stood)
+            overlaps, longest, done = overlaps + touched, max(longest, most), done + part
+            means.append(total / there / max(part, 1))
+        totals.append((means[0] * parts[0] + means[1] * parts[1]) / steps)
+        ends.append(means[1])
+        frees.append(open_road(network))
+        present.append(there)
+    return {
+        "cars": float(np.mean(present)),
+        "overlaps": overlaps,
+        "speed": float(np.mean(totals)),
+        "worst map": min(totals),
+        "at the end": min(ends),
+        "open road": float(np.mean(frees)),
+        "gridlocks": int(sum(end < free / 2 for end, free in zip(ends, frees, strict=True))),
+        "stood": longest * period,
+    }
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--hours", type=float, default=1.0, help="simulated, on each map (1)")
+    parser.add_argument("--seeds", type=int, default=20, help="maps of each scenario (20)")
+    parser.add_argument("--cars", type=int, default=0, help="on each map, in place of the scenario's default")
+    parser.add_argument("--scenario", choices=sorted(REGISTRY), help="this one alone")
+    parser.add_argument("--json", action="store_true", help="print one flat JSON object of numbers, nothing else")
+    options = parser.parse_args()
+    if options.seeds < 1 or not 0.0 < options.hours <= 1000.0 or options.cars < 0:
+        parser.error("--seeds must be 1 or more, --hours above 0, --cars 0 or more")
+    columns = ("cars", "overlaps", "speed", "worst map", "at the end", "open road", "gridlocks", "stood")
+    if not options.json:
+        print(f"{'':<12}" + "".join(f"{name:>11}" for name in columns) + f"{'took, s':>10}")
+    failed, flat = False, {}
+    for name in [options.scenario] if options.scenario else REGISTRY:
+        began = time.perf_counter()
+        row = measure(name, options.cars or REGISTRY[name].traffic or CARS, options.seeds, options.hours)
+        failed |= bool(row["overlaps"] or row["gridlocks"])
+        flat.update({f"{name}_{key.replace(' ', '_')}": value for key, value in row.items()})
+        if not options.json:
+            figures = "".join(f"{row[key]:>11.0f}" if row[key] == int(row[key]) else f"{row[key]:>11.2f}" for key in columns)
+            print(f"{name:<12}{figures}{time.perf_counter() - began:>10.1f}", flush=True)
+    if options.json:
+        print(json.dumps(flat))
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
