@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -115,6 +116,10 @@ class Scenario:
             torus=bool(torus),
             starts=frozen["starts"],
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies are read-only, too: kernels would be compiled anew for arrays that can be written to."""
+        return Scenario.from_arrays, (self.arrays(),)
 
 
 @dataclass(frozen=True)
