@@ -124,7 +124,9 @@ def main() -> int:
         failed |= bool(row["overlaps"] or row["gridlocks"])
         flat.update({f"{name}_{key.replace(' ', '_')}": value for key, value in row.items()})
         if not options.json:
-            figures = "".join(f"{row[key]:>11.0f}" if row[key] == int(row[key]) else f"{row[key]:>11.2f}" for key in columns)
+            figures = "".join(
+                f"{row[key]:>11.0f}" if row[key] == int(row[key]) else f"{row[key]:>11.2f}" for key in columns
+            )
             print(f"{name:<12}{figures}{time.perf_counter() - began:>10.1f}", flush=True)
     if options.json:
         print(json.dumps(flat))
