@@ -402,6 +402,19 @@ def _passes(network, drivers, lane, other):
 
 
 @leaf
+def _reaches(network, lane, x, y, within):
+    """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
+    first, k = network.offsets[lane], network.offsets[lane]
+    while k < network.offsets[lane + 1]:
+        dx, dy = _turned(network.points[k, 0] - x, network.width), _turned(network.points[k, 1] - y, network.height)
+        apart = math.sqrt(dx * dx + dy * dy)
+        if apart < within:
+            return _F(k - first) * network.steps[lane]
+        k += max(_I((apart - within) / network.steps[lane]), _I(1))
+    return _F(1e9)
+
+
+@leaf
 def _may_enter(network, drivers, world, i, ego):
     """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
     car = world[i]
@@ -451,26 +464,20 @@ def _may_enter(network, drivers, world, i, ego):
             room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
         elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and _is_junction(network, there)):
             needed += place
-    if not chained and room < needed:
-        return False
     # The ego car goes first, unless it is behind this one.
-    if ego[COS] == _ZERO and ego[SIN] == _ZERO:
-        return True
-    dx, dy = ego[X] - car[X], ego[Y] - car[Y]
-    dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-    forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-    if dx * dx + dy * dy < _F(2500.0) and not (forward < _ZERO and abs(aside) < _F(2.5)):
-        for t in range(5):  # s, what it takes to leave a junction
-            x, y = ego[X] + _F(t) * ego[SPEED] * ego[COS], ego[Y] + _F(t) * ego[SPEED] * ego[SIN]
-            k = network.offsets[lane]
-            while k < network.offsets[lane + 1]:
-                dx = _turned(network.points[k, 0] - x, network.width)
-                dy = _turned(network.points[k, 1] - y, network.height)
-                apart = math.sqrt(dx * dx + dy * dy)
-                if apart < _F(3.0):
+    if ego[COS] != _ZERO or ego[SIN] != _ZERO:
+        dx, dy = ego[X] - car[X], ego[Y] - car[Y]
+        dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+        forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+        far = car[HORIZON] + _lane_length(network, lane) + _F(4.0) * abs(ego[SPEED]) + _F(2.0) * place
+        if dx * dx + dy * dy < far * far and not (forward < _ZERO and abs(aside) < _F(2.5)):
+            for t in range(5):  # s, what it takes to leave a junction
+                x, y = ego[X] + _F(t) * ego[SPEED] * ego[COS], ego[Y] + _F(t) * ego[SPEED] * ego[SIN]
+                if _reaches(network, lane, x, y, _F(3.0)) < _F(1e8):
                     return False
-                k += max(_I((apart - _F(3.0)) / network.steps[lane]), _I(1))
-    return True
+            rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
+            room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
+    return room >= needed
 
 
 @leaf

@@ -1,8 +1,6 @@
 """What the Gymnasium environments can be asked for: sensing, actions, traffic, pictures, and Gymnasium's wrappers."""
 
-import copy
 import math
-import pickle
 import warnings
 from pathlib import Path
 from typing import Any
@@ -194,9 +192,7 @@ def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Scenario]], name: str)
 
 def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str, list[Scenario]]) -> None:
     n = 5
-    env = GridSimVectorEnv(
-        n, scenario="city", maps=maps["city"], observation="grid", frames=4, max_episode_steps=9
-    )
+    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="grid", frames=4, max_episode_steps=9)
     table = grid_table(env.config)
     for seed in (3, None):
         seen, _ = env.reset(seed=seed)
@@ -406,7 +402,9 @@ def test_record_video_works_on_the_vector_environment(tmp_path: Path) -> None:
 def test_wrappers_of_a_single_environment(observation: str, frames: int, actions: str) -> None:
     options: dict[str, Any] = {"maps": 1, "observation": observation, "frames": frames, "actions": actions}
     plain = gymnasium.make(env_id("city"), **options)
-    env: Any = RecordEpisodeStatistics(FrameStackObservation(FlattenObservation(gymnasium.make(env_id("city"), **options)), 3))
+    env: Any = RecordEpisodeStatistics(
+        FrameStackObservation(FlattenObservation(gymnasium.make(env_id("city"), **options)), 3)
+    )
     first, _ = plain.reset(seed=2)
     seen, _ = env.reset(seed=2)
     past = [first.reshape(-1)] * 3
