@@ -24,13 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from cluster.cli import compile_kernels
 from cluster.coordinator import Maps
 from cluster.pool import WorkerPool
 from cluster.ray_pool import RayPool
 from cluster.run import Session, make_tracker, new_run
 from cluster.settings import EvolveSettings
 from cluster.tracking import check_uri
+from cluster.warm import compile_kernels
 from cluster.worker import Task, Worker
 from evolution.breeding import Mutation
 from evolution.genetic import Genetic, GeneticConfig
@@ -62,7 +62,7 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dic
     pool = RayPool(2, maps.build)
     states: deque[tuple[dict[str, np.ndarray], dict[str, Any]]] = deque(maxlen=LAST + 1)
     this = session(folder, "whole", settings, pool, maps)
-    compile_kernels(this)
+    compile_kernels(settings.policy, settings.traffic)
 
     def keep(generation: int, row: dict[str, float]) -> None:
         arrays, meta = this.evolution.state()
@@ -90,7 +90,7 @@ def last_generations(
     pool = RayPool(workers, maps.build)
     this = session(folder, f"last-{workers}", settings, pool, maps)
     this.evolution.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
-    compile_kernels(this)
+    compile_kernels(settings.policy, settings.traffic)
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
     begun = 0.0
 

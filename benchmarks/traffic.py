@@ -35,7 +35,7 @@ CARS = 6  # where the scenario's default is none
 
 
 @njit(nogil=True)
-def soak(network, drivers, constants, world, first, steps, stood):
+def soak(network, drivers, constants, world, first, steps, stood) -> tuple[int, float, float]:
     """Let traffic flow for so many control steps from number `first` on.
 
     Args: world [cars, FIELDS], changed; stood int64 [cars], steps for which each car has stood by now, changed.

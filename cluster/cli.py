@@ -24,8 +24,9 @@ from gridsim.scenarios import is_map_file
 if TYPE_CHECKING:
     from cluster.coordinator import Maps
     from cluster.pool import WorkerPool
-    from cluster.run import RunFolder, Session
+    from cluster.run import RunFolder
     from cluster.tracking import Tracker
+    from cluster.warm import Warming
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
@@ -261,6 +262,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
     console = Console()
     try:
         flags, run = _prepare(arguments)
+        from cluster import warm
         from cluster.coordinator import Maps
         from cluster.pool import PoolError, SerialPool
         from cluster.run import is_finished, make_tracker
@@ -280,6 +282,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
 
     made = _make_folder(prog, run)
     maps = Maps(run.settings.scenario, SimConfig())
+    warming = warm.begin(run.settings)
     pool: WorkerPool
     try:
         if flags.workers == 0:
@@ -289,6 +292,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
 
             pool = RayPool(flags.workers, maps.build, flags.address or os.environ.get("RAY_ADDRESS") or None)
     except PoolError as error:
+        warming.stop()
         maps.close()
         _discard(made)
         fail(prog, str(error))
@@ -298,7 +302,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
     code = FAILED
     message = ""
     try:
-        message = _run(console, run, pool, maps, tracker, flags, started)
+        message = _run(console, run, pool, maps, tracker, flags, started, warming)
         status, code = "FINISHED", 0
     except KeyboardInterrupt:
         status, code = "KILLED", INTERRUPTED
@@ -314,6 +318,7 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
         with _undisturbed():
             if status == "KILLED":
                 Console(stderr=True).print("stopping; a moment ...", style="dim")
+            warming.stop()
             pool.close()
             maps.close()
             lost = tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
@@ -335,18 +340,22 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
 
 
 def _run(
-    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: EvolveFlags, started: float
+    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: EvolveFlags,
+    started: float, warming: Warming,
 ) -> str:  # fmt: skip
     """Evolve and finish. Returns the closing words."""
-    from cluster import progress, report
+    from cluster import progress, report, warm
     from cluster.champion import load_champion
     from cluster.run import Session
     from cluster.tracking import TrackingError
 
     initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
     session = Session(run, pool, maps, tracker, started, initial)
+    if warming.processes:
+        with console.status("compiling the simulator for this machine, once (some 10 s)"):
+            warming.wait()
     maps.ahead(session.evolution.curriculum.map_seeds[:3])
-    compile_kernels(session)  # here, before the workers need them: so they are compiled once, and cached
+    warm.compile_kernels(run.settings.policy, run.settings.traffic)  # before workers need them: never twice
     run.write_config()
     with progress.Progress(console, session, _shown(run.path)) as shown:
         session.on_row = shown.row
@@ -369,34 +378,6 @@ def _run(
         f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
         f"watch it: gridsim-watch {_shown(run.path)}\ncompare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
     )
-
-
-def compile_kernels(session: Session) -> None:
-    """Compile, or load from the cache, all that a generation needs."""
-    import numpy as np
-
-    from cluster.worker import Task, Worker
-    from evolution.breeding import FRESH, RECIPE, Mutation
-    from evolution.rollout import Limits
-
-    evolution = session.evolution
-    episodes = evolution.curriculum.episodes(0).part(0, 1)
-    recipes = np.zeros(2, dtype=RECIPE)
-    recipes["a"] = recipes["b"] = FRESH
-    recipes["seed"] = 1
-    task = Task(
-        policy=session.run.settings.policy,
-        parents=np.zeros((1, evolution.spec.size), dtype=np.float32),
-        key=1,
-        mutation=Mutation(),
-        episodes=episodes.rows,
-        worlds=episodes.worlds,
-        maps=tuple((session.run.settings.scenario, seed) for seed in episodes.maps),
-        limits=Limits(1.0, 1),
-        config=evolution.sim,
-        rewind=1,
-    )
-    Worker().evaluate(task, [session.maps.get(seed) for seed in episodes.maps], recipes)
 
 
 def _make_folder(prog: str, run: RunFolder) -> list[Path]:

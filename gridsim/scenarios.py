@@ -16,7 +16,18 @@ from gridsim.config import SimConfig
 from gridsim.curved import curved_layout
 from gridsim.highway import highway_layout
 from gridsim.jit import njit
-from gridsim.roads import Lanes, Road, Strips, clearance_nodes, freeze, make_road
+from gridsim.roads import (
+    CELLS_PER_M,
+    HEADING_BINS,
+    HEADING_WRAP,
+    START_CELLS_PER_M,
+    Lanes,
+    Road,
+    Strips,
+    clearance_nodes,
+    freeze,
+    make_road,
+)
 from gridsim.seamless import roundabout_layout, seamless_layout
 from gridsim.traffic import Network, make_network, network_of_lanes
 
@@ -178,6 +189,31 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
         lanes=lanes,
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
         network=make_network(lanes, width, height, TRAFFIC_PACE * sum(spec.speed_interval), config.traffic),
+    )
+
+
+def blank(config: SimConfig) -> Scenario:
+    """A map of 8 m x 8 m without any road: to compile kernels with, before there are maps."""
+    side = 8
+    lanes, f = Lanes.none(), np.float32
+    return Scenario(
+        name="blank",
+        seed=0,
+        road=Road(
+            field=freeze(np.zeros((side * CELLS_PER_M) ** 2, dtype=np.uint32)),
+            start_row=freeze(np.full((side * START_CELLS_PER_M) ** 2, -1, dtype=np.int32)),
+            start=freeze(np.zeros(HEADING_BINS + HEADING_WRAP, dtype=np.uint8)),
+            columns=np.uint32(side * CELLS_PER_M),
+            rows=np.uint32(side * CELLS_PER_M),
+            width=f(side),
+            height=f(side),
+            speed_low=f(0.0),
+            speed_high=f(1.0),
+            thin=np.uint32(1),
+        ),
+        lanes=lanes,
+        strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
+        network=make_network(lanes, side, side, 1.0, config.traffic),
     )
 
 

@@ -40,7 +40,7 @@ def parked(*poses):
 def _cast(k, rays, side, poses, worlds, ranges):
     for i in range(len(poses)):
         x, y, cosine, sine = poses[i]
-        cast_boxes(k, rays, side, side, x, y, cosine, sine, worlds[i], ranges[i])
+        cast_boxes(k, rays, side, side, x, y, cosine, sine, worlds[i], ranges[i], None)
 
 
 def cast(poses, worlds, reach=50.0):
