@@ -45,6 +45,7 @@ FIELDS = 19
 
 _CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
+_CROSSING_TIME = _F(4.0)  # s, what it takes to leave a junction
 _REACH = _F(2.4)  # m from the middle of a car within which all of it lies
 
 
@@ -469,10 +470,11 @@ def _may_enter(network, drivers, world, i, ego):
         dx, dy = ego[X] - car[X], ego[Y] - car[Y]
         dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
         forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-        far = car[HORIZON] + _lane_length(network, lane) + _F(4.0) * abs(ego[SPEED]) + _F(2.0) * place
+        way = _CROSSING_TIME * max(ego[SPEED], _ZERO)
+        far = car[HORIZON] + _lane_length(network, lane) + way + _F(2.0) * place
         if dx * dx + dy * dy < far * far and not (forward < _ZERO and abs(aside) < _F(2.5)):
-            for t in range(5):  # s, what it takes to leave a junction
-                x, y = ego[X] + _F(t) * ego[SPEED] * ego[COS], ego[Y] + _F(t) * ego[SPEED] * ego[SIN]
+            for k in range(1 + _I(way / _F(4.0))):
+                x, y = ego[X] + _F(4.0) * _F(k) * ego[COS], ego[Y] + _F(4.0) * _F(k) * ego[SIN]
                 if _reaches(network, lane, x, y, _F(3.0)) < _F(1e8):
                     return False
             rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length

@@ -463,7 +463,7 @@ def drive(
 
 
 def corners(config: SimConfig, poses: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Corners [n, 4, 2], counter-clockwise, of cars at poses [n, 3] (x, y, heading), larger by a margin on every side."""
+    """Corners [n, 4, 2], counter-clockwise, of cars at poses [n, 3] (x, y, heading), a margin (m) larger all round."""
     a, b = config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin
     own = np.array([[a, -b], [a, b], [-a, b], [-a, -b]])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
