@@ -11,7 +11,6 @@ import gymnasium
 import imageio_ffmpeg
 import numpy as np
 import pytest
-import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
@@ -25,6 +24,7 @@ from gridsim.simulator import DISTANCE, SPEED, views
 from gridsim.traffic import LANE
 from gridsim.vehicle import Action
 
+F = np.float32
 SENSING = [("rays", 1), ("grid", 1), ("grid", 4)]
 
 
@@ -194,23 +194,21 @@ def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Scenario]], name: str)
 
 def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str, list[Scenario]]) -> None:
     n = 5
-    env = GridSimVectorEnv(
-        n, scenario="city", maps=maps["city"], observation="grid", frames=4, max_episode_steps=9
-    )
+    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="grid", frames=4, max_episode_steps=9)
     table = grid_table(env.config)
     for seed in (3, None):
         seen, _ = env.reset(seed=seed)
         now = grids(table, env.ranges)
         past = [[now[i]] * 4 for i in range(n)]
         over = np.zeros(n, dtype=bool)
-        for row in drive(env, 30, seed=6):
+        for row in drive(env, 28, seed=6):  # in the middle of an episode
             np.testing.assert_array_equal(seen, np.array(past))
-            kept, copy = seen, seen.copy()
+            kept, before = seen, seen.copy()
             seen, _, terminations, truncations, _ = env.step(row)
             now = grids(table, env.ranges)
             past = [[now[i]] * 4 if over[i] else [*past[i][1:], now[i]] for i in range(n)]
             over = terminations | truncations
-            np.testing.assert_array_equal(kept, copy)  # what was returned is the caller's own
+            np.testing.assert_array_equal(kept, before)  # what was returned is the caller's own
         assert any((stack[0] != stack[3]).any() for stack in past)
 
 
@@ -371,6 +369,9 @@ def film(path: Path) -> tuple[int, float]:
     return imageio_ffmpeg.count_frames_and_secs(str(path))[0], fps
 
 
+# MoviePy 2 cuts the last picture of films of 8, 10 or 11 at 10 a second: their seconds, added up, are less than that.
+
+
 def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path) -> None:
     env: Any = gymnasium.make(env_id("city"), maps=1, render_mode="rgb_array", max_episode_steps=12)
     env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
@@ -388,14 +389,14 @@ def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_pa
 
 
 def test_record_video_works_on_the_vector_environment(tmp_path: Path) -> None:
-    env: Any = gymnasium.make_vec(env_id("highway"), num_envs=2, maps=1, render_mode="rgb_array", max_episode_steps=7)
+    env: Any = gymnasium.make_vec(env_id("highway"), num_envs=2, maps=1, render_mode="rgb_array", max_episode_steps=6)
     env = wrappers.RecordVideo(env, str(tmp_path / "films"), video_aspect_ratio=(2, 1), episode_trigger=lambda _: True)
     env.reset(seed=0)
-    for _ in range(7 + 1 + 4):  # an episode, the step that begins the next one, and some of that one
+    for _ in range(6 + 1 + 4):  # an episode, the step that begins the next one, and some of that one
         env.step(np.full(2, Action.ACCELERATE))
     env.close()
     films = sorted((tmp_path / "films").glob("*.mp4"))
-    assert [film(path) for path in films] == [(8, 10.0), (5, 10.0)]
+    assert [film(path) for path in films] == [(7, 10.0), (5, 10.0)]
 
 
 # --- other wrappers
@@ -406,7 +407,9 @@ def test_record_video_works_on_the_vector_environment(tmp_path: Path) -> None:
 def test_wrappers_of_a_single_environment(observation: str, frames: int, actions: str) -> None:
     options: dict[str, Any] = {"maps": 1, "observation": observation, "frames": frames, "actions": actions}
     plain = gymnasium.make(env_id("city"), **options)
-    env: Any = RecordEpisodeStatistics(FrameStackObservation(FlattenObservation(gymnasium.make(env_id("city"), **options)), 3))
+    env: Any = RecordEpisodeStatistics(
+        FrameStackObservation(FlattenObservation(gymnasium.make(env_id("city"), **options)), 3)
+    )
     first, _ = plain.reset(seed=2)
     seen, _ = env.reset(seed=2)
     past = [first.reshape(-1)] * 3
@@ -443,7 +446,7 @@ def side_by_side(
 def test_vector_wrappers_of_observations() -> None:
     low, high = np.zeros(32, dtype=np.float32), np.full(32, 2.0, dtype=np.float32)
     expected: list[tuple[Any, dict[str, Any], Any]] = [
-        (lambda env: wrappers.DtypeObservation(env, np.float64), {}, lambda seen: seen.astype(np.float64)),
+        (lambda env: wrappers.DtypeObservation(env, F), {"observation": "grid"}, lambda seen: seen.astype(F)),
         (lambda env: wrappers.ReshapeObservation(env, (4, 8)), {}, lambda seen: seen.reshape(-1, 4, 8)),
         (lambda env: wrappers.FlattenObservation(env), {"observation": "grid"}, lambda seen: seen.reshape(3, -1)),
         (
@@ -475,7 +478,10 @@ def test_vector_wrappers_of_actions() -> None:
     continuous = {"actions": "continuous"}
     cases: list[tuple[Any, Any]] = [
         (lambda env: wrappers.ClipAction(env), lambda row: row),
-        (lambda env: wrappers.RescaleAction(env, -0.5, 2.0), lambda row: np.clip((row + 0.5) / 1.25 - 1.0, -1.0, 1.0)),
+        (
+            lambda env: wrappers.RescaleAction(env, F(-0.5), F(2.0)),
+            lambda row: np.clip((row + 0.5) / 1.25 - 1.0, -1.0, 1.0),
+        ),
         (lambda env: wrappers.TransformAction(env, lambda row: -row), lambda row: -row),
     ]
     for wrap, inner in cases:
@@ -522,22 +528,14 @@ def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
     env.close()
 
 
-def test_observations_as_torch_tensors() -> None:
-    env = wrappers.NumpyToTorch(gymnasium.make_vec(env_id("city"), num_envs=2, maps=1, observation="grid", frames=4))
-    seen, _ = env.reset(seed=0)
-    assert seen.shape == (2, 4, CELLS, CELLS)
-    assert seen.dtype == torch.uint8
-    seen, rewards, *_ = env.step(torch.tensor([0, 0]))
-    assert rewards.dtype == torch.float32
-
-
 def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Scenario]]) -> None:
     """Gymnasium copies what it is given; a kernel takes arrays that can be written to for another type."""
     spec = gymnasium.make(env_id("city"), maps=maps["city"][:1]).spec
     assert spec is not None
     copied = spec.make().unwrapped.cars.simulator.scenarios[0]  # type: ignore[attr-defined]
     assert copied.seed == maps["city"][0].seed
-    for name, array in copied.arrays().items():
-        np.testing.assert_array_equal(array, maps["city"][0].arrays()[name])
-    for array in (*copied.road[:3], *(part for part in copied.network if np.ndim(part)), copied.lanes.points):
-        assert not array.flags.writeable
+    for again in (copied, copy.deepcopy(maps["city"][0]), pickle.loads(pickle.dumps(maps["city"][0]))):
+        for name, array in again.arrays().items():
+            np.testing.assert_array_equal(array, maps["city"][0].arrays()[name])
+        for array in (*again.road[:3], *(part for part in again.network if np.ndim(part)), again.lanes.points):
+            assert not array.flags.writeable
