@@ -35,7 +35,7 @@ CARS = 6  # where the scenario's default is none
 
 
 @njit(nogil=True)
-def soak(network, drivers, constants, world, first, steps, stood):
+def soak(network, drivers, constants, world, first, steps, stood) -> tuple[int, float, float]:
     """Let traffic flow for so many control steps from number `first` on.
 
     Args: world [cars, FIELDS], changed; stood int64 [cars], steps for which each car has stood by now, changed.
@@ -124,7 +124,9 @@ def main() -> int:
         failed |= bool(row["overlaps"] or row["gridlocks"])
         flat.update({f"{name}_{key.replace(' ', '_')}": value for key, value in row.items()})
         if not options.json:
-            figures = "".join(f"{row[key]:>11.0f}" if row[key] == int(row[key]) else f"{row[key]:>11.2f}" for key in columns)
+            figures = "".join(
+                f"{row[key]:>11.0f}" if row[key] == int(row[key]) else f"{row[key]:>11.2f}" for key in columns
+            )
             print(f"{name:<12}{figures}{time.perf_counter() - began:>10.1f}", flush=True)
     if options.json:
         print(json.dumps(flat))

@@ -389,7 +389,7 @@ def _is_junction(network, lane):
 
 @leaf
 def _passes(network, drivers, lane, other):
-    """Whether a lane passes where the rear of a car is that waits at the end of another lane with the same beginning."""
+    """Whether a lane passes where a car's rear is that waits at the end of another lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
     reach = _F(2.0) * drivers.half_width + _F(2.0) * _CAUTION
@@ -443,15 +443,13 @@ def _may_enter(network, drivers, world, i, ego):
             if there == lane or permit == lane:
                 return False
             for k in range(network.successors.shape[1]):
-                if there == network.successors[lane, k] and world[j, SPEED] < _F(2.0):
-                    if world[j, ALONG] < place + drivers.half_length:
-                        return False
+                slow = there == network.successors[lane, k] and world[j, SPEED] < _F(2.0)
+                if slow and world[j, ALONG] < place + drivers.half_length:
+                    return False
         elif there == beyond:
             rear = world[j, ALONG] - drivers.half_length
             room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
-        elif permit >= 0 and _I(world[j, AFTER]) == beyond:
-            needed += place
-        elif onward == beyond and _is_junction(network, there):
+        elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and _is_junction(network, there)):
             needed += place
     if not chained and room < needed:
         return False
@@ -462,7 +460,7 @@ def _may_enter(network, drivers, world, i, ego):
     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
     forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
     if dx * dx + dy * dy < _F(2500.0) and not (forward < _ZERO and abs(aside) < _F(2.5)):
-        for t in range(3):
+        for t in range(5):  # s, what it takes to leave a junction
             x, y = ego[X] + _F(t) * ego[SPEED] * ego[COS], ego[Y] + _F(t) * ego[SPEED] * ego[SIN]
             k = network.offsets[lane]
             while k < network.offsets[lane + 1]:
@@ -492,7 +490,8 @@ def _follow(network, drivers, car, other, is_ego):
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    if is_ego and not looked and other[SPEED] > _ONE:
+    same_way = car[COS] * other[COS] + car[SIN] * other[SIN] > _HALF
+    if is_ego and not looked and same_way and other[SPEED] > _ONE:
         # Where the ego car will be in a second: it may be about to cut in.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
         at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])

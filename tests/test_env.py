@@ -43,7 +43,7 @@ class Driver:
     def __call__(self, ranges: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         actions = []
         for row, speed in zip(ranges, speeds, strict=True):
-            encode(row, speed, self.scratch)
+            encode(row, None, speed, self.scratch)
             actions.append(decide(self.packed, self.layers, self.scratch))
         return np.array(actions)
 

@@ -63,7 +63,7 @@ def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
     states: list[np.ndarray] = []
     end = 0
     while end == 0:
-        look(road, k, RAYS, car, None, beams, ranges)
+        look(road, k, RAYS, car, None, beams, ranges, None)
         actions.append(int(choose(len(actions), ranges, car)))
         end = drive(road, k, car, visits, None, actions[-1])
         states.append(car.copy())
