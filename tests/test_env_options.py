@@ -106,7 +106,8 @@ def test_an_episode_follows_from_seed_and_number_alone(
     actions = drive(env, steps, seed=1)
 
     def run(env: GridSimVectorEnv, seed: int, actions: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-        seen = [(env.reset(seed=seed)[0], env.simulator.state.worlds.copy())]
+        observations, _ = env.reset(seed=seed)
+        seen: list[tuple[np.ndarray, ...]] = [(observations, env.simulator.state.worlds.copy())]
         for row in actions:
             observations, rewards, terminations, truncations, info = env.step(row)
             worlds = env.simulator.state.worlds.copy()
@@ -259,8 +260,9 @@ def test_a_continuous_action_that_is_none_is_refused(
 
 
 def test_an_error_is_one_line_for_any_number_of_cars(maps: dict[str, list[Scenario]]) -> None:
-    for actions in ("discrete", "continuous"):
-        env = GridSimVectorEnv(100, maps=maps["seamless"][:1], actions=actions)  # type: ignore[arg-type]
+    kinds: list[dict[str, Any]] = [{"actions": "discrete"}, {"actions": "continuous"}]
+    for options in kinds:
+        env = GridSimVectorEnv(100, maps=maps["seamless"][:1], **options)
         env.reset(seed=0)
         with pytest.raises(ValueError, match="100 cars") as error:
             env.step(np.zeros((100, 3)))
@@ -338,7 +340,9 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
     assert picture is not None
     assert picture.dtype == np.uint8
     assert picture.shape == (RENDER_SIZE[1], RENDER_SIZE[0], 3)
-    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    surface = pygame.display.get_surface()
+    assert surface is not None
+    shown = pygame.surfarray.array3d(surface).swapaxes(0, 1)
     np.testing.assert_array_equal(shown, picture)
 
     pygame.event.post(pygame.event.Event(pygame.QUIT))
@@ -434,10 +438,10 @@ def side_by_side(
 
     `inner` turns the actions that the wrapped one is given into those of the plain one.
     """
-    made = [gymnasium.make_vec(env_id("city"), num_envs=3, maps=1, **options) for _ in range(2)]
+    made: list[Any] = [gymnasium.make_vec(env_id("city"), num_envs=3, maps=1, **options) for _ in range(2)]
     env, plain = wrap(made[0]), made[1]
     theirs, ours = [plain.reset(seed=3)], [env.reset(seed=3)]
-    for row in drive(made[1].unwrapped, steps, seed=4):  # type: ignore[arg-type]
+    for row in drive(made[1].unwrapped, steps, seed=4):
         ours.append(env.step(row))
         theirs.append(plain.step(row if inner is None else inner(row)))
     return env, ours, theirs
@@ -475,11 +479,12 @@ def test_vector_wrappers_of_observations() -> None:
 
 
 def test_vector_wrappers_of_actions() -> None:
-    continuous = {"actions": "continuous"}
+    continuous: dict[str, Any] = {"actions": "continuous"}
+    low, high = np.full(2, -0.5, dtype=F), np.full(2, 2.0, dtype=F)
     cases: list[tuple[Any, Any]] = [
         (lambda env: wrappers.ClipAction(env), lambda row: row),
         (
-            lambda env: wrappers.RescaleAction(env, F(-0.5), F(2.0)),
+            lambda env: wrappers.RescaleAction(env, low, high),
             lambda row: np.clip((row + 0.5) / 1.25 - 1.0, -1.0, 1.0),
         ),
         (lambda env: wrappers.TransformAction(env, lambda row: -row), lambda row: -row),
