@@ -1,0 +1,568 @@
+"""The reference driver: pure pursuit along a route of lanes, as fast as its bends and the traffic allow.
+
+It is no learner: it reads the map and the other cars' state. What it may do is what any driver may: one of the eight
+actions each control period. Steering is pure pursuit (Coulter 1992) of the centre of mass, slip included; speed is a
+profile limited by curvature, held behind others by IDM (Treiber et al. 2000); lanes are changed by MOBIL (Kesting et al.
+2007). Its wish is continuous, the actions are not: what an action owes the wish in heading is made good by later ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim import traffic
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.jit import leaf, njit
+from gridsim.roads import VISIT_CELL, freeze
+from gridsim.scenarios import Scenario
+from gridsim.simulator import COS, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
+from gridsim.traffic import (
+    AFTER,
+    ALONG,
+    FACTOR,
+    GAP,
+    HORIZON,
+    LANE,
+    LEAD,
+    NEXT,
+    PACE,
+    PAST,
+    PERMIT,
+    SHIFT,
+    Drivers,
+    drivers,
+    flow,
+    idm,
+    wrapped,
+)
+from gridsim.vehicle import act, path_curvature
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF, _ONE, _TWO = _F(0.0), _F(0.5), _F(1.0), _F(2.0)
+
+# What the driver keeps in mind of a drive, float64.
+POINT = 0  # index of the route's point behind the car
+OWED = 1  # rad of heading that its actions have not yet given
+RAIL = 2  # which of the lanes abreast it is on
+BLEND = 3  # m to the left of that rail it still aims at, while it changes lanes
+LEFT_RAIL = 4  # the rail it comes from
+FIELDS_KEPT = 5
+
+
+@dataclass(frozen=True)
+class ReferenceConfig:
+    """How the reference driver drives."""
+
+    pace: float = 0.9  # of the scenario's interval, from its lower to its upper end: speed on a straight
+    lateral: float = 3.2  # m/s2 in bends, below the grip limit
+    acceleration: float = 3.0  # m/s2 of the profile, and a of IDM
+    braking: float = 2.5  # m/s2 before bends, and b of IDM
+    headway: float = 1.0  # s, T of IDM
+    preview: float = 0.5  # s of driving that the pursued point is ahead
+    nearest: float = 2.0  # m, added to that
+    window: float = 3.0  # m either way along a path over which its curvature is taken
+
+
+class Tuning(NamedTuple):
+    """`ReferenceConfig` as the kernels read it."""
+
+    preview: np.float32  # s
+    nearest: np.float32  # m
+
+
+class Route(NamedTuple):
+    """Lanes to drive, one after another, with those abreast of them as further rails; rails are left to right.
+
+    Arrays are read-only; point i of a rail is beside point i of every other.
+    """
+
+    points: np.ndarray  # float32 [rails, n, 2], m, continuous: not wrapped over the torus
+    arc: np.ndarray  # float32 [rails, n], m along the rail
+    speeds: np.ndarray  # float32 [rails, n], m/s, at most: bends and braking for them
+    lanes: np.ndarray  # int32 [rails, m]
+    offsets: np.ndarray  # int32 [m + 1], where each lane's points begin
+    rail: int  # which one the start is on
+
+
+class Profile(NamedTuple):
+    """The reference along a path, by arc length."""
+
+    arc: np.ndarray  # float64 [n], m along the path
+    speed: np.ndarray  # float64 [n], m/s
+    steering: np.ndarray  # float64 [n], rad, left positive
+
+    def speed_at(self, s: np.ndarray) -> np.ndarray:
+        """Speed (m/s) of the reference s m along the path."""
+        return np.interp(s, self.arc, self.speed)
+
+    def steering_at(self, s: np.ndarray) -> np.ndarray:
+        """Steering (rad) of the reference s m along the path."""
+        return np.interp(s, self.arc, self.steering)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """An episode of the reference driver: its states before each of n control periods, and how it ended.
+
+    Attributes:
+        time: float64 [n], s.
+        pose: float32 [n, 3]: x, y (m), heading (rad).
+        speed: float32 [n], m/s.
+        steering: float32 [n], rad.
+        action: int64 [n].
+        arc: float64 [n], m along the route.
+        rail: int64 [n], which of the route's rails it was on.
+        car: float32 [simulator.FIELDS], the state at the end.
+        end: how it ended.
+        route: where it went.
+    """
+
+    time: np.ndarray
+    pose: np.ndarray
+    speed: np.ndarray
+    steering: np.ndarray
+    action: np.ndarray
+    arc: np.ndarray
+    rail: np.ndarray
+    car: np.ndarray
+    end: End
+    route: Route
+
+
+# --- Speed profile ---------------------------------------------------------------------------------------------------
+
+
+def _curvature(points: np.ndarray, arc: np.ndarray, window: float) -> np.ndarray:
+    """Curvature (1/m) at points [n, 2] of a path: the turn of its heading from `window` m before to as much after."""
+
+    def heading(s: np.ndarray) -> np.ndarray:
+        back, front = np.maximum(s - window / 2, arc[0]), np.minimum(s + window / 2, arc[-1])
+        dx, dy = (np.interp(front, arc, axis) - np.interp(back, arc, axis) for axis in points.T)
+        return np.arctan2(dy, dx)
+
+    before, after = np.maximum(arc - window / 2, arc[0]), np.minimum(arc + window / 2, arc[-1])
+    turn = (heading(after) - heading(before) + np.pi) % (2 * np.pi) - np.pi
+    return turn / np.maximum(after - before, 1e-6)
+
+
+def _arc_length(points: np.ndarray) -> np.ndarray:
+    step = np.diff(points.astype(np.float64), axis=0)
+    return np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))])
+
+
+@njit
+def _within_braking(arc, braking, speeds):
+    for i in range(len(arc) - 2, -1, -1):
+        speeds[i] = min(speeds[i], math.sqrt(speeds[i + 1] ** 2 + 2.0 * braking * (arc[i + 1] - arc[i])))
+
+
+@njit
+def _within_acceleration(arc, acceleration, speeds):
+    for i in range(1, len(arc)):
+        speeds[i] = min(speeds[i], math.sqrt(speeds[i - 1] ** 2 + 2.0 * acceleration * (arc[i] - arc[i - 1])))
+
+
+def top_speed(interval: tuple[float, float], config: ReferenceConfig) -> float:
+    """Speed (m/s) of the reference on a straight, from the scenario's interval."""
+    low, high = interval
+    return low + config.pace * (high - low)
+
+
+def profile(
+    points: np.ndarray,
+    interval: tuple[float, float],
+    start_speed: float = 0.0,
+    config: ReferenceConfig | None = None,
+    sim: SimConfig | None = None,
+) -> Profile:
+    """Speed and steering of the reference along a path that anybody drove, without traffic and without driving it.
+
+    Args: points [n, 2] in m, in order and not wrapped over the torus (`unwrapped`); the scenario's speed interval and
+    the speed at the first point, m/s.
+    Raises: ValueError for fewer than 2 points.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+        raise ValueError(f"a path is 2 points [n, 2] or more, not {points.shape}")
+    config, sim = config or ReferenceConfig(), sim or SimConfig()
+    arc = _arc_length(points)
+    kept = np.concatenate([[True], np.diff(arc) > 1e-6])  # who stands still has no heading
+    points, arc = points[kept], arc[kept]
+    curvature = _curvature(points, arc, config.window)
+    speed = np.minimum(top_speed(interval, config), np.sqrt(config.lateral / np.maximum(np.abs(curvature), 1e-9)))
+    _within_braking(arc, config.braking, speed)
+    speed[0] = min(speed[0], start_speed)
+    _within_acceleration(arc, config.acceleration, speed)
+    vehicle = sim.vehicle
+    slip = np.arcsin(np.clip(curvature * vehicle.rear_axle, -1.0, 1.0))
+    steering = np.arctan(np.tan(slip) * vehicle.wheelbase / vehicle.rear_axle)
+    limit = math.radians(vehicle.steering_limit)
+    return Profile(arc, speed, np.clip(steering, -limit, limit))
+
+
+def unwrapped(points: np.ndarray, width: float, height: float) -> np.ndarray:
+    """A path [n, 2] on a torus of these sides (m), made continuous."""
+    points = np.asarray(points, dtype=np.float64)
+    step = np.diff(points, axis=0)
+    step -= np.round(step / [width, height]) * [width, height]
+    return np.concatenate([points[:1], points[0] + np.cumsum(step, axis=0)])
+
+
+# --- Routes ----------------------------------------------------------------------------------------------------------
+
+
+def locate(scenario: Scenario, start: np.ndarray) -> tuple[int, float]:
+    """The lane that a start (x, y, heading, ...) is on, and the m along it: nearest in place and heading."""
+    lanes = scenario.lanes
+    sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    ahead = np.diff(lanes.points.astype(np.float64), axis=0)
+    away = np.asarray(start[:2], dtype=np.float64) - lanes.points[:-1]
+    away -= np.round(away / sides) * sides
+    length = np.maximum(np.hypot(*ahead.T), 1e-9)
+    part = np.clip((away * ahead).sum(axis=1) / length**2, 0.0, 1.0)
+    distance = np.hypot(*(away - part[:, None] * ahead).T)
+    turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - start[2]
+    distance += 5.0 * np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
+    distance[lanes.offsets[1:-1] - 1] = np.inf  # from one lane's end to the next lane's beginning
+    point = int(distance.argmin())
+    lane = int(np.searchsorted(lanes.offsets, point, side="right")) - 1
+    return lane, float((point - lanes.offsets[lane] + part[point]) * lanes.steps[lane])
+
+
+def _abreast(scenario: Scenario, lane: int) -> list[int]:
+    """A lane and those beside it, from left to right."""
+    while scenario.lanes.left[lane] >= 0:
+        lane = int(scenario.lanes.left[lane])
+    row = [lane]
+    while scenario.lanes.right[row[-1]] >= 0:
+        row.append(int(scenario.lanes.right[row[-1]]))
+    return row
+
+
+def plan(
+    scenario: Scenario, start: np.ndarray, length: float, seed: int, config: ReferenceConfig | None = None
+) -> Route:
+    """A route of so many m or more from a start float32 [5] on, with random turns at junctions.
+
+    Raises: ValueError on a map without lanes.
+    """
+    config = config or ReferenceConfig()
+    lanes = scenario.lanes
+    if not len(lanes):
+        raise ValueError(f"the reference driver needs lanes; {scenario.name} has none")
+    rng = np.random.default_rng(np.random.SeedSequence([seed, 29]))
+    lane, along = locate(scenario, start)
+    chosen, ahead = [lane], float(lanes.lengths[lane]) - along
+    while ahead < length or len(chosen) < 3:
+        onward = lanes.successors[chosen[-1]]
+        chosen.append(int(rng.choice(onward[onward >= 0])))
+        ahead += float(lanes.lengths[chosen[-1]])
+    rows = np.array([_abreast(scenario, lane) for lane in chosen], dtype=np.int32).T
+    rail = int(np.flatnonzero(rows[:, 0] == lane)[0])
+    counts = np.diff(lanes.offsets)[rows[0]] - 1
+    sides = np.float64(scenario.road.width), np.float64(scenario.road.height)
+    points = np.stack(
+        [
+            unwrapped(np.concatenate([*(lanes.lane(i)[:-1] for i in row), lanes.lane(row[-1])[-1:]]), *sides)
+            for row in rows
+        ]
+    )
+    arc = np.stack([_arc_length(rail_points) for rail_points in points])
+    top = top_speed((float(scenario.road.speed_low), float(scenario.road.speed_high)), config)
+    speeds = np.empty_like(arc)
+    for r in range(len(rows)):
+        curvature = np.abs(_curvature(points[r], arc[r], config.window))
+        speeds[r] = np.minimum(top, np.sqrt(config.lateral / np.maximum(curvature, 1e-9)))
+        _within_braking(arc[r], config.braking, speeds[r])
+    f = np.float32
+    return Route(
+        freeze(points.astype(f)),
+        freeze(arc.astype(f)),
+        freeze(speeds.astype(f)),
+        freeze(rows),
+        freeze(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)),
+        rail,
+    )
+
+
+# --- Driving ---------------------------------------------------------------------------------------------------------
+
+
+@leaf
+def _at(route, rail, s, k):
+    """Point (m, m) of the route s m along a rail, from point k on, and its index."""
+    last = _I(route.arc.shape[1] - 2)
+    while k < last and route.arc[rail, k + 1] < s:
+        k += _I(1)
+    span = max(route.arc[rail, k + 1] - route.arc[rail, k], _F(1e-6))
+    part = (s - route.arc[rail, k]) / span
+    x0, y0 = route.points[rail, k, 0], route.points[rail, k, 1]
+    return (
+        x0 + part * (route.points[rail, k + 1, 0] - x0),
+        y0 + part * (route.points[rail, k + 1, 1] - y0),
+        k,
+        part,
+    )
+
+
+@leaf
+def _progress(network, route, rail, k, x, y):
+    """Where a car is along a rail, looked for from point k on: (point behind it, m along, m to the left of it)."""
+    last = _I(route.arc.shape[1] - 2)
+    while True:
+        ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
+        uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
+        length = max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+        dx = traffic._turned(x - route.points[rail, k, 0], network.width)
+        dy = traffic._turned(y - route.points[rail, k, 1], network.height)
+        along = (dx * ux + dy * uy) / length
+        if along <= length or k >= last:
+            return k, route.arc[rail, k] + along, (dy * ux - dx * uy) / length
+        k += _I(1)
+
+
+@leaf
+def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car):
+    """Curvature (1/m) of the circle that takes the centre of mass to a point of the route ahead, with its slip.
+
+    With a the angle from the heading to the point and d its distance: tan(slip) = sin(a) / (d / (2 l_r) + cos(a)).
+    """
+    ahead = tuning.preview * max(car[SPEED], _ZERO) + tuning.nearest
+    x, y, k, _ = _at(route, rail, s + ahead, k)
+    ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
+    uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
+    norm = blend / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+    dx = traffic._turned(x - norm * uy - car[X], network.width)
+    dy = traffic._turned(y + norm * ux - car[Y], network.height)
+    forward, left = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+    distance = max(math.sqrt(forward * forward + left * left), _F(0.1))
+    tangent = (left / distance) / max(distance / (_TWO * constants.rear_axle) + forward / distance, _F(0.1))
+    curvature = tangent / (math.sqrt(_ONE + tangent * tangent) * constants.rear_axle)
+    bound = constants.grip / max(car[SPEED] * car[SPEED], _F(1e-6))
+    return min(max(curvature, -bound), bound)
+
+
+@leaf
+def _choose_action(constants, car, curvature, acceleration, owed):
+    """The action whose effect comes nearest to a wanted curvature (1/m) and acceleration (m/s2).
+
+    Heading is looked at over two periods, since the wheels turn by fixed steps; returns (action, rad then owed).
+    """
+    speed, steering = max(car[SPEED], _ZERO), car[STEERING]
+    way = max(speed, _ONE) * constants.dt
+    quantum = path_curvature(constants, speed, constants.steering_step) * way
+    weight = _ONE if acceleration > _F(-4.0) else _F(0.2)  # braking hard comes before keeping to the line
+    best, cost, left = _I(4), _F(1e9), _ZERO
+    for action in range(8):
+        if action == 7 and speed < _HALF:
+            continue
+        given, wheels = act(constants, action, speed, steering)
+        first = owed + (curvature - path_curvature(constants, speed, wheels)) * way
+        second = _F(1e9)
+        for then in range(1, 5):
+            _, later = act(constants, then, speed, wheels)
+            second = min(second, abs(first + (curvature - path_curvature(constants, speed, later)) * way))
+        total = weight * (abs(first) + second) / quantum + abs(acceleration - given) / constants.acceleration
+        if total < cost:
+            best, cost, left = _I(action), total, first
+    return best, min(max(left, -quantum), quantum)
+
+
+@leaf
+def _seat(network, route, rail, m, s, car, me):
+    """Write the ego car down as a traffic car on lane m of a rail, s m along it."""
+    last = _I(route.lanes.shape[1] - 1)
+    me[X], me[Y], me[COS], me[SIN], me[SPEED] = car[X], car[Y], car[COS], car[SIN], max(car[SPEED], _ZERO)
+    me[PAST], me[PERMIT] = -_ONE, -_ONE
+    me[LANE] = route.lanes[rail, m]
+    me[NEXT] = route.lanes[rail, min(m + _I(1), last)]
+    me[AFTER] = route.lanes[rail, min(m + _I(2), last)]
+    lane = _I(me[LANE])
+    length = _F(network.offsets[lane + 1] - network.offsets[lane] - 1) * network.steps[lane]
+    me[ALONG] = min(max(s - route.arc[rail, route.offsets[m]], _ZERO), length)
+
+
+@leaf
+def _mind_others(network, drivers, route, memory, k, s, car, bend, acceleration, world, others):
+    """The acceleration (m/s2) that the other cars leave of a wanted one, and a change of lanes where it pays."""
+    n = _I(world.shape[0])
+    me, nobody = others[n], others[n + 1]
+    rail, speed = _I(memory[RAIL]), max(car[SPEED], _ZERO)
+    m = _I(np.searchsorted(route.offsets, k, side="right") - 1)
+    m = min(m, _I(route.lanes.shape[1] - 1))
+    for j in range(n):
+        for field in range(world.shape[1]):
+            others[j, field] = world[j, field]
+    me[HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_TWO * drivers.comfort))
+    me[GAP], me[LEAD], me[SHIFT] = _F(1e9), _ZERO, _F(memory[BLEND])
+    for side in range(2):
+        if side == 0 and memory[BLEND] == 0.0:
+            continue  # only who changes lanes minds the one it comes from too
+        on = rail if side == 1 else _I(memory[LEFT_RAIL])
+        _seat(network, route, on, m, s, car, me)
+        for j in range(n):
+            if world[j, LANE] >= _ZERO:
+                dx, dy = wrapped(world[j, X] - car[X], network.width), wrapped(world[j, Y] - car[Y], network.height)
+                if math.sqrt(dx * dx + dy * dy) - _F(5.0) < me[HORIZON]:
+                    traffic._follow(network, drivers, me, world[j], False)
+    wish = max(bend, _ONE)
+    if me[GAP] < _F(1e8):
+        acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
+    onward = _I(me[NEXT])
+    if network.crossing_offsets[onward + 1] > network.crossing_offsets[onward]:
+        line = route.arc[rail, route.offsets[m + 1]] - s - drivers.half_length
+        if line < me[HORIZON] and not traffic._may_enter(network, drivers, others, n, nobody):
+            acceleration = min(acceleration, idm(drivers, speed, wish, line + drivers.jam - _HALF, _ZERO))
+    if route.lanes.shape[0] > 1:
+        lane = _I(me[LANE])
+        at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
+        me[FACTOR] = wish / network.speeds[at]
+        me[PACE] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD])
+        traffic._change_lanes(network, drivers, others, n, nobody, _I(car[STEPS]))
+        if _I(me[LANE]) != lane:
+            memory[LEFT_RAIL] = rail
+            memory[RAIL] = rail + 1 if _I(me[LANE]) == network.right[lane] else rail - 1
+            memory[BLEND] = me[SHIFT]
+    return acceleration
+
+
+@njit(_nrt=False)
+def _decide(network, constants, drivers, tuning, route, memory, car, world, others):
+    """The driver's action for one control period.
+
+    Args: what it keeps in mind float64 [FIELDS_KEPT], changed; `others` [cars + 2, traffic.FIELDS] is scratch, of which
+    the last row is 0.
+    """
+    rail = _I(memory[RAIL])
+    speed = max(car[SPEED], _ZERO)
+    k, s, _ = _progress(network, route, rail, _I(memory[POINT]), car[X], car[Y])
+    memory[POINT] = k
+    _, _, to, part = _at(route, rail, s + speed * constants.dt, k)
+    bend = route.speeds[rail, to] + part * (route.speeds[rail, to + 1] - route.speeds[rail, to])
+    acceleration = min(max((bend - speed) / constants.dt, -constants.braking), constants.acceleration)
+    if world.shape[0] > 0:
+        acceleration = _mind_others(
+            network, drivers, route, memory, k, s, car, bend, acceleration, world, others
+        )  # fmt: skip
+    rail, blend = _I(memory[RAIL]), _F(memory[BLEND])
+    curvature = _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
+    way = drivers.shift * constants.dt
+    memory[BLEND] = blend - min(max(blend, -way), way)
+    action, memory[OWED] = _choose_action(constants, car, curvature, acceleration, _F(memory[OWED]))
+    return action
+
+
+@njit(nogil=True)
+def _drive(road, network, constants, traffic_drivers, drivers, tuning, route, start, target, max_steps, world, log):
+    """One episode; fills log float64 [max_steps, 8] and returns (state at the end, steps, End)."""
+    cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
+    car, visits = np.empty(FIELDS, dtype=np.float32), np.empty(cells, dtype=np.float32)
+    others = np.zeros((world.shape[0] + 2, world.shape[1]), dtype=np.float32)
+    memory = np.zeros(FIELDS_KEPT)
+    memory[RAIL] = route.rail
+    place(road, start, car, visits)
+    steps, end = 0, 0
+    while end == 0:
+        action = _decide(network, constants, drivers, tuning, route, memory, car, world, others)
+        row = log[steps]
+        row[0], row[1], row[2], row[3] = car[X], car[Y], math.atan2(car[SIN], car[COS]), car[SPEED]
+        row[4], row[5], row[7] = car[STEERING], action, memory[RAIL]
+        _, row[6], _ = _progress(network, route, _I(memory[RAIL]), _I(memory[POINT]), car[X], car[Y])
+        flow(network, traffic_drivers, world, car, _I(steps))
+        end = control(road, constants, car, visits, world, action, target, max_steps)
+        steps += 1
+    return car, steps, end
+
+
+class ReferenceDriver:
+    """Drives a batch of cars, each on a route of its own: `reset`, then `act` once each control period."""
+
+    def __init__(
+        self, scenarios: Sequence[Scenario], sim: SimConfig | None = None, config: ReferenceConfig | None = None
+    ):
+        self.scenarios = scenarios
+        self.sim, self.config = sim or SimConfig(), config or ReferenceConfig()
+        self._constants: Constants = constants(self.sim)
+        self._traffic: Drivers = drivers(self.sim)
+        f = np.float32
+        self._drivers = self._traffic._replace(
+            acceleration=f(self.config.acceleration), comfort=f(self.config.braking), headway=f(self.config.headway)
+        )
+        self._tuning = Tuning(f(self.config.preview), f(self.config.nearest))
+        self._maps = np.zeros(0, dtype=np.int64)
+        self._routes: list[Route] = []
+        self._memory = np.zeros((0, FIELDS_KEPT))
+
+    def reset(
+        self, starts: np.ndarray, maps: np.ndarray | int, seeds: Sequence[int], length: float | None = None
+    ) -> None:
+        """Begin drives at starts float32 [n, 5] on `scenarios[maps[k]]`, with turns at junctions from seeds [n].
+
+        Routes are `length` m long, or as long as the target and a tenth.
+        """
+        length = 1.1 * self.sim.episode.target if length is None else length
+        self._maps = np.broadcast_to(np.asarray(maps, dtype=np.int64), len(starts))
+        self._routes = [
+            plan(self.scenarios[m], start, length, seed, self.config)
+            for m, start, seed in zip(self._maps, starts, seeds, strict=True)
+        ]
+        self._memory = np.zeros((len(starts), FIELDS_KEPT))
+        self._memory[:, RAIL] = [route.rail for route in self._routes]
+
+    def act(self, cars: np.ndarray, worlds: np.ndarray) -> np.ndarray:
+        """Actions int64 [n] for cars float32 [n, simulator.FIELDS] in worlds [n, cars, traffic.FIELDS]."""
+        others = np.zeros((worlds.shape[1] + 2, worlds.shape[2]), dtype=np.float32)
+        return np.array(
+            [
+                _decide(
+                    self.scenarios[m].network, self._constants, self._drivers, self._tuning, route, memory, car, world,
+                    others,
+                )
+                for m, route, memory, car, world in zip(
+                    self._maps, self._routes, self._memory, cars, worlds, strict=True
+                )
+            ],
+            dtype=np.int64,
+        )  # fmt: skip
+
+    def drive(
+        self,
+        scenario: Scenario,
+        start: np.ndarray,
+        world: np.ndarray,
+        seed: int,
+        target: float | None = None,
+        max_steps: int | None = None,
+    ) -> Drive:
+        """A whole episode from a start float32 [5] in the traffic float32 [cars, traffic.FIELDS] around it.
+
+        Ends as `simulator.Simulator`'s episodes do; `target` (m) and `max_steps` are the configuration's unless given.
+        """
+        episode = self.sim.episode
+        target = episode.target if target is None else target
+        max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
+        route = plan(scenario, start, 1.1 * target, seed, self.config)
+        log = np.empty((max_steps, 8))
+        car, steps, end = _drive(
+            scenario.road, scenario.network, self._constants, self._traffic, self._drivers, self._tuning, route,
+            np.asarray(start, dtype=np.float32), np.float32(target), max_steps,
+            np.array(world, dtype=np.float32), log,
+        )  # fmt: skip
+        log = log[:steps]
+        return Drive(
+            time=np.arange(steps) * episode.control_period,
+            pose=log[:, :3].astype(np.float32),
+            speed=log[:, 3].astype(np.float32),
+            steering=log[:, 4].astype(np.float32),
+            action=log[:, 5].astype(np.int64),
+            arc=log[:, 6],
+            rail=log[:, 7].astype(np.int64),
+            car=car,
+            end=End(end),
+            route=route,
+        )
