@@ -35,7 +35,7 @@ def main() -> None:
             bad = [(k, end.name, len(d.time)) for k, (end, d) in enumerate(zip(ends, drives)) if end != End.SUCCESS]
             print(
                 f"{name:>10} {cars:7d} {np.mean([end == End.SUCCESS for end in ends]):7.3f} {np.mean(speeds):6.2f} "
-                f"{paced:5.2f}  {low:.0f} - {high:.0f}  {bad}",
+                f"{paced:5.2f}  {low:.0f} - {high:.0f}  {len(bad)} {bad[:12]}",
                 flush=True,
             )
 

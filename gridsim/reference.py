@@ -53,6 +53,16 @@ BLEND = 3  # m to the left of that rail it still aims at, while it changes lanes
 LEFT_RAIL = 4  # the rail it comes from
 FIELDS_KEPT = 5
 
+_MARGIN = _F(1.0)  # m from where paths meet at which to wait
+_CREEP = _F(0.6)  # m/s with which it waits: progress enough not to be idle
+
+
+class Conflicts(NamedTuple):
+    """Where paths meet, for each of `Network.crossings`: float32 [c]."""
+
+    enter: np.ndarray  # m along the lane to its first point in the other's way
+    free: np.ndarray  # m along the other lane from which on its car has gone, or goes ahead on the same ground
+
 
 @dataclass(frozen=True)
 class ReferenceConfig:
@@ -63,16 +73,18 @@ class ReferenceConfig:
     acceleration: float = 3.0  # m/s2 of the profile, and a of IDM
     braking: float = 2.5  # m/s2 before bends, and b of IDM
     headway: float = 1.0  # s, T of IDM
-    preview: float = 0.5  # s of driving that the pursued point is ahead
-    nearest: float = 2.0  # m, added to that
+    nearest: float = 2.0  # m that the pursued point is ahead, at least
+    preview: float = 0.25  # s of driving, added to that
+    bend_share: float = 0.15  # of the tightest radius that grip allows, added to that
     window: float = 3.0  # m either way along a path over which its curvature is taken
 
 
 class Tuning(NamedTuple):
     """`ReferenceConfig` as the kernels read it."""
 
-    preview: np.float32  # s
     nearest: np.float32  # m
+    preview: np.float32  # s
+    bend_share: np.float32
 
 
 class Route(NamedTuple):
@@ -87,6 +99,7 @@ class Route(NamedTuple):
     lanes: np.ndarray  # int32 [rails, m]
     offsets: np.ndarray  # int32 [m + 1], where each lane's points begin
     rail: int  # which one the start is on
+    first: int  # the point before the start
 
 
 class Profile(NamedTuple):
@@ -287,7 +300,43 @@ def plan(
         freeze(rows),
         freeze(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)),
         rail,
+        int(along / lanes.steps[lane]),
     )
+
+
+@njit
+def _find_conflicts(network, apart, length, enter, free):
+    for lane in range(len(network.steps)):
+        for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
+            other = network.crossings[c]
+            enter[c], free[c] = 0.0, network.clear[c]
+            found = False
+            for p in range(network.offsets[lane], network.offsets[lane + 1] - 1):
+                for q in range(network.offsets[other], network.offsets[other + 1] - 1):
+                    dx = traffic._turned(network.points[p, 0] - network.points[q, 0], network.width)
+                    dy = traffic._turned(network.points[p, 1] - network.points[q, 1], network.height)
+                    if dx * dx + dy * dy < apart * apart:
+                        ux = network.points[p + 1, 0] - network.points[p, 0]
+                        uy = network.points[p + 1, 1] - network.points[p, 1]
+                        vx = network.points[q + 1, 0] - network.points[q, 0]
+                        vy = network.points[q + 1, 1] - network.points[q, 1]
+                        enter[c] = (p - network.offsets[lane]) * network.steps[lane]
+                        if ux * vx + uy * vy > 0.5 * network.steps[lane] * network.steps[other]:
+                            # They join: who is on the common ground is followed.
+                            gone = (q - network.offsets[other]) * network.steps[other] + length
+                            free[c] = min(free[c], gone)
+                        found = True
+                        break
+                if found:
+                    break
+
+
+def conflicts(scenario: Scenario, sim: SimConfig) -> Conflicts:
+    """Where the lanes of a map meet."""
+    count = len(scenario.network.crossings)
+    enter, free = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
+    _find_conflicts(scenario.network, np.float32(sim.traffic.apart), np.float32(sim.vehicle.length), enter, free)
+    return Conflicts(freeze(enter), freeze(free))
 
 
 # --- Driving ---------------------------------------------------------------------------------------------------------
@@ -332,7 +381,8 @@ def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
 
     With a the angle from the heading to the point and d its distance: tan(slip) = sin(a) / (d / (2 l_r) + cos(a)).
     """
-    ahead = tuning.preview * max(car[SPEED], _ZERO) + tuning.nearest
+    speed = max(car[SPEED], _ZERO)
+    ahead = tuning.nearest + speed * (tuning.preview + tuning.bend_share * speed / constants.grip)
     x, y, k, _ = _at(route, rail, s + ahead, k)
     ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
     uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
@@ -356,6 +406,9 @@ def _choose_action(constants, car, curvature, acceleration, owed):
     speed, steering = max(car[SPEED], _ZERO), car[STEERING]
     way = max(speed, _ONE) * constants.dt
     quantum = path_curvature(constants, speed, constants.steering_step) * way
+    # Steering further than grip allows gains nothing, and has to be taken back step by step.
+    tangent = constants.grip * constants.rear_axle / max(speed * speed, _ONE)
+    furthest = max(math.atan(tangent / constants.rear_share), constants.steering_step)
     weight = _ONE if acceleration > _F(-4.0) else _F(0.2)  # braking hard comes before keeping to the line
     best, cost, left = _I(4), _F(1e9), _ZERO
     for action in range(8):
@@ -368,6 +421,7 @@ def _choose_action(constants, car, curvature, acceleration, owed):
             _, later = act(constants, then, speed, wheels)
             second = min(second, abs(first + (curvature - path_curvature(constants, speed, later)) * way))
         total = weight * (abs(first) + second) / quantum + abs(acceleration - given) / constants.acceleration
+        total += _HALF * max(abs(wheels) - furthest, _ZERO) / constants.steering_step
         if total < cost:
             best, cost, left = _I(action), total, first
     return best, min(max(left, -quantum), quantum)
@@ -388,7 +442,46 @@ def _seat(network, route, rail, m, s, car, me):
 
 
 @leaf
-def _mind_others(network, drivers, route, memory, k, s, car, bend, acceleration, world, others):
+def _give_way(network, conflicts, drivers, me, world):
+    """The greatest acceleration (m/s2) with which nobody is met who is in a junction already, or may enter it."""
+    speed, allowed = me[SPEED], drivers.acceleration
+    ahead = -me[ALONG]  # m to the beginning of the lane
+    for turn in range(3):
+        lane = _I(me[LANE] if turn == 0 else (me[NEXT] if turn == 1 else me[AFTER]))
+        if ahead > me[HORIZON]:
+            break
+        for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
+            way = ahead + conflicts.enter[c] - drivers.half_length - _MARGIN
+            if way < -_MARGIN or way > me[HORIZON]:
+                continue  # in the middle of it one goes on
+            other = network.crossings[c]
+            for j in range(world.shape[0]):
+                if world[j, LANE] < _ZERO:
+                    continue
+                if _I(world[j, LANE]) == other:
+                    at = world[j, ALONG]
+                elif _I(world[j, PERMIT]) == other:
+                    at = world[j, ALONG] - traffic._lane_length(network, _I(world[j, LANE]))
+                elif _I(world[j, PAST]) == other:
+                    at = world[j, ALONG] + traffic._lane_length(network, other)
+                else:
+                    continue
+                rest = conflicts.free[c] + drivers.half_length + _HALF - at
+                if rest <= _ZERO:
+                    continue
+                time = rest / max(world[j, SPEED], _HALF)
+                if speed * time > way:  # arrive when it has gone, or stop there
+                    room = max(way, _F(0.1))
+                    slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * room))
+                    if speed < _CREEP:
+                        slower = drivers.acceleration  # standing is idleness in this world
+                    allowed = min(allowed, slower)
+        ahead += traffic._lane_length(network, lane)
+    return allowed
+
+
+@leaf
+def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others):
     """The acceleration (m/s2) that the other cars leave of a wanted one, and a change of lanes where it pays."""
     n = _I(world.shape[0])
     me, nobody = others[n], others[n + 1]
@@ -413,11 +506,7 @@ def _mind_others(network, drivers, route, memory, k, s, car, bend, acceleration,
     wish = max(bend, _ONE)
     if me[GAP] < _F(1e8):
         acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
-    onward = _I(me[NEXT])
-    if network.crossing_offsets[onward + 1] > network.crossing_offsets[onward]:
-        line = route.arc[rail, route.offsets[m + 1]] - s - drivers.half_length
-        if line < me[HORIZON] and not traffic._may_enter(network, drivers, others, n, nobody):
-            acceleration = min(acceleration, idm(drivers, speed, wish, line + drivers.jam - _HALF, _ZERO))
+    acceleration = min(acceleration, _give_way(network, conflicts, drivers, me, world))
     if route.lanes.shape[0] > 1:
         lane = _I(me[LANE])
         at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
@@ -432,7 +521,7 @@ def _mind_others(network, drivers, route, memory, k, s, car, bend, acceleration,
 
 
 @njit(_nrt=False)
-def _decide(network, constants, drivers, tuning, route, memory, car, world, others):
+def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others):
     """The driver's action for one control period.
 
     Args: what it keeps in mind float64 [FIELDS_KEPT], changed; `others` [cars + 2, traffic.FIELDS] is scratch, of which
@@ -447,7 +536,7 @@ def _decide(network, constants, drivers, tuning, route, memory, car, world, othe
     acceleration = min(max((bend - speed) / constants.dt, -constants.braking), constants.acceleration)
     if world.shape[0] > 0:
         acceleration = _mind_others(
-            network, drivers, route, memory, k, s, car, bend, acceleration, world, others
+            network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others
         )  # fmt: skip
     rail, blend = _I(memory[RAIL]), _F(memory[BLEND])
     curvature = _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
@@ -458,17 +547,19 @@ def _decide(network, constants, drivers, tuning, route, memory, car, world, othe
 
 
 @njit(nogil=True)
-def _drive(road, network, constants, traffic_drivers, drivers, tuning, route, start, target, max_steps, world, log):
+def _drive(
+    road, network, conflicts, constants, traffic_drivers, drivers, tuning, route, start, target, max_steps, world, log
+):
     """One episode; fills log float64 [max_steps, 8] and returns (state at the end, steps, End)."""
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car, visits = np.empty(FIELDS, dtype=np.float32), np.empty(cells, dtype=np.float32)
     others = np.zeros((world.shape[0] + 2, world.shape[1]), dtype=np.float32)
     memory = np.zeros(FIELDS_KEPT)
-    memory[RAIL] = route.rail
+    memory[RAIL], memory[POINT] = route.rail, route.first
     place(road, start, car, visits)
     steps, end = 0, 0
     while end == 0:
-        action = _decide(network, constants, drivers, tuning, route, memory, car, world, others)
+        action = _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others)
         row = log[steps]
         row[0], row[1], row[2], row[3] = car[X], car[Y], math.atan2(car[SIN], car[COS]), car[SPEED]
         row[4], row[5], row[7] = car[STEERING], action, memory[RAIL]
@@ -493,7 +584,8 @@ class ReferenceDriver:
         self._drivers = self._traffic._replace(
             acceleration=f(self.config.acceleration), comfort=f(self.config.braking), headway=f(self.config.headway)
         )
-        self._tuning = Tuning(f(self.config.preview), f(self.config.nearest))
+        self._tuning = Tuning(f(self.config.nearest), f(self.config.preview), f(self.config.bend_share))
+        self._conflicts: dict[int, Conflicts] = {}
         self._maps = np.zeros(0, dtype=np.int64)
         self._routes: list[Route] = []
         self._memory = np.zeros((0, FIELDS_KEPT))
@@ -507,12 +599,14 @@ class ReferenceDriver:
         """
         length = 1.1 * self.sim.episode.target if length is None else length
         self._maps = np.broadcast_to(np.asarray(maps, dtype=np.int64), len(starts))
+        self._conflicts = {m: conflicts(self.scenarios[m], self.sim) for m in np.unique(self._maps).tolist()}
         self._routes = [
             plan(self.scenarios[m], start, length, seed, self.config)
             for m, start, seed in zip(self._maps, starts, seeds, strict=True)
         ]
         self._memory = np.zeros((len(starts), FIELDS_KEPT))
         self._memory[:, RAIL] = [route.rail for route in self._routes]
+        self._memory[:, POINT] = [route.first for route in self._routes]
 
     def act(self, cars: np.ndarray, worlds: np.ndarray) -> np.ndarray:
         """Actions int64 [n] for cars float32 [n, simulator.FIELDS] in worlds [n, cars, traffic.FIELDS]."""
@@ -520,8 +614,8 @@ class ReferenceDriver:
         return np.array(
             [
                 _decide(
-                    self.scenarios[m].network, self._constants, self._drivers, self._tuning, route, memory, car, world,
-                    others,
+                    self.scenarios[m].network, self._conflicts[int(m)], self._constants, self._drivers, self._tuning, route,
+                    memory, car, world, others,
                 )
                 for m, route, memory, car, world in zip(
                     self._maps, self._routes, self._memory, cars, worlds, strict=True
@@ -546,10 +640,12 @@ class ReferenceDriver:
         episode = self.sim.episode
         target = episode.target if target is None else target
         max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
+        found = conflicts(scenario, self.sim)
         route = plan(scenario, start, 1.1 * target, seed, self.config)
         log = np.empty((max_steps, 8))
         car, steps, end = _drive(
-            scenario.road, scenario.network, self._constants, self._traffic, self._drivers, self._tuning, route,
+            scenario.road, scenario.network, found, self._constants, self._traffic,
+            self._drivers, self._tuning, route,
             np.asarray(start, dtype=np.float32), np.float32(target), max_steps,
             np.array(world, dtype=np.float32), log,
         )  # fmt: skip
