@@ -2,8 +2,8 @@
 
 It is no learner: it reads the map and the other cars' state. What it may do is what any driver may: one of the eight
 actions each control period. Steering is pure pursuit (Coulter 1992) of the centre of mass, slip included; speed is a
-profile limited by curvature, held behind others by IDM (Treiber et al. 2000); lanes are changed by MOBIL (Kesting et al.
-2007). Its wish is continuous, the actions are not: what an action owes the wish in heading is made good by later ones.
+profile limited by curvature, held behind others by IDM (Treiber et al. 2000); lanes are changed by MOBIL (Kesting et
+al. 2007). Its wish is continuous, the actions are not: what an action owes the wish in heading is made good by later ones.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.roads import VISIT_CELL, freeze
 from gridsim.scenarios import Scenario
-from gridsim.simulator import COS, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
+from gridsim.simulator import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
 from gridsim.traffic import (
     AFTER,
     ALONG,
@@ -53,14 +53,19 @@ BLEND = 3  # m to the left of that rail it still aims at, while it changes lanes
 LEFT_RAIL = 4  # the rail it comes from
 FIELDS_KEPT = 5
 
-_MARGIN = _F(1.0)  # m from where paths meet at which to wait
+_CAUTION = 0.3  # m, on every side of a car that waits
 _CREEP = _F(0.6)  # m/s with which it waits: progress enough not to be idle
+_RESERVE = _F(3.0)  # m before where paths meet from which on it creeps
+_THROUGH = _F(9.0)  # m from there until it has passed
+_BORED = _F(9.0)  # control steps of standing after which it moves up a little
+_NUDGE = _F(1.0)  # m that it may then use of what it has kept clear
 
 
 class Conflicts(NamedTuple):
     """Where paths meet, for each of `Network.crossings`: float32 [c]."""
 
-    enter: np.ndarray  # m along the lane to its first point in the other's way
+    enter: np.ndarray  # m along the lane to where its car is in the other's way
+    meet: np.ndarray  # m along the other lane to where its car is in this one's way
     free: np.ndarray  # m along the other lane from which on its car has gone, or goes ahead on the same ground
 
 
@@ -305,38 +310,54 @@ def plan(
 
 
 @njit
-def _find_conflicts(network, apart, length, enter, free):
+def _find_conflicts(network, half_length, half_width, enter, free):
     for lane in range(len(network.steps)):
+        first, last = network.offsets[lane], network.offsets[lane + 1] - 1
         for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
             other = network.crossings[c]
-            enter[c], free[c] = 0.0, network.clear[c]
             found = False
-            for p in range(network.offsets[lane], network.offsets[lane + 1] - 1):
+            p = first
+            while p <= last and not found:
+                a, b = max(p - 1, first), min(p + 1, last)
+                ux, uy = network.points[b, 0] - network.points[a, 0], network.points[b, 1] - network.points[a, 1]
+                length = math.hypot(ux, uy)
+                ux, uy = ux / length, uy / length
                 for q in range(network.offsets[other], network.offsets[other + 1] - 1):
-                    dx = traffic._turned(network.points[p, 0] - network.points[q, 0], network.width)
-                    dy = traffic._turned(network.points[p, 1] - network.points[q, 1], network.height)
-                    if dx * dx + dy * dy < apart * apart:
-                        ux = network.points[p + 1, 0] - network.points[p, 0]
-                        uy = network.points[p + 1, 1] - network.points[p, 1]
+                    dx = traffic._turned(network.points[q, 0] - network.points[p, 0], network.width)
+                    dy = traffic._turned(network.points[q, 1] - network.points[p, 1], network.height)
+                    if abs(dx * ux + dy * uy) < half_length and abs(dy * ux - dx * uy) < half_width:
                         vx = network.points[q + 1, 0] - network.points[q, 0]
                         vy = network.points[q + 1, 1] - network.points[q, 1]
-                        enter[c] = (p - network.offsets[lane]) * network.steps[lane]
-                        if ux * vx + uy * vy > 0.5 * network.steps[lane] * network.steps[other]:
+                        if ux * vx + uy * vy > 0.5 * network.steps[other]:
                             # They join: who is on the common ground is followed.
-                            gone = (q - network.offsets[other]) * network.steps[other] + length
+                            gone = _F(q - network.offsets[other]) * network.steps[other] + half_length
                             free[c] = min(free[c], gone)
                         found = True
                         break
-                if found:
-                    break
+                p += 1
+            enter[c] = _F(p - 1 - first) * network.steps[lane]
+
+
+@njit
+def _find_meetings(network, enter, meet):
+    for lane in range(len(network.steps)):
+        for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
+            other = network.crossings[c]
+            for back in range(network.crossing_offsets[other], network.crossing_offsets[other + 1]):
+                if network.crossings[back] == lane:
+                    meet[c] = enter[back]
 
 
 def conflicts(scenario: Scenario, sim: SimConfig) -> Conflicts:
     """Where the lanes of a map meet."""
-    count = len(scenario.network.crossings)
-    enter, free = np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.float32)
-    _find_conflicts(scenario.network, np.float32(sim.traffic.apart), np.float32(sim.vehicle.length), enter, free)
-    return Conflicts(freeze(enter), freeze(free))
+    network, vehicle = scenario.network, sim.vehicle
+    enter, meet = np.zeros_like(network.clear), np.zeros_like(network.clear)
+    free = network.clear.copy()
+    # A car that stands further back leaves the others room for half their width, and for caution.
+    half_length = np.float32((vehicle.length + vehicle.width) / 2 + _CAUTION)
+    _find_conflicts(network, half_length, np.float32(vehicle.width + _CAUTION), enter, free)
+    _find_meetings(network, enter, meet)
+    return Conflicts(freeze(enter), freeze(meet), freeze(free))
 
 
 # --- Driving ---------------------------------------------------------------------------------------------------------
@@ -443,16 +464,16 @@ def _seat(network, route, rail, m, s, car, me):
 
 @leaf
 def _give_way(network, conflicts, drivers, me, world):
-    """The greatest acceleration (m/s2) with which nobody is met who is in a junction already, or may enter it."""
-    speed, allowed = me[SPEED], drivers.acceleration
+    """Meet nobody who is in a junction already, or may enter it: (greatest acceleration in m/s2, m to the meeting)."""
+    speed, allowed, least = me[SPEED], drivers.acceleration, _F(1e9)
     ahead = -me[ALONG]  # m to the beginning of the lane
     for turn in range(3):
         lane = _I(me[LANE] if turn == 0 else (me[NEXT] if turn == 1 else me[AFTER]))
         if ahead > me[HORIZON]:
             break
         for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
-            way = ahead + conflicts.enter[c] - drivers.half_length - _MARGIN
-            if way < -_MARGIN or way > me[HORIZON]:
+            way = ahead + conflicts.enter[c]
+            if way < -_NUDGE or way > me[HORIZON]:
                 continue  # in the middle of it one goes on
             other = network.crossings[c]
             for j in range(world.shape[0]):
@@ -470,14 +491,21 @@ def _give_way(network, conflicts, drivers, me, world):
                 if rest <= _ZERO:
                     continue
                 time = rest / max(world[j, SPEED], _HALF)
-                if speed * time > way:  # arrive when it has gone, or stop there
-                    room = max(way, _F(0.1))
+                before = (conflicts.meet[c] - at) / max(world[j, SPEED], _ONE)
+                if speed * time < way or (way + _THROUGH) / max(speed, _ONE) < before - _ONE:
+                    continue  # it has gone by then, or comes later
+                room = way - _RESERVE
+                if room > _ZERO:
                     slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * room))
-                    if speed < _CREEP:
-                        slower = drivers.acceleration  # standing is idleness in this world
-                    allowed = min(allowed, slower)
+                elif speed > _CREEP or way < _ZERO:
+                    slower = -drivers.braking
+                else:
+                    slower = drivers.acceleration
+                if speed < _CREEP and way > _ZERO:
+                    slower = drivers.acceleration
+                allowed, least = min(allowed, slower), min(least, way)
         ahead += traffic._lane_length(network, lane)
-    return allowed
+    return allowed, least
 
 
 @leaf
@@ -506,7 +534,10 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
     wish = max(bend, _ONE)
     if me[GAP] < _F(1e8):
         acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
-    acceleration = min(acceleration, _give_way(network, conflicts, drivers, me, world))
+    allowed, way = _give_way(network, conflicts, drivers, me, world)
+    acceleration = min(acceleration, allowed)
+    if car[IDLE] >= _BORED and way > -_NUDGE and me[GAP] - drivers.half_length > _NUDGE:
+        acceleration = drivers.acceleration  # standing too long is idleness in this world
     if route.lanes.shape[0] > 1:
         lane = _I(me[LANE])
         at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
