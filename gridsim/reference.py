@@ -3,7 +3,7 @@
 It is no learner: it reads the map and the other cars' state. What it may do is what any driver may: one of the eight
 actions each control period. Steering is pure pursuit (Coulter 1992) of the centre of mass, slip included; speed is a
 profile limited by curvature, held behind others by IDM (Treiber et al. 2000); lanes are changed by MOBIL (Kesting et
-al. 2007). Its wish is continuous, the actions are not: what an action owes the wish in heading is made good by later ones.
+al. 2007). Its wish is continuous, the actions are not: the heading that an action owes the wish is given by later ones.
 """
 
 from __future__ import annotations
@@ -54,11 +54,14 @@ LEFT_RAIL = 4  # the rail it comes from
 FIELDS_KEPT = 5
 
 _CAUTION = 0.3  # m, on every side of a car that waits
-_CREEP = _F(0.6)  # m/s with which it waits: progress enough not to be idle
+_CREEP = _F(0.8)  # m/s with which it waits: progress enough not to be idle
 _RESERVE = _F(3.0)  # m before where paths meet from which on it creeps
-_THROUGH = _F(9.0)  # m from there until it has passed
+_LEAD_TIME = _F(0.3)  # s that it must be first there to go first
+_ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
 _BORED = _F(9.0)  # control steps of standing after which it moves up a little
-_NUDGE = _F(1.0)  # m that it may then use of what it has kept clear
+_FIRM = _F(5.0)  # m/s2 of braking that it counts on
+_SLOW = _F(0.2)  # m/s below which another car waits
+_NUDGE = _F(0.5)  # m that it may then use of what it has kept clear
 
 
 class Conflicts(NamedTuple):
@@ -491,18 +494,21 @@ def _give_way(network, conflicts, drivers, me, world):
                 if rest <= _ZERO:
                     continue
                 time = rest / max(world[j, SPEED], _HALF)
-                before = (conflicts.meet[c] - at) / max(world[j, SPEED], _ONE)
-                if speed * time < way or (way + _THROUGH) / max(speed, _ONE) < before - _ONE:
-                    continue  # it has gone by then, or comes later
+                stops = speed * speed < _TWO * _FIRM * way  # it still can, should the other one not go on
+                if stops and speed * (time + _HALF) < way:
+                    continue  # it has gone by then
+                before = conflicts.meet[c] - at
+                if before > _ZERO and (
+                    world[j, SPEED] < _SLOW or way / max(speed, _ONE) + _LEAD_TIME < before / max(world[j, SPEED], _ONE)
+                ):
+                    continue  # it waits, or comes later and brakes for the ego car
                 room = way - _RESERVE
-                if room > _ZERO:
-                    slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * room))
-                elif speed > _CREEP or way < _ZERO:
+                if way < _ZERO or not stops:
                     slower = -drivers.braking
+                elif room > _ZERO and speed > _CREEP:
+                    slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * room))
                 else:
-                    slower = drivers.acceleration
-                if speed < _CREEP and way > _ZERO:
-                    slower = drivers.acceleration
+                    slower = (_CREEP - speed) / drivers.dt
                 allowed, least = min(allowed, slower), min(least, way)
         ahead += traffic._lane_length(network, lane)
     return allowed, least
@@ -530,7 +536,11 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
             if world[j, LANE] >= _ZERO:
                 dx, dy = wrapped(world[j, X] - car[X], network.width), wrapped(world[j, Y] - car[Y], network.height)
                 if math.sqrt(dx * dx + dy * dy) - _F(5.0) < me[HORIZON]:
+                    before = me[GAP]
                     traffic._follow(network, drivers, me, world[j], False)
+                    along = me[COS] * world[j, COS] + me[SIN] * world[j, SIN]
+                    if me[GAP] < before and along < _F(0.7):
+                        me[GAP] = max(me[GAP] - _ASIDE, drivers.half_length)
     wish = max(bend, _ONE)
     if me[GAP] < _F(1e8):
         acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
