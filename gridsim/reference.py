@@ -56,9 +56,9 @@ FIELDS_KEPT = 5
 _CAUTION = 0.3  # m, on every side of a car that waits
 _CREEP = _F(0.8)  # m/s with which it waits: progress enough not to be idle
 _RESERVE = _F(3.0)  # m before where paths meet from which on it creeps
-_LEAD_TIME = _F(0.3)  # s that it must be first there to go first
+_LEAD_TIME = _F(1.0)  # s that it must be first there to go first
 _ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
-_BORED = _F(9.0)  # control steps of standing after which it moves up a little
+_BORED = _F(8.0)  # control steps of standing after which it moves up a little
 _FIRM = _F(5.0)  # m/s2 of braking that it counts on
 _SLOW = _F(0.2)  # m/s below which another car waits
 _NUDGE = _F(0.5)  # m that it may then use of what it has kept clear
@@ -527,6 +527,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
             others[j, field] = world[j, field]
     me[HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_TWO * drivers.comfort))
     me[GAP], me[LEAD], me[SHIFT] = _F(1e9), _ZERO, _F(memory[BLEND])
+    touch = _F(1e9)  # m to where another car is in the way
     for side in range(2):
         if side == 0 and memory[BLEND] == 0.0:
             continue  # only who changes lanes minds the one it comes from too
@@ -539,14 +540,16 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
                     before = me[GAP]
                     traffic._follow(network, drivers, me, world[j], False)
                     along = me[COS] * world[j, COS] + me[SIN] * world[j, SIN]
-                    if me[GAP] < before and along < _F(0.7):
-                        me[GAP] = max(me[GAP] - _ASIDE, drivers.half_length)
+                    if me[GAP] < before:
+                        touch = min(touch, me[GAP])
+                        if along < _F(0.7):
+                            me[GAP] = max(me[GAP] - _ASIDE, drivers.half_length)
     wish = max(bend, _ONE)
     if me[GAP] < _F(1e8):
         acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
     allowed, way = _give_way(network, conflicts, drivers, me, world)
     acceleration = min(acceleration, allowed)
-    if car[IDLE] >= _BORED and way > -_NUDGE and me[GAP] - drivers.half_length > _NUDGE:
+    if car[IDLE] >= _BORED and way > -_NUDGE and touch - drivers.half_length > _NUDGE:
         acceleration = drivers.acceleration  # standing too long is idleness in this world
     if route.lanes.shape[0] > 1:
         lane = _I(me[LANE])
