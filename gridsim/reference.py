@@ -57,6 +57,8 @@ _CAUTION = 0.3  # m, on every side of a car that waits
 _CREEP = _F(0.8)  # m/s with which it waits: progress enough not to be idle
 _RESERVE = _F(3.0)  # m before where paths meet from which on it creeps
 _LEAD_TIME = _F(1.0)  # s that it must be first there to go first
+_USUAL = _F(4.0)  # m/s that another car may soon go
+_KEEP = _F(0.8)  # m before where paths meet at which it stops
 _ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
 _BORED = _F(8.0)  # control steps of standing after which it moves up a little
 _FIRM = _F(5.0)  # m/s2 of braking that it counts on
@@ -475,7 +477,7 @@ def _give_way(network, conflicts, drivers, me, world):
         if ahead > me[HORIZON]:
             break
         for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
-            way = ahead + conflicts.enter[c]
+            way = ahead + conflicts.enter[c] - _KEEP
             if way < -_NUDGE or way > me[HORIZON]:
                 continue  # in the middle of it one goes on
             other = network.crossings[c]
@@ -497,11 +499,11 @@ def _give_way(network, conflicts, drivers, me, world):
                 stops = speed * speed < _TWO * _FIRM * way  # it still can, should the other one not go on
                 if stops and speed * (time + _HALF) < way:
                     continue  # it has gone by then
-                before = conflicts.meet[c] - at
-                if before > _ZERO and (
-                    world[j, SPEED] < _SLOW or way / max(speed, _ONE) + _LEAD_TIME < before / max(world[j, SPEED], _ONE)
-                ):
-                    continue  # it waits, or comes later and brakes for the ego car
+                if world[j, SPEED] < _SLOW and speed < _ONE:
+                    continue  # it waits, for the ego car perhaps
+                before = (conflicts.meet[c] - at) / max(world[j, SPEED], _USUAL)
+                if way / max(speed, _ONE) + _LEAD_TIME < before:
+                    continue  # it comes later, and brakes for the ego car
                 room = way - _RESERVE
                 if way < _ZERO or not stops:
                     slower = -drivers.braking
@@ -549,7 +551,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
         acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
     allowed, way = _give_way(network, conflicts, drivers, me, world)
     acceleration = min(acceleration, allowed)
-    if car[IDLE] >= _BORED and way > -_NUDGE and touch - drivers.half_length > _NUDGE:
+    if car[IDLE] >= _BORED and way > -_NUDGE and touch > drivers.half_length + _F(0.1):
         acceleration = drivers.acceleration  # standing too long is idleness in this world
     if route.lanes.shape[0] > 1:
         lane = _I(me[LANE])
