@@ -54,16 +54,14 @@ LEFT_RAIL = 4  # the rail it comes from
 FIELDS_KEPT = 5
 
 _CAUTION = 0.3  # m, on every side of a car that waits
-_CREEP = _F(0.8)  # m/s with which it waits: progress enough not to be idle
-_RESERVE = _F(3.0)  # m before where paths meet from which on it creeps
+_KEEP = _F(2.5)  # m before where paths meet at which it waits
+_NUDGE = _F(2.0)  # m of these that it then uses, bit by bit
+_BORED = _F(8.0)  # control steps of standing after which it moves up a bit, so as not to be idle
 _LEAD_TIME = _F(1.0)  # s that it must be first there to go first
 _USUAL = _F(4.0)  # m/s that another car may soon go
-_KEEP = _F(0.8)  # m before where paths meet at which it stops
-_ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
-_BORED = _F(8.0)  # control steps of standing after which it moves up a little
-_FIRM = _F(5.0)  # m/s2 of braking that it counts on
 _SLOW = _F(0.2)  # m/s below which another car waits
-_NUDGE = _F(0.5)  # m that it may then use of what it has kept clear
+_FIRM = _F(5.0)  # m/s2 of braking that it counts on
+_ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
 
 
 class Conflicts(NamedTuple):
@@ -504,13 +502,10 @@ def _give_way(network, conflicts, drivers, me, world):
                 before = (conflicts.meet[c] - at) / max(world[j, SPEED], _USUAL)
                 if way / max(speed, _ONE) + _LEAD_TIME < before:
                     continue  # it comes later, and brakes for the ego car
-                room = way - _RESERVE
                 if way < _ZERO or not stops:
                     slower = -drivers.braking
-                elif room > _ZERO and speed > _CREEP:
-                    slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * room))
                 else:
-                    slower = (_CREEP - speed) / drivers.dt
+                    slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * way))
                 allowed, least = min(allowed, slower), min(least, way)
         ahead += traffic._lane_length(network, lane)
     return allowed, least
