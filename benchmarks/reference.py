@@ -1,4 +1,4 @@
-"""The reference driver on the 64 held-out episodes of every scenario: `python benchmarks/reference.py [SCENARIO ...]`."""
+"""The reference driver on the held-out episodes of each scenario: `python benchmarks/reference.py [SCENARIO ...]`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default
 
 
 def main() -> None:
+    """Print a line for each scenario, without and with traffic; failures as (episode, end, steps)."""
     print(f"{'scenario':>10} {'traffic':>7} {'success':>7} {'m/s':>6} {'paced':>5}  interval  ends")
     for name in sys.argv[1:] or REGISTRY:
         spec = REGISTRY[name]
@@ -32,7 +33,11 @@ def main() -> None:
             paced = np.mean([drive.car[PACED] / drive.car[DISTANCE] for drive in drives])
             ends = [drive.end for drive in drives]
             low, high = spec.speed_interval
-            bad = [(k, end.name, len(d.time)) for k, (end, d) in enumerate(zip(ends, drives)) if end != End.SUCCESS]
+            bad = [
+                (k, end.name, len(d.time))
+                for k, (end, d) in enumerate(zip(ends, drives, strict=True))
+                if end != End.SUCCESS
+            ]
             print(
                 f"{name:>10} {cars:7d} {np.mean([end == End.SUCCESS for end in ends]):7.3f} {np.mean(speeds):6.2f} "
                 f"{paced:5.2f}  {low:.0f} - {high:.0f}  {len(bad)} {bad[:12]}",
