@@ -192,7 +192,6 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_action_space: Discrete | Box = Discrete(len(Action))
         if actions == "continuous":
             self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
-        self._action_axes = 1 if actions == "discrete" else 2
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         #: float32 [n, rays], m: the ranges that the last observations were made of.
@@ -248,8 +247,9 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
         begun = self.simulator.state.ends != 0
-        if np.ndim(actions) != self._action_axes:
-            raise ValueError(f"actions are {self.action_space}, not of shape {np.shape(actions)}")
+        if np.shape(actions) != self.action_space.shape:
+            each = f"{self.num_envs} cars, each with an action of {self.single_action_space}"
+            raise ValueError(f"there are {each}, not actions of shape {np.shape(actions)}")
         ranges, speeds, progress, ends = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
@@ -378,7 +378,11 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
             if self._window is None:
                 self._window = Window(RENDER_SIZE)
-            self._window.show(self._picture(0), RENDER_FPS)
+            if not self._window.closed:
+                self._window.show(self._picture(0), RENDER_FPS)
+                self._window.keys()  # a window whose events nobody takes is shown as one that hangs
+                if self._window.closed:  # by whoever watched: drive on unseen
+                    self._window.close()
 
     def _picture(self, i: int) -> np.ndarray:
         """What car i's world looks like: uint8 [height, width, 3]."""

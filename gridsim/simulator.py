@@ -579,8 +579,11 @@ def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
     Raises: ValueError with one line unless they are n whole numbers that name actions, or n pairs within [-1, 1].
     """
     array = np.asarray(actions)
-    if array.shape == (n, 2) and array.dtype.kind in "fiu":
-        pairs = np.ascontiguousarray(array, dtype=np.float32)
+    if array.shape == (n, 2):
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"continuous actions must be numbers within -1 and 1, not {array.dtype}")
+        with np.errstate(over="ignore"):
+            pairs = np.ascontiguousarray(array, dtype=np.float32)
         if not (np.abs(pairs) <= 1.0).all():  # false for what is not a number, too
             raise ValueError(f"continuous actions must be within -1 and 1, not {pairs[~(np.abs(pairs) <= 1.0)][0]}")
         return pairs

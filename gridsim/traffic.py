@@ -286,7 +286,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
                 car[SEED] = _F(mix(bits) >> _U(40))
-                car[FACTOR] = _F(0.8) + _F(0.4) * uniform(mix(bits + GOLDEN))
+                car[FACTOR] = _F(0.9) + _F(0.3) * uniform(mix(bits + GOLDEN))
                 car[NEXT] = _F(_choose(network, lane, car))
                 car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
                 at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
