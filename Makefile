@@ -14,7 +14,7 @@ ARGS   ?=
 PORT   ?= 5000
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test ui bench lint format
+.PHONY: help install evolve test ui bench pictures lint format
 
 help: ## This list
 	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
@@ -38,6 +38,9 @@ ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
 bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/scaling.py
+
+pictures: $(STAMP) ## Draw docs/'s pictures of the five scenarios again
+	$(BIN)/python docs/pictures.py
 
 lint: $(STAMP) ## Check style, format and types
 	$(BIN)/ruff check .

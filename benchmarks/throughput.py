@@ -1,34 +1,37 @@
 """Car-steps per second on one pinned core, and what surrounds them.
 
-    python benchmarks/throughput.py [--json] [--peers]
+    python benchmarks/throughput.py [--json] [--peers [PYTHON]]
 
-Ego cars only, resets included, a trained policy at the wheel over several maps, medians of several runs:
+On `seamless`, resets included, a trained policy at the wheel over several maps, medians of several runs; ego cars only
+are counted:
 
-    rollout_rays         car-steps/s of the fused rollout: 31 rays of 50 m, network, act, advance, collide
-    vector_env_rays      car-steps/s of `env.step` of the Gymnasium vector environment with 1,024 cars
-    breed_512x1000_ms    512 children of about 1,000 genes, half of them of two parents, 3 % of the genes mutated
-    map_ms               a new map from its seed
+    rollout_rays             car-steps/s of the fused rollout: 31 rays of 50 m, network, act, advance, collide
+    vector_env_rays          car-steps/s of `env.step` of the Gymnasium vector environment with 1,024 cars
+    vector_env_grid          the same with `observation="grid"`
+    ..._traffic              the same with 8 other cars in each car's world, by a driver who learned among traffic
+    breed_512x1000_ms        512 children of about 1,000 genes, half of them of two parents, 3 % of the genes mutated
+    map_<scenario>_ms, _mib  a new map from its seed: time to build it, and its memory
 
 `--json` prints these and the speeds driven as one flat object of numbers. `--peers` adds the steps per second of other
-environments on the same core under random actions, where they are installed beside this project
-(`pip install highway-env "gymnasium[box2d]"`); they are no dependencies.
+environments on the same core under random actions, and how many times as many ours takes; they are no dependencies, and
+`--peers /path/to/python` finds them in a virtual environment of their own (`benchmarks/peers.py`).
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import os
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-import gymnasium
 import numpy as np
+from peers import NOT_INSTALLED, PEERS  # beside this file
 
 import gridsim.env
 from cluster.champion import Champion, load_champion
@@ -38,19 +41,14 @@ from evolution.episodes import lane_starts
 from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
 from evolution.rollout import Limits, evaluate
 from gridsim.jit import njit
-from gridsim.scenarios import HELD_OUT_SEED, Scenario, build
+from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build
 from gridsim.simulator import DISTANCE
 
 MAPS = 8
 EPISODES = 16  # of the rollout, over all maps
 CARS = 1024  # of the vector environment
 SPEED = 6.0  # m/s, that the policy must drive at: crashing and parked cars are cheap
-# What a peer is called here: the module it needs, its id and its arguments.
-PEERS: dict[str, tuple[str, str, dict[str, Any]]] = {
-    "highway_env_grid": ("highway_env", "highway-v0", {"config": {"observation": {"type": "OccupancyGrid"}}}),
-    "highway_env_lidar": ("highway_env", "highway-v0", {"config": {"observation": {"type": "LidarObservation"}}}),
-    "car_racing": ("Box2D", "CarRacing-v3", {"continuous": False}),
-}
+TRAFFIC = 8  # cars in a world
 
 
 def median_s(run: Callable[[], object], runs: int) -> float:
@@ -63,14 +61,15 @@ def median_s(run: Callable[[], object], runs: int) -> float:
     return statistics.median(times)
 
 
-def rollout_rays(champion: Champion, maps: list[Scenario], runs: int) -> tuple[float, float]:
+def rollout_rays(champion: Champion, maps: list[Scenario], runs: int, traffic: int = 0) -> tuple[float, float]:
     """(car-steps/s, m/s driven) of the fused rollout of whole episodes."""
     spec, episode = PolicySpec.parse(champion.policy), champion.sim.episode
-    episodes, _ = lane_starts(maps, np.arange(EPISODES) % len(maps), np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    episodes, worlds = lane_starts(maps, np.arange(EPISODES) % len(maps), rng, traffic, champion.sim.traffic)
     limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
 
     def run() -> np.ndarray:
-        return evaluate(spec, champion.genome[None], maps, episodes, limits, champion.sim)[0]
+        return evaluate(spec, champion.genome[None], maps, episodes, limits, champion.sim, worlds=worlds)[0]
 
     results = run()
     steps = int(results["steps"].sum())
@@ -87,9 +86,18 @@ def _actions(packed, layers, ranges, speeds, actions):
         actions[i] = decide(packed, layers, scratch)
 
 
-def vector_env_rays(champion: Champion, maps: list[Scenario], runs: int, steps: int = 200) -> tuple[float, float]:
+def vector_env(
+    champion: Champion,
+    maps: list[Scenario],
+    runs: int,
+    traffic: int = 0,
+    observation: Literal["rays", "grid"] = "rays",
+    steps: int = 200,
+) -> tuple[float, float]:
     """(car-steps/s, m/s driven) of `env.step`: without the network's own time; a step that only resets is none."""
-    env = gridsim.env.GridSimVectorEnv(CARS, maps=maps, config=champion.sim)
+    env = gridsim.env.GridSimVectorEnv(
+        CARS, maps=maps, config=champion.sim, traffic=traffic, observation=observation, scenario=champion.scenario
+    )
     layers = PolicySpec.parse(champion.policy).layers
     packed = np.empty(packed_size(layers), dtype=np.float32)
     pack(champion.genome, layers, packed)
@@ -129,73 +137,85 @@ def breed_ms(runs: int) -> float:
     return 1e3 * median_s(lambda: breed(parents, recipes, 1, spec, mutation), 4 * runs)
 
 
-def map_ms(scenario: str, runs: int) -> float:
-    """Milliseconds to build a map nobody has seen."""
-    build(scenario, 0)
+def new_map(scenario: str, runs: int) -> tuple[float, float]:
+    """(ms to build a map nobody has seen, MiB of its arrays)."""
+    made = build(scenario, 0)
+    arrays = [value for value in [*made.road, *made.network, *made.arrays().values()] if isinstance(value, np.ndarray)]
+    unique = {array.__array_interface__["data"][0]: array.nbytes for array in arrays}  # some are seen twice
     seeds = iter(range(HELD_OUT_SEED + 1000, HELD_OUT_SEED + 1000 + runs))
-    return 1e3 * median_s(lambda: build(scenario, next(seeds)), runs)
+    return 1e3 * median_s(lambda: build(scenario, next(seeds)), runs), sum(unique.values()) / 2**20
 
 
-def peer_steps(name: str, seconds: float = 3.0) -> float | None:
-    """Steps per second of another environment under random actions, resets included; None where it is not installed."""
-    module, env_id, arguments = PEERS[name]
-    if importlib.util.find_spec(module) is None:
-        print(f"throughput: {name}: skipped, {module} is not installed", file=sys.stderr)
-        return None
-    importlib.import_module(module)
-    env = gymnasium.make(env_id, **arguments)
-    env.action_space.seed(0)
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
-    steps, start = 0, time.perf_counter()
-    while (spent := time.perf_counter() - start) < seconds:
-        *_, terminated, truncated, _ = env.step(env.action_space.sample())
-        steps += 1
-        if terminated or truncated:
-            env.reset()
-    env.close()
-    return steps / spent
+def peer_steps(name: str, python: str) -> float | str:
+    """Steps per second of another environment, measured by a process of that Python; or why there are none."""
+    file = str(Path(__file__).with_name("peers.py"))
+    try:
+        run = subprocess.run([python, file, name], capture_output=True, text=True, timeout=120, check=False)
+        if run.returncode == 0:
+            return float(run.stdout.split()[-1])
+    except (OSError, subprocess.TimeoutExpired, ValueError, IndexError) as error:
+        return f"could not be run: {error}"
+    why = (run.stderr.strip() or f"exit code {run.returncode}").splitlines()[-1]
+    return why if run.returncode == NOT_INSTALLED else f"could not be run: {why}"
 
 
 def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--json", action="store_true", help="print one flat JSON object of numbers, nothing else")
-    parser.add_argument("--peers", action="store_true", help="also measure other environments that are installed")
-    parser.add_argument("--champion", type=Path, default=Path(__file__).with_name("champion.npz"), help="who drives")
+    parser.add_argument(
+        "--peers", nargs="?", const=sys.executable, metavar="PYTHON", help="also measure other environments"
+    )
+    here = Path(__file__).parent
+    parser.add_argument("--champion", type=Path, default=here / "champion.npz", help="who drives alone")
+    parser.add_argument("--champion-traffic", type=Path, default=here / "champion_traffic.npz", help="... in traffic")
     parser.add_argument("--runs", type=int, default=7, help="of which each figure is the median (7)")
     options = parser.parse_args()
     if options.runs < 1:
         parser.error("--runs must be 1 or more")
     try:
-        champion = load_champion(options.champion)
+        alone, among = load_champion(options.champion), load_champion(options.champion_traffic)
     except CheckpointError as error:
         parser.error(f"{error}")
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
-    maps = [build(champion.scenario, HELD_OUT_SEED + k, champion.sim) for k in range(MAPS)]
     figures: dict[str, float] = {}
-    for name, measure in (("rollout_rays", rollout_rays), ("vector_env_rays", vector_env_rays)):
-        figures[name], figures[f"{name}_speed_mps"] = measure(champion, maps, options.runs)
-        if figures[f"{name}_speed_mps"] < SPEED:
-            slow = figures[f"{name}_speed_mps"]
-            print(f"throughput: {name}: the champion drives at {slow:.1f} m/s, not {SPEED:g}", file=sys.stderr)
+    rates = []
+    for champion, traffic in ((alone, 0), (among, TRAFFIC)):
+        maps = [build(champion.scenario, HELD_OUT_SEED + k, champion.sim) for k in range(MAPS)]
+        for name in ("rollout_rays", "vector_env_rays", "vector_env_grid"):
+            if name == "rollout_rays":
+                rate, speed = rollout_rays(champion, maps, options.runs, traffic)
+            else:
+                rate, speed = vector_env(
+                    champion, maps, options.runs, traffic, "grid" if name.endswith("grid") else "rays"
+                )
+            name += "_traffic" if traffic else ""
+            rates.append(name)
+            figures[name], figures[f"{name}_speed_mps"] = rate, speed
+            if speed < SPEED:
+                print(f"throughput: {name}: the champion drives at {speed:.1f} m/s, not {SPEED:g}", file=sys.stderr)
     figures["breed_512x1000_ms"] = breed_ms(options.runs)
-    figures["map_ms"] = map_ms(champion.scenario, options.runs)
-    peers = {name: peer_steps(name) for name in PEERS} if options.peers else {}
-    found = {name: steps for name, steps in peers.items() if steps is not None}
+    for name in REGISTRY:
+        figures[f"map_{name}_ms"], figures[f"map_{name}_mib"] = new_map(name, options.runs)
+    peers = {name: peer_steps(name, options.peers) for name in PEERS} if options.peers else {}
+    found = {name: steps for name, steps in peers.items() if not isinstance(steps, str)}
 
     if options.json:
         print(json.dumps({**figures, **{f"peer_{name}": steps for name, steps in found.items()}}))
         return 0
-    for name in ("rollout_rays", "vector_env_rays"):
-        print(f"{name:<20}{figures[name]:>12,.0f} car-steps/s   at {figures[f'{name}_speed_mps']:.1f} m/s")
-    for name in ("breed_512x1000_ms", "map_ms"):
-        print(f"{name:<20}{figures[name]:>12.2f} ms")
-    for name, steps in found.items():
-        ratio = figures["vector_env_rays"] / steps
-        print(f"{name:<20}{steps:>12,.0f} steps/s; vector_env_rays is {ratio:,.0f} times that")
+    for name in rates:
+        print(f"{name:<24}{figures[name]:>12,.0f} car-steps/s   at {figures[f'{name}_speed_mps']:.1f} m/s")
+    print(f"{'breed_512x1000_ms':<24}{figures['breed_512x1000_ms']:>12.2f} ms")
+    for name in REGISTRY:
+        print(f"{f'map_{name}':<24}{figures[f'map_{name}_ms']:>12.1f} ms   {figures[f'map_{name}_mib']:.1f} MiB")
+    for name, steps in peers.items():
+        if isinstance(steps, str):
+            print(f"{name:<24}{steps}")
+        else:
+            ours = PEERS[name].ours
+            print(f"{name:<24}{steps:>12,.0f} steps/s; {ours} is {figures[ours] / steps:,.0f} times that")
     return 0
 
 

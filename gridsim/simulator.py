@@ -585,7 +585,7 @@ def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
         with np.errstate(over="ignore"):
             pairs = np.ascontiguousarray(array, dtype=np.float32)
         if not (np.abs(pairs) <= 1.0).all():  # false for what is not a number, too
-            raise ValueError(f"continuous actions must be within -1 and 1, not {pairs[~(np.abs(pairs) <= 1.0)][0]}")
+            raise ValueError(f"continuous actions must be within -1 and 1, not {pairs[~(np.abs(pairs) <= 1.0)][0]:g}")
         return pairs
     if array.shape != (n,):
         raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")
