@@ -41,8 +41,10 @@ PACE = 15  # m/s2, its acceleration in this step
 HORIZON = 16  # m ahead that it looks in this step
 GAP = 17  # m from its middle to where it must not get
 LEAD = 18  # m/s of what is there
-FIELDS = 19
+CLOCK = 19  # control steps until it thinks of another lane
+FIELDS = 20
 
+_THINKING = _F(10.0)  # control steps from one thought of another lane to the next
 _CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
 _CROSSING_TIME = _F(4.0)  # s, what it takes to leave a junction
@@ -272,6 +274,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
         car = world[i]
         car[:] = _ZERO
         car[LANE], car[PAST], car[PERMIT] = -_ONE, -_ONE, -_ONE
+        car[CLOCK] = _F(i) % _THINKING  # not all at once
         for _ in range(60):
             draws += 1
             bits = mix(key + _U(draws) * GOLDEN)
@@ -546,11 +549,15 @@ def _desired(network, car):
 
 
 @njit(_nrt=False)
-def _change_lanes(network, drivers, world, i, ego, step):
+def _change_lanes(network, drivers, world, i, ego):
     """MOBIL (Kesting et al. 2007): move car i to a neighbouring lane where that is safe and it gains by it."""
     car = world[i]
     lane = _I(car[LANE])
-    if car[SHIFT] != _ZERO or (_I(step) + _I(7) * _I(i)) % _I(10) != _I(0):
+    if car[CLOCK] > _ZERO:
+        car[CLOCK] -= _ONE
+        return
+    car[CLOCK] = _THINKING - _ONE
+    if car[SHIFT] != _ZERO:
         return
     if network.left[lane] < 0 and network.right[lane] < 0:
         return
@@ -661,11 +668,11 @@ def _go(network, drivers, car):
 
 
 @njit(nogil=True, _nrt=False)
-def flow(network, drivers, world, ego, step):
+def flow(network, drivers, world, ego):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
     Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it
-    is not there); number of the control step.
+    is not there).
     """
     cars = world.shape[0]
     _see(network, drivers, world, ego)
@@ -687,7 +694,7 @@ def flow(network, drivers, world, ego, step):
         car[PACE] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
-            _change_lanes(network, drivers, world, i, ego, step)
+            _change_lanes(network, drivers, world, i, ego)
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
             _go(network, drivers, world[i])
