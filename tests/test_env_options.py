@@ -1,6 +1,8 @@
 """What the Gymnasium environments can be asked for: sensing, actions, traffic, pictures, and Gymnasium's wrappers."""
 
+import copy
 import math
+import pickle
 import warnings
 from pathlib import Path
 from typing import Any
