@@ -21,7 +21,7 @@ from cluster.coordinator import Maps, summarise
 from cluster.settings import MAX_TRAFFIC
 from evolution import convnet
 from evolution.curriculum import HELD_OUT_MAPS, spread_starts
-from evolution.policy import CnnSpec, Observation, PolicySpec, act_on
+from evolution.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
@@ -81,7 +81,15 @@ class Champion:
         """A Gymnasium environment on the champion's scenario, or another."""
         from gridsim.env import GridSimEnv
 
-        return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **options)
+        spec = PolicySpec.parse(self.policy)
+        sees: dict[str, Any] = {"observation": spec.observation}
+        if isinstance(spec, CnnSpec):
+            sees["frames"] = spec.frames
+        elif isinstance(spec, MlpSpec):
+            sees["motion"] = spec.motion
+        if scenario in (None, self.scenario):
+            sees["traffic"] = self.traffic
+        return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **{**sees, **options})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if that cannot be done."""

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from evolution.curriculum import CurriculumConfig
 from evolution.genetic import GeneticConfig
 from evolution.policy import Observation, PolicySpec
-from gridsim.scenarios import build, check_name, default_traffic, is_map_file
+from gridsim.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
@@ -73,8 +73,11 @@ class EvolveSettings:
             object.__setattr__(self, "policy", DEFAULT_POLICY.get(self.observation, ""))
 
     def curriculum(self) -> CurriculumConfig:
-        """The curriculum of such a run."""
-        return CurriculumConfig()
+        """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
+        low, _ = speed_interval(self.scenario)
+        if self.traffic:
+            return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3)
+        return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
 
     def check(self) -> None:
         """Raises SettingsError, one line that says what to change."""

@@ -43,7 +43,7 @@ class CurriculumConfig:
     last_target: float = 400.0  # m; what is learned further on is learned as well from another start
     race_stretch: float = 2.5  # length of a race's episodes, in targets
     growth: float = 0.6  # share of the race's episodes in which the best 8 must reach the target before it doubles
-    pace: float = 7.0  # m/s that the time limit of a training episode allows for
+    pace: float = 7.0  # m/s that the time limit of a training episode allows for; this and champion_pace: seamless
     slack: float = 3.0  # s, added to it
     validation_target: float = 300.0  # m, from which on champions are looked for
     contenders: int = 4  # racers that are validated each generation

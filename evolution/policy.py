@@ -46,9 +46,9 @@ class PolicySpec(ABC):
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read `mlp:6,7` or `cnn:16,32,256@4`. Raises ValueError with one line for anything else."""
-        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)", text):
-            spec: PolicySpec = MlpSpec(tuple(int(n) for n in match[1].split(",")))
+        """Read `mlp:6,7`, `mlp:6,7+motion` or `cnn:16,32,256@4`. Raises ValueError with one line for all else."""
+        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?", text):
+            spec: PolicySpec = MlpSpec(tuple(int(n) for n in match[1].split(",")), motion=bool(match[2]))
             if min(spec.hidden) < 1 or spec.size > MAX_GENES:
                 raise ValueError(
                     f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
@@ -66,7 +66,7 @@ class PolicySpec(ABC):
                 raise ValueError(f"policy {text!r} has {spec.size:,} genes; {MAX_GENES:,} are the most")
             return spec
         raise ValueError(
-            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, "
+            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7 or mlp:6,7+motion, "
             "or cnn for the grid, as in cnn:8,16,32@1"
         )
 
@@ -92,19 +92,23 @@ class PolicySpec(ABC):
 
 @dataclass(frozen=True)
 class MlpSpec(PolicySpec):
-    """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts."""
+    """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts.
+
+    With `motion` it also sees how fast what each ray meets comes closer (`boxes.cast_boxes`).
+    """
 
     observation = "rays"
 
     hidden: tuple[int, ...] = (6, 7)
+    motion: bool = False
 
     def __str__(self) -> str:
-        return "mlp:" + ",".join(map(str, self.hidden))
+        return "mlp:" + ",".join(map(str, self.hidden)) + ("+motion" if self.motion else "")
 
     @property
     def inputs(self) -> int:
-        """The rays and the speed."""
-        return INPUTS
+        """The rays, what they meet's motion if it is seen, and the speed."""
+        return INPUTS + (INPUTS - 1 if self.motion else 0)
 
     @property
     def layers(self) -> np.ndarray:
@@ -187,12 +191,20 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
 
 
 @leaf
-def encode(ranges, speed, inputs):
-    """What the network sees: float32 [rays + 1]. Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out."""
+def encode(ranges, closing, speed, inputs):
+    """What the network sees: float32 [rays + 1], or [2 * rays + 1] where closing is not None; the speed is the last.
+
+    Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out.
+    """
     rays = ranges.shape[0]
     for i in range(rays):
         inputs[i] = _F(2.0) * ranges[i] / (ranges[i] + RAY_HALF) - _F(1.0)
-    inputs[rays] = speed / SPEED_SCALE - _F(1.0)
+    last = rays
+    if closing is not None:
+        for i in range(rays):
+            inputs[rays + i] = closing[i] / SPEED_SCALE
+        last = 2 * rays
+    inputs[last] = speed / SPEED_SCALE - _F(1.0)
 
 
 @leaf
@@ -294,13 +306,20 @@ def decide(packed, layers, scratch):
 
 
 @njit
-def _act_on(packed, layers, observations, reach, speed_limit, actions):
+def _act_on(packed, layers, observations, motion, reach, speed_limit, actions):
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    ranges = np.empty(layers[0] - 1, dtype=np.float32)
+    rays = (layers[0] - 1) // 2 if motion else layers[0] - 1
+    ranges, closing = np.empty(rays, dtype=np.float32), np.empty(rays, dtype=np.float32)
     for n in range(observations.shape[0]):
-        for i in range(ranges.shape[0]):
+        for i in range(rays):
             ranges[i] = observations[n, i] * reach
-        encode(ranges, observations[n, ranges.shape[0]] * speed_limit, scratch)
+        speed = observations[n, layers[0] - 1] * speed_limit
+        if motion:
+            for i in range(rays):
+                closing[i] = observations[n, rays + i] * speed_limit
+            encode(ranges, closing, speed, scratch)
+        else:
+            encode(ranges, None, speed, scratch)
         actions[n] = decide(packed, layers, scratch)
 
 
@@ -309,7 +328,8 @@ def act_on(
 ) -> int | np.ndarray:
     """Actions of a genome for the environment's observations.
 
-    Args: observation float32 [32] or [n, 32]: ranges / reach, then speed / speed_limit; reach m; speed limit m/s.
+    Args: observation float32 [32] or [n, 32]: ranges / reach, then speed / speed_limit; with motion [63] or [n, 63],
+    closing speeds / speed_limit between them; reach m; speed limit m/s.
     Returns: an action, or int64 [n]; -1 where the network gives no number.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
@@ -318,5 +338,6 @@ def act_on(
     packed = np.empty(packed_size(spec.layers), dtype=np.float32)
     pack(np.ascontiguousarray(genome), spec.layers, packed)
     actions = np.empty(len(many), dtype=np.int64)
-    _act_on(packed, spec.layers, np.ascontiguousarray(many), _F(reach), _F(speed_limit), actions)
+    motion = isinstance(spec, MlpSpec) and spec.motion
+    _act_on(packed, spec.layers, np.ascontiguousarray(many), motion, _F(reach), _F(speed_limit), actions)
     return int(actions[0]) if np.ndim(observation) == 1 else actions

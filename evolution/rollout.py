@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution import convnet
-from evolution.policy import BLOCK, CnnSpec, PolicySpec, decide, encode, pack, packed_size
+from evolution.policy import BLOCK, INPUTS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size
 from gridsim.config import SimConfig, constants
 from gridsim.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.jit import njit
@@ -38,7 +38,7 @@ from gridsim.simulator import (
 from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic import drivers, flow
 
-_F, _I = np.float32, np.int32
+_F = np.float32
 
 #: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
 #: its own target (m) and limit (control steps), where these are not 0.
@@ -76,9 +76,15 @@ def _eye(spec: PolicySpec, config: SimConfig) -> Eye | None:
     """None for a policy on rays. Raises: ValueError if it sees another number of them."""
     if isinstance(spec, CnnSpec):
         return Eye(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
-    if spec.inputs != config.sensors.rays + 1:
-        raise ValueError(f"{spec} sees {spec.inputs - 1} rays, the sensor has {config.sensors.rays}")
+    if config.sensors.rays != INPUTS - 1:
+        raise ValueError(f"{spec} sees {INPUTS - 1} rays, the sensor has {config.sensors.rays}")
     return None
+
+
+def _closing(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
+    """Room for the motion that a policy sees, if it sees any."""
+    sees = isinstance(spec, MlpSpec) and spec.motion
+    return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
 
 
 @njit
@@ -108,6 +114,7 @@ def _run(
     world,
     beams,
     ranges,
+    closing,
     scratch,
     eye,
     ring,
@@ -123,9 +130,9 @@ def _run(
     end = 0
     steps = 0
     while end == 0:
-        look(road, constants, fan, car, world, beams, ranges)
+        look(road, constants, fan, car, world, beams, ranges, closing)
         if eye is None:
-            encode(ranges, car[SPEED], scratch)
+            encode(ranges, closing, car[SPEED], scratch)
             action = decide(packed, layers, scratch)
         else:
             fill_grid(eye.table, ranges, eye.grid)
@@ -139,7 +146,7 @@ def _run(
         if world is not None:
             if keep > 0:
                 world_ring[steps % keep] = world
-            flow(network, drivers, world, car, _I(steps))
+            flow(network, drivers, world, car)
         end = drive(road, constants, car, visits, world, action)
         steps += 1
         if end == 0:
@@ -165,6 +172,7 @@ def _rollout(
     max_steps,
     rewind,
     rays,
+    closing,
     eye,
     results,
     column,
@@ -206,6 +214,7 @@ def _rollout(
             world,
             beams,
             ranges,
+            closing,
             scratch,
             eye,
             ring,
@@ -287,6 +296,7 @@ def evaluate(
             int(episode["steps"] or limits.steps),
             rewind,
             config.sensors.rays,
+            _closing(spec, config),
             eye,
             results,
             column,
@@ -331,6 +341,7 @@ def trajectory(
         _F(limits.target),
         limits.steps,
         config.sensors.rays,
+        _closing(spec, config),
         _eye(spec, config),
     )
     row = np.zeros((), dtype=RESULT)
@@ -339,7 +350,9 @@ def trajectory(
 
 
 @njit(nogil=True)
-def _trajectory(road, network, constants, drivers, fan, genome, layers, start, traffic, target, max_steps, rays, eye):
+def _trajectory(
+    road, network, constants, drivers, fan, genome, layers, start, traffic, target, max_steps, rays, closing, eye
+):
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car = np.empty(FIELDS, dtype=np.float32)
     visits = np.empty(cells, dtype=np.float32)
@@ -367,6 +380,7 @@ def _trajectory(road, network, constants, drivers, fan, genome, layers, start, t
         world,
         beams,
         ranges,
+        closing,
         scratch,
         eye,
         ring,

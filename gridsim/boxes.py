@@ -14,11 +14,15 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 
 @leaf
-def cast_boxes(constants, fan, width, height, x, y, cosine, sine, world, ranges):
+def cast_boxes(constants, fan, width, height, x, y, cosine, sine, world, ranges, closing):
     """Shorten ranges (m) to the first box of a world that each ray meets: slab test (Kay and Kajiya 1986).
 
     Args: fan of `sensors.fan`; sides of the torus, m; the sensor's position (m) and heading; world of `traffic`.
+    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the speed (m/s) over ground at which what a
+    ray has met comes towards the sensor along it, as a radar tells; 0 where that is the road's edge.
     """
+    if closing is not None:
+        closing[:] = _ZERO
     length, breadth = constants.half_length, constants.half_width
     radius = math.sqrt(length * length + breadth * breadth)
     last_ray = _I(ranges.shape[0] - 1)
@@ -53,6 +57,8 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, world, ranges)
             leave = min(max(x0, x1), max(y0, y1))
             if enter <= leave and leave > _ZERO and enter < ranges[r]:
                 ranges[r] = max(enter, _ZERO)
+                if closing is not None:
+                    closing[r] = -world[j, SPEED] * ux  # the box moves along its own heading
 
 
 @leaf

@@ -51,12 +51,12 @@ class EpisodeConfig:
 class TrafficConfig:
     """How other cars drive: IDM (Treiber et al. 2000, city values) and MOBIL (Kesting et al. 2007)."""
 
-    acceleration: float = 1.5  # m/s2, a of IDM
+    acceleration: float = 2.0  # m/s2, a of IDM
     comfort: float = 2.0  # m/s2, comfortable deceleration, b of IDM
     braking: float = 8.0  # m/s2, greatest deceleration
     headway: float = 1.2  # s, T of IDM
     jam: float = 2.0  # m, bumper to bumper at standstill, s0 of IDM
-    lateral: float = 2.0  # m/s2, lateral acceleration in bends
+    lateral: float = 3.0  # m/s2, lateral acceleration in bends
     politeness: float = 0.2  # p of MOBIL
     threshold: float = 0.2  # m/s2 to be gained by a change of lanes
     safe_braking: float = 3.0  # m/s2 that a change of lanes may ask of who is behind

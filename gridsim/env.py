@@ -3,7 +3,8 @@
 Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and so on; Gymnasium imports it by itself
 for `gymnasium.make("gridsim.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
 
-Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; or
+Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s, and with
+`motion` between them how fast what each ray meets comes closer over ground, float32 [rays], as a share of 30 m/s; or
 `grid`, uint8 [80, 80], the occupancy grid of `gridsim.grid`, and with `frames` above 1 [frames, 80, 80], the newest
 last. Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of
 `vehicle.act_continuous`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
@@ -70,7 +71,7 @@ def _draw(keys, episodes, which, numbers, drawn):
 
 
 @njit
-def _observe(ranges, speeds, progress, ends, fastest, begun, reach, slowest, limit, dt, observations, rewards):
+def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slowest, limit, dt, observations, rewards):
     """Observations [n, rays + 1], if not None, and rewards [n]; `fastest` m/s: upper speed of each car's scenario."""
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
@@ -81,7 +82,10 @@ def _observe(ranges, speeds, progress, ends, fastest, begun, reach, slowest, lim
         if observations is not None:
             for r in range(rays):
                 observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
-            observations[i, rays] = min(max(speed / limit, slowest), _F(1.0))
+            if closing is not None:
+                for r in range(rays):
+                    observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
+            observations[i, observations.shape[1] - 1] = min(max(speed / limit, slowest), _F(1.0))
         if begun[i]:
             rewards[i] = _F(0.0)
         elif ends[i] == 1:
@@ -119,6 +123,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         traffic: int | None = None,
         observation: Literal["rays", "grid"] = "rays",
         frames: int = 1,
+        motion: bool = False,
         actions: Literal["discrete", "continuous"] = "discrete",
         render_mode: Literal["rgb_array", "human"] | None = None,
         max_episode_steps: int | None = None,
@@ -134,6 +139,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             traffic: other cars in each car's world; None is as many as the scenario has by default.
             observation: `rays` or `grid`.
             frames: grids that make an observation, 1 to 16.
+            motion: whether rays also tell the motion of what they meet.
             actions: `discrete` or `continuous`.
             render_mode: `rgb_array`, or `human`, a window that follows the first car.
             max_episode_steps: time limit in control steps; None is the configuration's.
@@ -150,6 +156,8 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
         if not 1 <= frames <= 16 or (frames > 1 and observation == "rays"):
             raise ValueError(f"frames must be 1 to 16, and more than 1 only for observation='grid', not {frames}")
+        if motion and observation == "grid":
+            raise ValueError("motion is seen by rays; leave it out with observation='grid'")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         if map_seed < 0:
@@ -170,7 +178,10 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._views: dict[int, Renderer] = {}  # by map
         self._window: Window | None = None
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
-        low = np.zeros(self.config.sensors.rays + 1, dtype=np.float32)
+        self._motion = motion
+        rays = self.config.sensors.rays
+        low = np.zeros((2 if motion else 1) * rays + 1, dtype=np.float32)
+        low[rays:] = -1.0
         low[-1] = self._slowest = _F(-self.config.vehicle.reverse_limit / self.config.vehicle.speed_limit)
         self._table = grid_table(self.config) if observation == "grid" else None
         self._stack = np.zeros((num_envs, frames, CELLS, CELLS), dtype=np.uint8) if observation == "grid" else None
@@ -181,7 +192,6 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_action_space: Discrete | Box = Discrete(len(Action))
         if actions == "continuous":
             self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
-        self._action_axes = 1 if actions == "discrete" else 2
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         #: float32 [n, rays], m: the ranges that the last observations were made of.
@@ -237,8 +247,9 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
         begun = self.simulator.state.ends != 0
-        if np.ndim(actions) != self._action_axes:
-            raise ValueError(f"actions are {self.action_space}, not of shape {np.shape(actions)}")
+        if np.shape(actions) != self.action_space.shape:
+            each = f"{self.num_envs} cars, each with an action of {self.single_action_space}"
+            raise ValueError(f"there are {each}, not actions of shape {np.shape(actions)}")
         ranges, speeds, progress, ends = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
@@ -320,9 +331,11 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Observations and rewards [n] of a step."""
         n, rays = ranges.shape
         rewards = np.empty(n, dtype=np.float32)
-        observations = np.empty((n, rays + 1), dtype=np.float32) if self._table is None else None
+        width = (2 if self._motion else 1) * rays + 1
+        observations = np.empty((n, width), dtype=np.float32) if self._table is None else None
         _observe(
             ranges,
+            self.simulator.closing if self._motion else None,
             speeds,
             progress,
             ends,
@@ -365,7 +378,11 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
             if self._window is None:
                 self._window = Window(RENDER_SIZE)
-            self._window.show(self._picture(0), RENDER_FPS)
+            if not self._window.closed:
+                self._window.show(self._picture(0), RENDER_FPS)
+                self._window.keys()  # a window whose events nobody takes is shown as one that hangs
+                if self._window.closed:  # by whoever watched: drive on unseen
+                    self._window.close()
 
     def _picture(self, i: int) -> np.ndarray:
         """What car i's world looks like: uint8 [height, width, 3]."""

@@ -41,11 +41,10 @@ from gridsim.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.scenarios import START_SPEED, Scenario
+from gridsim.scenarios import FILE_SPEEDS, START_SPEED, Scenario
 from gridsim.traffic import make_network
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
-SPEED_INTERVAL = (5.0, 12.0)  # m/s, of a map that names none
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
 KEYS = (
@@ -83,7 +82,7 @@ class MapFile:
     free_thresh: float = 0.5
     starts: tuple[tuple[float, float, float], ...] = ()
     torus: bool = False
-    speed: tuple[float, float] = SPEED_INTERVAL
+    speed: tuple[float, float] = FILE_SPEEDS
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Scenario:
@@ -220,7 +219,7 @@ def _checked(path: Path, values: Any) -> MapFile:
         raise ValueError(f"free_thresh must be above 0 and not above occupied_thresh, not {free:g} with {occupied:g}")
     low, high = (
         _number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit)
-        for value in _list(values.get("speed", list(SPEED_INTERVAL)), "speed", (2,))
+        for value in _list(values.get("speed", list(FILE_SPEEDS)), "speed", (2,))
     )
     if not low < high:
         raise ValueError(f"speed must be an interval from low to high, not {low:g} to {high:g}")

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from gridsim.traffic import Network, make_network, network_of_lanes
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
+FILE_SPEEDS = (5.0, 12.0)  # m/s, the interval of a map from a file that names none
 START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight as a share of the interval's two ends together: its middle
 ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
@@ -116,6 +118,10 @@ class Scenario:
             starts=frozen["starts"],
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies are read-only, too: kernels would be compiled anew for arrays that can be written to."""
+        return Scenario.from_arrays, (self.arrays(),)
+
 
 @dataclass(frozen=True)
 class ScenarioSpec:
@@ -157,6 +163,11 @@ def label(name: str) -> str:
 def default_traffic(name: str) -> int:
     """Other cars on a scenario's road unless told otherwise; none on a map from a file, which has no lanes."""
     return REGISTRY[name].traffic if name in REGISTRY else 0
+
+
+def speed_interval(name: str) -> tuple[float, float]:
+    """m/s, a scenario's own; of a map from a file, the one that files have unless they say otherwise."""
+    return REGISTRY[name].speed_interval if name in REGISTRY else FILE_SPEEDS
 
 
 def map_of(name: str, seed: int) -> int:

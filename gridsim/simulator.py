@@ -113,16 +113,17 @@ def place(road, start, car, visits):
 
 
 @leaf
-def look(road, constants, fan, car, world, beams, ranges):
+def look(road, constants, fan, car, world, beams, ranges, closing):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
-    Here and below a world of None is no traffic, and what traffic needs is not even compiled.
+    Here and below a world of None is no traffic, and what traffic needs is not even compiled. closing as in
+    `boxes.cast_boxes`; without traffic it is left as it is.
     """
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
     if world is not None:
-        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], world, ranges)
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], world, ranges, closing)
 
 
 @leaf
@@ -221,23 +222,25 @@ def control(road, constants, car, visits, world, acceleration, target, max_steps
 
 
 @njit
-def _place_some(road, constants, fan, order, which, starts, cars, visits, worlds, beams, ranges):
+def _place_some(road, constants, fan, order, which, starts, cars, visits, worlds, beams, ranges, closing):
     for k in order:
         i = which[k]
         place(road, starts[k], cars[i], visits[i])
         if worlds is not None:
-            look(road, constants, fan, cars[i], worlds[i], beams, ranges[k])
+            look(road, constants, fan, cars[i], worlds[i], beams, ranges[k], closing[i])
         else:
-            look(road, constants, fan, cars[i], None, beams, ranges[k])
+            look(road, constants, fan, cars[i], None, beams, ranges[k], None)
 
 
 @njit(nogil=True)
-def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, worlds, ranges):
+def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
     beams = np.empty((3, LANES), dtype=np.float32)
     for row, first, last in runs:
         road = road_of(atlas, row)
-        _place_some(road, constants, fan, order[first:last], which, starts, cars, visits, worlds, beams, ranges)
+        _place_some(
+            road, constants, fan, order[first:last], which, starts, cars, visits, worlds, beams, ranges, closing
+        )
 
 
 @njit
@@ -257,6 +260,7 @@ def _control_some(
     ends,
     beams,
     ranges,
+    closing,
     speeds,
     progress,
 ):
@@ -270,7 +274,7 @@ def _control_some(
             else:
                 acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
             if worlds is not None:
-                flow(network, drivers, worlds[i], car, _I(car[STEPS]))
+                flow(network, drivers, worlds[i], car)
                 car[STEERING] = steering
                 ends[i] = control(road, constants, car, visits[i], worlds[i], acceleration, target, max_steps)
             else:
@@ -278,9 +282,9 @@ def _control_some(
                 ends[i] = control(road, constants, car, visits[i], None, acceleration, target, max_steps)
             progress[i] = car[DISTANCE] - before
         if worlds is not None:
-            look(road, constants, fan, car, worlds[i], beams, ranges[i])
+            look(road, constants, fan, car, worlds[i], beams, ranges[i], closing[i])
         else:
-            look(road, constants, fan, car, None, beams, ranges[i])
+            look(road, constants, fan, car, None, beams, ranges[i], None)
         speeds[i] = car[SPEED]
 
 
@@ -300,6 +304,7 @@ def _control_all(
     worlds,
     ends,
     ranges,
+    closing,
     speeds,
     progress,
 ):
@@ -325,6 +330,7 @@ def _control_all(
             ends,
             beams,
             ranges,
+            closing,
             speeds,
             progress,
         )
@@ -400,6 +406,8 @@ class Simulator:
             ends=np.zeros(cars, dtype=np.uint8),
             worlds=np.zeros((cars, traffic, TRAFFIC_FIELDS), dtype=np.float32),
         )
+        #: float32 [n, rays]: m/s at which what each ray last met came closer over ground; 0 for the road's edge.
+        self.closing = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self._atlas: Atlas | None = None  # maps that cars are on; None before the first reset
         self._shown: list[Scenario] = []  # what the atlas shows
         self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
@@ -461,6 +469,7 @@ class Simulator:
             state.visits,
             self._traffic_or_none(),
             ranges,
+            self.closing,
         )
         state.maps[cars] = maps
         state.ends[cars] = End.RUNNING
@@ -536,6 +545,7 @@ class Simulator:
             self._traffic_or_none(),
             state.ends,
             ranges,
+            self.closing,
             speeds,
             progress,
         )
@@ -546,7 +556,7 @@ class Simulator:
 def _views(road, constants, fan, cars, worlds, ranges):
     beams = np.empty((3, LANES), dtype=np.float32)
     for i in range(cars.shape[0]):
-        look(road, constants, fan, cars[i], worlds[i], beams, ranges[i])
+        look(road, constants, fan, cars[i], worlds[i], beams, ranges[i], None)
 
 
 def views(scenario: Scenario, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> np.ndarray:
@@ -569,10 +579,13 @@ def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
     Raises: ValueError with one line unless they are n whole numbers that name actions, or n pairs within [-1, 1].
     """
     array = np.asarray(actions)
-    if array.shape == (n, 2) and array.dtype.kind in "fiu":
-        pairs = np.ascontiguousarray(array, dtype=np.float32)
+    if array.shape == (n, 2):
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"continuous actions must be numbers within -1 and 1, not {array.dtype}")
+        with np.errstate(over="ignore"):
+            pairs = np.ascontiguousarray(array, dtype=np.float32)
         if not (np.abs(pairs) <= 1.0).all():  # false for what is not a number, too
-            raise ValueError(f"continuous actions must be within -1 and 1, not {pairs[~(np.abs(pairs) <= 1.0)][0]}")
+            raise ValueError(f"continuous actions must be within -1 and 1, not {pairs[~(np.abs(pairs) <= 1.0)][0]:g}")
         return pairs
     if array.shape != (n,):
         raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")

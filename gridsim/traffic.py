@@ -41,10 +41,13 @@ PACE = 15  # m/s2, its acceleration in this step
 HORIZON = 16  # m ahead that it looks in this step
 GAP = 17  # m from its middle to where it must not get
 LEAD = 18  # m/s of what is there
-FIELDS = 19
+CLOCK = 19  # control steps until it thinks of another lane
+FIELDS = 20
 
+_THINKING = _F(10.0)  # control steps from one thought of another lane to the next
 _CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
+_CROSSING_TIME = _F(4.0)  # s, what it takes to leave a junction
 _REACH = _F(2.4)  # m from the middle of a car within which all of it lies
 
 
@@ -271,6 +274,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
         car = world[i]
         car[:] = _ZERO
         car[LANE], car[PAST], car[PERMIT] = -_ONE, -_ONE, -_ONE
+        car[CLOCK] = _F(i) % _THINKING  # not all at once
         for _ in range(60):
             draws += 1
             bits = mix(key + _U(draws) * GOLDEN)
@@ -285,7 +289,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
                 car[SEED] = _F(mix(bits) >> _U(40))
-                car[FACTOR] = _F(0.8) + _F(0.4) * uniform(mix(bits + GOLDEN))
+                car[FACTOR] = _F(0.9) + _F(0.3) * uniform(mix(bits + GOLDEN))
                 car[NEXT] = _F(_choose(network, lane, car))
                 car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
                 at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
@@ -389,7 +393,7 @@ def _is_junction(network, lane):
 
 @leaf
 def _passes(network, drivers, lane, other):
-    """Whether a lane passes where the rear of a car is that waits at the end of another lane with the same beginning."""
+    """Whether a lane passes where a car's rear is that waits at the end of another lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
     reach = _F(2.0) * drivers.half_width + _F(2.0) * _CAUTION
@@ -399,6 +403,19 @@ def _passes(network, drivers, lane, other):
         if dx * dx + dy * dy < reach * reach:
             return True
     return False
+
+
+@leaf
+def _reaches(network, lane, x, y, within):
+    """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
+    first, k = network.offsets[lane], network.offsets[lane]
+    while k < network.offsets[lane + 1]:
+        dx, dy = _turned(network.points[k, 0] - x, network.width), _turned(network.points[k, 1] - y, network.height)
+        apart = math.sqrt(dx * dx + dy * dy)
+        if apart < within:
+            return _F(k - first) * network.steps[lane]
+        k += max(_I((apart - within) / network.steps[lane]), _I(1))
+    return _F(1e9)
 
 
 @leaf
@@ -443,36 +460,29 @@ def _may_enter(network, drivers, world, i, ego):
             if there == lane or permit == lane:
                 return False
             for k in range(network.successors.shape[1]):
-                if there == network.successors[lane, k] and world[j, SPEED] < _F(2.0):
-                    if world[j, ALONG] < place + drivers.half_length:
-                        return False
+                slow = there == network.successors[lane, k] and world[j, SPEED] < _F(2.0)
+                if slow and world[j, ALONG] < place + drivers.half_length:
+                    return False
         elif there == beyond:
             rear = world[j, ALONG] - drivers.half_length
             room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
-        elif permit >= 0 and _I(world[j, AFTER]) == beyond:
+        elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and _is_junction(network, there)):
             needed += place
-        elif onward == beyond and _is_junction(network, there):
-            needed += place
-    if not chained and room < needed:
-        return False
     # The ego car goes first, unless it is behind this one.
-    if ego[COS] == _ZERO and ego[SIN] == _ZERO:
-        return True
-    dx, dy = ego[X] - car[X], ego[Y] - car[Y]
-    dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-    forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-    if dx * dx + dy * dy < _F(2500.0) and not (forward < _ZERO and abs(aside) < _F(2.5)):
-        for t in range(3):
-            x, y = ego[X] + _F(t) * ego[SPEED] * ego[COS], ego[Y] + _F(t) * ego[SPEED] * ego[SIN]
-            k = network.offsets[lane]
-            while k < network.offsets[lane + 1]:
-                dx = _turned(network.points[k, 0] - x, network.width)
-                dy = _turned(network.points[k, 1] - y, network.height)
-                apart = math.sqrt(dx * dx + dy * dy)
-                if apart < _F(3.0):
+    if ego[COS] != _ZERO or ego[SIN] != _ZERO:
+        dx, dy = ego[X] - car[X], ego[Y] - car[Y]
+        dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+        forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+        way = _CROSSING_TIME * max(ego[SPEED], _ZERO)
+        far = car[HORIZON] + _lane_length(network, lane) + way + _F(2.0) * place
+        if dx * dx + dy * dy < far * far and not (forward < _ZERO and abs(aside) < _F(2.5)):
+            for k in range(1 + _I(way / _F(4.0))):
+                x, y = ego[X] + _F(4.0) * _F(k) * ego[COS], ego[Y] + _F(4.0) * _F(k) * ego[SIN]
+                if _reaches(network, lane, x, y, _F(3.0)) < _F(1e8):
                     return False
-                k += max(_I((apart - _F(3.0)) / network.steps[lane]), _I(1))
-    return True
+            rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
+            room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
+    return room >= needed
 
 
 @leaf
@@ -492,7 +502,8 @@ def _follow(network, drivers, car, other, is_ego):
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    if is_ego and not looked and other[SPEED] > _ONE:
+    same_way = car[COS] * other[COS] + car[SIN] * other[SIN] > _HALF
+    if is_ego and not looked and same_way and other[SPEED] > _ONE:
         # Where the ego car will be in a second: it may be about to cut in.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
         at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])
@@ -538,11 +549,15 @@ def _desired(network, car):
 
 
 @njit(_nrt=False)
-def _change_lanes(network, drivers, world, i, ego, step):
+def _change_lanes(network, drivers, world, i, ego):
     """MOBIL (Kesting et al. 2007): move car i to a neighbouring lane where that is safe and it gains by it."""
     car = world[i]
     lane = _I(car[LANE])
-    if car[SHIFT] != _ZERO or (_I(step) + _I(7) * _I(i)) % _I(10) != _I(0):
+    if car[CLOCK] > _ZERO:
+        car[CLOCK] -= _ONE
+        return
+    car[CLOCK] = _THINKING - _ONE
+    if car[SHIFT] != _ZERO:
         return
     if network.left[lane] < 0 and network.right[lane] < 0:
         return
@@ -653,11 +668,11 @@ def _go(network, drivers, car):
 
 
 @njit(nogil=True, _nrt=False)
-def flow(network, drivers, world, ego, step):
+def flow(network, drivers, world, ego):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
     Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it
-    is not there); number of the control step.
+    is not there).
     """
     cars = world.shape[0]
     _see(network, drivers, world, ego)
@@ -679,7 +694,7 @@ def flow(network, drivers, world, ego, step):
         car[PACE] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
-            _change_lanes(network, drivers, world, i, ego, step)
+            _change_lanes(network, drivers, world, i, ego)
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
             _go(network, drivers, world[i])

@@ -26,6 +26,19 @@ def root() -> Path:
     return Path(__file__).resolve().parents[1]
 
 
+@pytest.fixture(scope="session")
+def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
+    from cluster.tracking import Tracker, check_uri
+
+    folder = tmp_path_factory.mktemp("mlflow")
+    begun = Tracker(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {})
+    begun.wait_ready(60)
+    assert begun.close("FINISHED") is None
+    assert os.listdir(folder) == ["mlflow.db"]
+    return folder / "mlflow.db"
+
+
 @pytest.fixture
 def command(tmp_path: Path) -> Command:
     """Run an installed console script in the test's empty folder: `command("gridsim-evolve", "--seed", 1)`.

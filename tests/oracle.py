@@ -457,3 +457,74 @@ def drive(
             break
     table = np.array(rows)
     return Drive(table[:, :3], table[:, 3], table[:, 4], table[:, 5], table[:, 6], end or "RUNNING")
+
+
+# --- Other cars ------------------------------------------------------------------------------------------------------
+
+
+def corners(config: SimConfig, poses: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """Corners [n, 4, 2], counter-clockwise, of cars at poses [n, 3] (x, y, heading), a margin (m) larger all round."""
+    a, b = config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin
+    own = np.array([[a, -b], [a, b], [-a, b], [-a, -b]])
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+    return poses[:, None, :2] + own @ turn
+
+
+def rays_to_boxes(
+    config: SimConfig,
+    sides: tuple[float, float],
+    origin: np.ndarray,
+    angles: np.ndarray,
+    poses: np.ndarray,
+    margin: float,
+) -> np.ndarray:
+    """How far rays [r] (rad) from one origin get before they meet a car at poses [n, 3], on a torus: m [r], inf if not.
+
+    Each ray is intersected with each edge of each car, in this world and in those beside it; 0 from within a car.
+    """
+    shifts = np.array([[i * sides[0], j * sides[1], 0.0] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    outlines = corners(config, (poses[:, None] + shifts).reshape(-1, 3), margin) - origin
+    first, edge = outlines, np.roll(outlines, -1, axis=1) - outlines
+    if (_cross(edge, -first) > 0.0).all(axis=1).any():  # to the left of all four edges
+        return np.zeros(len(angles))
+    d = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        way, part = _cross(first, edge) / _cross(d, edge), _cross(first, d) / _cross(d, edge)
+    hit = (way >= 0.0) & (part >= 0.0) & (part <= 1.0)
+    return np.where(hit, way, np.inf).reshape(len(angles), -1).min(axis=1)
+
+
+def overlap_area(one: np.ndarray, other: np.ndarray) -> float:
+    """Area (m2) that two convex polygons [n, 2], counter-clockwise, share: Sutherland and Hodgman 1974."""
+    kept = list(one)
+    for a, b in zip(other, np.roll(other, -1, axis=0), strict=True):
+        ahead, kept = kept, []
+        for p, q in zip(ahead, ahead[1:] + ahead[:1], strict=True):
+            left, right = _cross(b - a, p - a), _cross(b - a, q - a)
+            if left >= 0.0:
+                kept.append(p)
+            if left * right < 0.0:
+                kept.append(p + (q - p) * left / (left - right))
+    if len(kept) < 3:
+        return 0.0
+    outline = np.array(kept)
+    return float(_cross(outline, np.roll(outline, -1, axis=0)).sum() / 2)
+
+
+def idm(config: SimConfig, speed: float, desired: float, gap: float, leader: float) -> float:
+    """Acceleration (m/s2) by Treiber, Hennecke and Helbing 2000: gap m from bumper to bumper, inf without a leader."""
+    t = config.traffic
+    approach = speed * (speed - leader) / (2 * math.sqrt(t.acceleration * t.comfort))
+    wanted = t.jam + max(0.0, speed * t.headway + approach)
+    return max(t.acceleration * (1 - (speed / desired) ** 4 - (wanted / gap) ** 2), -t.braking)
+
+
+def equilibrium_gap(config: SimConfig, speed: float, desired: float) -> float:
+    """Gap (m) at which a follower neither gains nor loses: s_e(v) = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
+    t = config.traffic
+    return (t.jam + speed * t.headway) / math.sqrt(1 - (speed / desired) ** 4)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,5 +1,7 @@
 """GridSim from Python: the three lines, evaluate, and a fitness of one's own."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
 from gridsim.scenarios import build
 
-SMALL = EvolveSettings(population=32, generations=2, elites=2, seed=3)
+SMALL = EvolveSettings(scenario="curved", population=32, generations=2, elites=2, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -31,14 +33,14 @@ def test_load_drive_evaluate(champion, tmp_path):
             break
     env.close()
     figures = evaluate(loaded, episodes=8)
-    assert figures == evaluate(champion, "seamless", episodes=8)
+    assert figures == evaluate(champion, "curved", episodes=8)
     assert figures["episodes"] == 8
     assert figures["distance_m"] > 0.0
 
 
 def test_environment_and_rollout_drive_alike(champion):
     """What a person sees in the environment is what evolution saw."""
-    scenario = build("seamless", 12)
+    scenario = build("curved", 12)
     env = champion.make_env()
     start = np.array([*scenario.lanes.points[3], 0.0, 5.0, 0.0], dtype=np.float32)
     direction = scenario.lanes.points[4] - scenario.lanes.points[3]
@@ -89,7 +91,7 @@ def test_not_a_number_fitness_loses():
 def test_bad_champions_are_refused(champion, tmp_path):
     with pytest.raises(CheckpointError):
         load_champion(tmp_path / "none.npz")
-    save(tmp_path / "short.npz", {"genome": champion.genome[:10]}, {"policy": "mlp:6,7", "scenario": "seamless"})
+    save(tmp_path / "short.npz", {"genome": champion.genome[:10]}, {"policy": "mlp:6,7", "scenario": "curved"})
     with pytest.raises(CheckpointError):
         load_champion(tmp_path / "short.npz")
     with pytest.raises(ValueError, match="unknown scenario"):
@@ -107,7 +109,7 @@ def test_champion_class_is_what_is_returned(champion):
 
 # --- On the occupancy grid -------------------------------------------------------------------------------------------
 
-ON_THE_GRID = EvolveSettings(observation="grid", policy="cnn:8,8,8@2", population=24, generations=2, elites=2, seed=3)
+ON_THE_GRID = dataclasses.replace(SMALL, observation="grid", policy="cnn:8,8,8@2", population=24)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +122,7 @@ def test_a_champion_of_the_grid_is_saved_loaded_and_evaluated(seer, tmp_path):
     seer.save(tmp_path / "champion.npz")
     loaded = load_champion(tmp_path / "champion.npz")
     assert loaded.genome.tobytes() == seer.genome.tobytes()
-    assert evaluate(loaded, episodes=8) == evaluate(seer, "seamless", episodes=8)
+    assert evaluate(loaded, episodes=8) == evaluate(seer, "curved", episodes=8)
 
 
 def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer):

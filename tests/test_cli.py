@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 BIN = Path(sys.executable).parent
-SMALL = ["--population", "48", "--generations", "6", "--seed", "5", "--elites", "4"]
+# Of all maps these are built fastest.
+ROAD = ["--scenario", "curved", "--traffic", "2"]
+SMALL = [*ROAD, "--population", "48", "--generations", "6", "--seed", "5", "--elites", "4"]
 
 
 def start(*arguments, cwd, **env):
@@ -155,9 +157,10 @@ def test_killed_process_resumes_to_the_same_champion(reference, tmp_path):
 
 
 @pytest.mark.e2e
-def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
+def test_ctrl_c_saves_and_leaves_nothing_behind(reference, empty_database, tmp_path):
     from mlflow.tracking import MlflowClient
 
+    shutil.copy(empty_database, tmp_path / "mlflow.db")  # a run waits for MLflow no more than 15 s then
     process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
     history = tmp_path / "runs/c/history.csv"
     wait_until(lambda: history.exists() and len(rows(tmp_path / "runs/c")) >= 2)
@@ -256,7 +259,19 @@ def test_config_repeats_and_init_continues(reference, tmp_path):
     assert done.returncode == 0, done.stderr
     assert summary(tmp_path / "runs/again")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
     champion = reference / "runs/ref/champion.npz"
-    arguments = ["--workers", "0", "--population", "24", "--generations", "1", "--sigma", "0", "--bump-rate", "0"]
+    arguments = [
+        "--workers",
+        "0",
+        *ROAD,
+        "--population",
+        "24",
+        "--generations",
+        "1",
+        "--sigma",
+        "0",
+        "--bump-rate",
+        "0",
+    ]
     done = evolve(*arguments, "--init", str(champion), "--name", "warm", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     # Without mutation every member is the one it started from.
@@ -279,7 +294,13 @@ WRONG = {
     "config that is none": (["--config", "/etc/hostname"], "config.json"),
     "init that is missing": (["--init", "nothing.npz"], "nothing.npz"),
     "policy": (["--policy", "mlp:0"], "policy"),
-    "traffic": (["--traffic", "4"], "--traffic"),
+<<<<<<< HEAD
+    "negative traffic": (["--traffic", "-3"], "--traffic must be 0 to 100"),
+    "traffic that no road holds": (["--traffic", "100000"], "--traffic must be 0 to 100"),
+    "traffic that is no number": (["--traffic", "x"], "--traffic"),
+=======
+    "traffic": (["--traffic", "-5"], "--traffic"),
+>>>>>>> w-ci
     "dead cluster": (["--address", "127.0.0.1:1"], "127.0.0.1:1"),
     "dead MLflow": (["--tracking-uri", "http://127.0.0.1:1"], "127.0.0.1:1"),
     "MLflow file store": (["--tracking-uri", "file:///tmp/mlruns"], "file"),

@@ -17,7 +17,7 @@ from evolution.tiles import plain_tile, vector_tile
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.grid import grid_table, grids, push_frames
 from gridsim.scenarios import build
-from gridsim.simulator import End, Simulator
+from gridsim.simulator import DISTANCE, STEPS, End, Simulator
 
 torch = pytest.importorskip("torch")
 
@@ -204,7 +204,8 @@ def test_a_rollout_is_the_simulator_the_grid_and_the_network(task, text):
             assert row["distance"] == state.cars[0, 6]
     one, states, _ = trajectory(spec, genomes[longest[0]], maps[0], episodes[0]["start"], limits, config)
     assert one == results[longest[0], 0]
-    assert len(states) == one["steps"]
+    assert len(states) == one["steps"] + 1  # the last is where it ended
+    assert (states[-1, DISTANCE], states[-1, STEPS]) == (one["distance"], one["steps"])
 
 
 @given(data=st.data())

@@ -129,7 +129,7 @@ DAMAGES = {
     "skipped episode": (lambda text: _edit(text, 3, "episode", "2"), "line 5: episode"),
     "time backwards": (lambda text: _edit(text, 3, "time_s", "0.1"), "line 5: time_s"),
     "two maps": (lambda text: _edit(text, 3, "map_seed", "4"), "same in all rows"),
-    "unknown scenario": (lambda text: text.replace("seamless", "../moon"), "unknown scenario"),
+    "unknown scenario": (lambda text: text.replace("seamless", "moon"), "unknown scenario"),
     "negative seed": (lambda text: text.replace(",11\n", ",-1\n"), "map_seed"),
     "null bytes": (lambda text: text.replace("seamless", "seam\0less"), "unknown scenario"),
     "open quote": (lambda text: text + '"', "CSV"),

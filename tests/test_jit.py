@@ -142,7 +142,7 @@ def drive_a_while(scenario, start, actions):
     place(scenario.road, start, car, visits)
     states, seen, ends = [], [], []
     for action in actions:
-        look(scenario.road, k, rays, car, None, beams, ranges)
+        look(scenario.road, k, rays, car, None, beams, ranges, None)
         ends.append(drive(scenario.road, k, car, visits, None, int(action)))
         states.append(car.copy())
         seen.append(ranges.copy())

@@ -55,18 +55,6 @@ def tracker(uri, **options):
     return Tracker(uri, **given)
 
 
-@pytest.fixture(scope="session")
-def empty_database(tmp_path_factory):
-    """A database that has been created once, for all tests to copy: creating one takes a second."""
-    folder = tmp_path_factory.mktemp("mlflow")
-    uri = check_uri(f"sqlite:///{folder}/mlflow.db")
-    begun = Tracker(uri, "other", "other", {}, {})
-    begun.wait_ready(60)
-    assert begun.close("FINISHED") is None
-    assert os.listdir(folder) == ["mlflow.db"]
-    return folder / "mlflow.db"
-
-
 @pytest.fixture
 def uri(empty_database, tmp_path):
     (tmp_path / "store").mkdir()

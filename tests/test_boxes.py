@@ -1,0 +1,266 @@
+"""Other cars as boxes, against the oracle: what rays hit of them, what overlaps, and that nothing tunnels through."""
+
+import math
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gridsim.boxes import boxes_touch, cast_boxes, hits_box, nearest_box, stands_ahead
+from gridsim.config import SimConfig, TrafficConfig, constants
+from gridsim.jit import njit
+from gridsim.lanes import Path, lay_lanes
+from gridsim.roads import Strips, clearance_nodes, freeze, make_road
+from gridsim.scenarios import Scenario
+from gridsim.sensors import fan
+from gridsim.simulator import DISTANCE, IDLE, End, Simulator
+from gridsim.traffic import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, SIN, SPEED, X, Y, make_network
+from gridsim.vehicle import Action
+
+F = np.float32
+CONFIG = SimConfig()
+K = constants(CONFIG)
+RAYS = fan(31, K.ray_first, K.ray_step)
+ANGLES = np.radians(np.linspace(-60.0, 60.0, 31))
+SIDE = 256.0
+
+
+def parked(*poses):
+    """A world with cars at poses (x, y, heading)."""
+    world = np.zeros((len(poses), FIELDS), dtype=F)
+    table = np.array(poses, dtype=float).reshape(-1, 3)
+    world[:, X], world[:, Y] = table[:, 0], table[:, 1]
+    world[:, COS], world[:, SIN] = np.cos(table[:, 2]), np.sin(table[:, 2])
+    return world
+
+
+@njit
+def _cast(k, rays, side, poses, worlds, ranges):
+    for i in range(len(poses)):
+        x, y, cosine, sine = poses[i]
+        cast_boxes(k, rays, side, side, x, y, cosine, sine, worlds[i], ranges[i], None)
+
+
+def cast(poses, worlds, reach=50.0):
+    """Ranges [n, 31] of sensors at poses [n, 3] in worlds [n, cars, FIELDS] without walls."""
+    sensors = np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]).astype(F)
+    ranges = np.full((len(poses), 31), reach, dtype=F)
+    _cast(K, RAYS, F(SIDE), sensors, worlds, ranges)
+    return ranges
+
+
+def check_rays(pose, boxes, ranges):
+    """Ranges of one sensor against the oracle; where a ray grazes a corner, either answer is right."""
+    sides = (SIDE, SIDE)
+    larger, smaller = (
+        np.minimum(oracle.rays_to_boxes(CONFIG, sides, pose[:2], pose[2] + ANGLES, boxes, margin), 50.0)
+        for margin in (2e-4, -2e-4)
+    )
+    assert (ranges >= larger - 1e-3).all()
+    assert (ranges <= smaller + 1e-3).all()
+    return np.abs(smaller - larger) < 0.01  # rays that do not graze
+
+
+# --- Rays ------------------------------------------------------------------------------------------------------------
+
+
+def test_rays_are_the_oracles():
+    """Sensors and boxes anywhere on the torus, most of them near each other, some overlapping, some across the seam."""
+    rng = np.random.default_rng(3)
+    n, cars = 1500, 3
+    sensors = np.column_stack([rng.uniform(0, SIDE, (n, 2)), rng.uniform(-math.pi, math.pi, n)])
+    sensors[:300, 0] = rng.uniform(-3.0, 3.0, 300) % SIDE  # at the seam
+    away = rng.gamma(2.0, 8.0, (n, cars))
+    bearing = rng.uniform(-math.pi, math.pi, (n, cars))
+    boxes = np.stack(
+        [
+            (sensors[:, None, 0] + away * np.cos(bearing)) % SIDE,
+            (sensors[:, None, 1] + away * np.sin(bearing)) % SIDE,
+            rng.uniform(-math.pi, math.pi, (n, cars)),
+        ],
+        axis=-1,
+    )
+    boxes, sensors = boxes.astype(F).astype(float), sensors.astype(F).astype(float)
+    ranges = cast(sensors, np.stack([parked(*row) for row in boxes]))
+    exact = sum(int(check_rays(*scene).sum()) for scene in zip(sensors, boxes, ranges, strict=True))
+    assert exact > 0.98 * ranges.size
+    assert 0.03 < (ranges == 0.0).all(axis=1).mean() < 0.3  # from within a box
+    assert 0.2 < (ranges < 50.0).mean() < 0.8
+
+
+@pytest.mark.parametrize("heading", [0.0, math.pi / 2, math.pi, -math.pi / 2, 0.3])
+@pytest.mark.parametrize("x", [128.0, 1.0, 255.9])
+def test_rays_along_and_beside_a_box(x, heading):
+    """Square to the box's sides, where a ray is parallel to two of them; before it, beside it, and behind."""
+    c, s = math.cos(heading), math.sin(heading)
+    for forward, aside in ((10, 0), (2.001, 0), (2.5, 0), (0, 2.0), (0, -1.01), (-8, 0), (30, 3), (45, -1), (60, 0)):
+        sensor = np.array([x, 100.0, heading], dtype=F).astype(float)
+        box = np.array([(x + forward * c - aside * s) % SIDE, (100.0 + forward * s + aside * c) % SIDE, heading])
+        box = box.astype(F).astype(float)
+        ranges = cast(sensor[None], parked(box)[None])[0]
+        assert np.isfinite(ranges).all()
+        check_rays(sensor, box[None], ranges)
+        if aside == 0 and 2.0 < forward < 50:
+            assert ranges[15] == pytest.approx(forward - 2.0, abs=1e-3)
+
+
+def test_a_box_only_ever_shortens_a_range_and_who_is_not_there_does_not():
+    sensor, world = np.array([[100.0, 100.0, 0.0]]), parked((110.0, 100.0, 0.0))
+    assert cast(sensor, world[None], 5.0)[0].max() == 5.0
+    world[:, LANE] = -1.0
+    assert cast(sensor, world[None])[0].min() == 50.0
+
+
+# --- Overlap ---------------------------------------------------------------------------------------------------------
+
+headings = st.one_of(st.floats(-math.pi, math.pi), st.sampled_from([0.0, math.pi / 2, math.pi / 4, math.pi]))
+
+
+@given(st.floats(0.0, 5.5), st.floats(-math.pi, math.pi), headings, headings)
+def test_boxes_touch_where_their_outlines_share_ground(away, bearing, heading, other):
+    dx, dy = F(away * math.cos(bearing)), F(away * math.sin(bearing))
+    touch = boxes_touch(K, dx, dy, *(F(f(h)) for h in (heading, other) for f in (math.cos, math.sin)))
+    poses = np.array([[0.0, 0.0, heading], [float(dx), float(dy), other]])
+    smaller, larger = (oracle.overlap_area(*oracle.corners(CONFIG, poses, margin)) for margin in (-1e-4, 1e-4))
+    assert touch or smaller == 0.0
+    assert not touch or larger > 0.0
+
+
+def test_the_oracles_area_is_that_of_closed_forms():
+    def area(*other):
+        return oracle.overlap_area(*oracle.corners(CONFIG, np.array([[5.0, 7.0, 0.0], other])))
+
+    assert area(5.0, 7.0, 0.0) == pytest.approx(8.0)
+    assert area(8.0, 7.5, 0.0) == pytest.approx(1.0 * 1.5)
+    assert area(5.0, 7.0, math.pi / 2) == pytest.approx(4.0)
+    assert area(5.0 + 2.0 + math.sqrt(5.0), 7.0, math.atan(0.5)) == pytest.approx(0.0)  # corner to edge
+    assert area(20.0, 7.0, 0.5) == 0.0
+
+
+def test_the_nearest_box_is_found_across_the_seam():
+    world = parked((250.0, 128.0, 0.0), (20.0, 128.0, 0.0), (128.0, 20.0, 0.0))
+    world[:, SPEED] = [3.0, 5.0, 9.0]
+    assert nearest_box(world, F(SIDE), F(SIDE), F(4.0), F(128.0)) == (pytest.approx(10.0), 5.0)
+    world[0, LANE] = -1.0
+    assert nearest_box(world, F(SIDE), F(SIDE), F(4.0), F(128.0)) == (pytest.approx(16.0), 5.0)
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
+def test_a_box_is_looked_at_where_it_was(heading):
+    """Half a period ago a car at 30 m/s was 1.5 m further back."""
+    world = parked((100.0, 100.0, heading))
+    world[:, SPEED] = 30.0
+    c, s = math.cos(heading), math.sin(heading)
+    for back in (0.0, 0.25, 0.5, 1.0):
+        for beyond in (-0.01, 0.01):
+            behind = 4.0 + 3.0 * back + beyond
+            x, y = F(100.0 - behind * c), F(100.0 - behind * s)
+            hit = hits_box(K, world, F(back), F(0.1), F(SIDE), F(SIDE), x, y, F(c), F(s))
+            assert hit == (beyond < 0)
+
+
+@pytest.mark.parametrize(
+    ("forward", "aside", "speed", "expected"),
+    [(6, 0, 0, True), (13.9, 0, 0.4, True), (14.1, 0, 0, False), (6, 0, 0.6, False), (6, 1.9, 0, True),
+     (6, 2.1, 0, False), (6, -2.1, 0, False), (-6, 0, 0, False)],
+)  # fmt: skip
+def test_who_stands_ahead(forward, aside, speed, expected):
+    heading = 2.0
+    c, s = math.cos(heading), math.sin(heading)
+    world = parked(((250.0 + forward * c - aside * s) % SIDE, (3.0 + forward * s + aside * c) % SIDE, heading))
+    world[:, SPEED] = speed
+    assert stands_ahead(K, world, F(SIDE), F(SIDE), F(250.0), F(3.0), F(c), F(s)) == expected
+
+
+# --- Collisions in the simulator -------------------------------------------------------------------------------------
+
+BLIND = SimConfig(traffic=TrafficConfig(braking=1e-6, acceleration=1e-6))  # keeps its speed, whatever is ahead
+
+
+@pytest.fixture(scope="module")
+def cross():
+    """A road of 20 m along x, one along y, and a lane in the middle of each, one westwards and one northwards."""
+    strips = Strips(np.array([[0.0, 128.0, SIDE, 128.0, 10.0], [128.0, 0.0, 128.0, SIDE, 10.0]]), np.zeros((0, 6)))
+    straight = ((SIDE, 0.0),)
+    lanes = lay_lanes([Path(SIDE, 128.0, math.pi, straight), Path(128.0, 0.0, math.pi / 2, straight)], SIDE, SIDE)
+    for array in vars(lanes).values():
+        freeze(array)
+    road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 50.0)
+    network = make_network(lanes, SIDE, SIDE, 30.0, CONFIG.traffic)
+    return Scenario("cross", 0, road, lanes, strips, network)
+
+
+def on_lane(lane, along, speed, pose):
+    """A world with one car, `along` m along a lane of `cross`, at a pose."""
+    world = parked(pose)
+    world[0, [LANE, ALONG, PAST, PERMIT, FACTOR, SPEED]] = lane, along, -1.0, -1.0, 1.0, speed
+    world[0, 7:9] = lane  # the lane leads into itself
+    return world
+
+
+def meet(scenario, start, world, action=Action.NONE, steps=40):
+    """Drive one car of a `BLIND` world until the episode ends; (simulator, End)."""
+    simulator = Simulator([scenario], 1, BLIND, traffic=1)
+    simulator.reset(np.array([start], dtype=F), worlds=world[None])
+    for _ in range(steps):
+        *_, ends = simulator.step(np.array([action]))
+        if ends[0]:
+            break
+    return simulator, End(int(ends[0]))
+
+
+@pytest.mark.parametrize("aside", [0.0, 1.9, -1.9, 2.1])
+def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
+    """30 against 30 m/s, 6 m a control period, at every phase of it; and past each other with 10 cm to spare."""
+    for phase in np.arange(0.0, 6.0, 0.2):
+        along = SIDE - 150.0 - phase
+        simulator, end = meet(
+            cross, [100.0, 128.0 + aside, 0.0, 30.0, 0.0], on_lane(0, along, 30.0, (SIDE - along, 128.0, math.pi))
+        )
+        assert end == (End.COLLISION if abs(aside) < 2.0 else End.RUNNING)
+        car, other = simulator.state.cars[0], simulator.state.worlds[0, 0]
+        assert other[SPEED] == pytest.approx(30.0, abs=1e-3)
+        if end == End.COLLISION:
+            # They met half way, and the ego car is no further than two sub-steps into the other at that moment.
+            meeting = 100.0 + (50.0 + phase) / 2 - 2.0
+            assert -0.01 <= car[X] - meeting < 1.0
+
+
+@pytest.mark.parametrize("offset", [-2.8, -1.0, 0.0, 1.5, 2.8])
+def test_nothing_tunnels_through_crosswise(cross, offset):
+    """Both at 30 m/s, at right angles, so that the middle of one is `offset` m short when that of the other crosses."""
+    for phase in np.arange(0.0, 3.0, 0.2):
+        south = 128.0 - 30.0 - phase
+        _, end = meet(
+            cross,
+            [128.0 - 30.0 - phase - offset, 128.0, 0.0, 30.0, 0.0],
+            on_lane(1, south, 30.0, (128.0, south, math.pi / 2)),
+        )
+        assert end == End.COLLISION
+
+
+def test_a_car_from_behind_is_run_into_too(cross):
+    """The ego car stands; the other cannot brake."""
+    _, end = meet(cross, [100.0, 128.0, 0.0, 0.0, 0.0], on_lane(0, 140.0, 30.0, (116.0, 128.0, math.pi)))
+    assert end == End.COLLISION
+
+
+# --- Standing behind a standing car ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("gap", "ends"), [(3.0, False), (9.5, False), (11.0, True), (None, True)])
+def test_waiting_behind_a_standing_car_is_not_idle(cross, gap, ends):
+    """Standing 5 s, bumper to bumper so many m behind a car that stands, and alone."""
+    simulator = Simulator([cross], 1, BLIND, traffic=1)
+    world = on_lane(0, 100.0, 0.0, (SIDE - 100.0, 128.0, math.pi))
+    if gap is None:
+        world[0, LANE] = -1.0
+    start = [SIDE - 100.0 + 4.0 + (gap or 3.0), 128.0, math.pi, 0.0, 0.0]
+    simulator.reset(np.array([start], dtype=F), worlds=world[None])
+    for step in range(50):
+        *_, now = simulator.step(np.array([Action.NONE]))
+        assert now[0] == (End.IDLE if ends and step >= 14 else End.RUNNING)
+    assert simulator.state.cars[0, DISTANCE] == 0.0
+    assert simulator.state.cars[0, IDLE] == (15 if ends else 0)

@@ -1,0 +1,444 @@
+"""Traffic: its laws against closed forms and the oracle, who waits for whom, and that it neither crashes nor stops."""
+
+import math
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from gridsim.boxes import boxes_touch
+from gridsim.config import SimConfig, constants
+from gridsim.jit import njit
+from gridsim.lanes import Path, lay_lanes
+from gridsim.roads import freeze
+from gridsim.scenarios import REGISTRY, build
+from gridsim.traffic import (
+    AFTER,
+    ALONG,
+    COS,
+    FACTOR,
+    FIELDS,
+    LANE,
+    NEXT,
+    PAST,
+    PERMIT,
+    SHIFT,
+    SIN,
+    SPEED,
+    X,
+    Y,
+    drivers,
+    flow,
+    idm,
+    make_network,
+    spawn,
+    wrapped,
+)
+
+F = np.float32
+CONFIG = SimConfig()
+K, D = constants(CONFIG), drivers(CONFIG)
+LENGTH = CONFIG.vehicle.length
+NOBODY = np.zeros(14, dtype=F)  # an ego car that is not there
+FAR = np.full(5, 1e6, dtype=F)  # a start that is near nothing
+DT = CONFIG.episode.control_period
+
+
+def network_of(paths, width, height, limit=12.0, abreast=1):
+    lanes = lay_lanes(paths, width, height, abreast)
+    for array in vars(lanes).values():
+        freeze(array)
+    return make_network(lanes, width, height, limit, CONFIG.traffic)
+
+
+@pytest.fixture(scope="module")
+def ring():
+    """One straight lane round a torus of 1,024 m, along x at y = 32, where 12 m/s are allowed."""
+    return network_of([Path(0.0, 32.0, 0.0, ((1024.0, 0.0),))], 1024.0, 64.0)
+
+
+@pytest.fixture(scope="module")
+def crossing():
+    """Two straight lanes of 256 m that cross: lanes 0, 1, 2 eastwards (before, in and after the junction), 3, 4, 5
+    northwards. Junctions reach 8 m either way of (128, 128)."""
+    pieces = ((120.0, 0.0), (16.0, 0.0), (120.0, 0.0))
+    starts = (0.0, 120.0, 136.0)
+    east = [Path(at, 128.0, 0.0, (piece,)) for at, piece in zip(starts, pieces, strict=True)]
+    north = [Path(128.0, at, math.pi / 2, (piece,)) for at, piece in zip(starts, pieces, strict=True)]
+    return network_of(east + north, 256.0, 256.0)
+
+
+@pytest.fixture(scope="module")
+def abreast():
+    """Two lanes side by side, left (0) and right (1), round a torus of 1,024 m along x."""
+    straight = ((1024.0, 0.0),)
+    return network_of([Path(0.0, 35.75, 0.0, straight), Path(0.0, 32.0, 0.0, straight)], 1024.0, 64.0, 20.0, 2)
+
+
+def length_of(network, lane):
+    return float(network.offsets[lane + 1] - network.offsets[lane] - 1) * float(network.steps[lane])
+
+
+def cars_on(network, *rows):
+    """A world of cars (lane, m along it, m/s, factor), placed by one look at where they are."""
+    world = np.zeros((len(rows), FIELDS), dtype=F)
+    for car, (lane, along, speed, factor) in zip(world, rows, strict=True):
+        car[[LANE, ALONG, SPEED, FACTOR, PAST, PERMIT]] = lane, along, speed, factor, -1.0, -1.0
+        car[NEXT] = network.successors[lane, 0]
+        car[AFTER] = network.successors[int(car[NEXT]), 0]
+        at = along / float(network.steps[lane])
+        first = network.offsets[lane] + int(at)
+        a, b = network.points[first], network.points[first + 1]
+        car[[X, Y]] = (a + (at - int(at)) * (b - a)) % [network.width, network.height]
+        car[[COS, SIN]] = (b - a) / np.hypot(*(b - a))
+    return world
+
+
+def ego(x, y, heading=0.0, speed=0.0):
+    car = NOBODY.copy()
+    car[[X, Y, COS, SIN, SPEED]] = x, y, math.cos(heading), math.sin(heading), speed
+    return car
+
+
+@njit(nogil=True)
+def _watch(network, drivers, constants, world, ego, steps, history):
+    """Let traffic flow; returns pairs that overlapped, over all steps. history [steps or 0, cars, FIELDS] is kept."""
+    overlaps = 0
+    for step in range(steps):
+        flow(network, drivers, world, ego)
+        if len(history):
+            history[step] = world
+        for i in range(len(world)):
+            for j in range(i):
+                if world[i, LANE] >= 0.0 and world[j, LANE] >= 0.0:
+                    dx = wrapped(world[j, X] - world[i, X], network.width)
+                    dy = wrapped(world[j, Y] - world[i, Y], network.height)
+                    if abs(dx) + abs(dy) < 8.0 and boxes_touch(
+                        constants, dx, dy, world[i, COS], world[i, SIN], world[j, COS], world[j, SIN]
+                    ):
+                        overlaps += 1
+    return overlaps
+
+
+def watch(network, world, seconds, ego=NOBODY):
+    """States [steps, cars, FIELDS] of a world after each step; no two cars overlap in any of them."""
+    history = np.zeros((round(seconds / DT), *world.shape), dtype=F)
+    assert _watch(network, D, K, world.copy(), ego, len(history), history) == 0
+    return history
+
+
+# --- The intelligent driver model ------------------------------------------------------------------------------------
+
+speeds = st.floats(0.0, 30.0, width=32)
+
+
+@given(speeds, st.floats(2.0, 30.0, width=32), st.floats(0.5, 200.0, width=32), speeds)
+def test_the_law_is_the_oracles(speed, desired, gap, leader):
+    expected = oracle.idm(CONFIG, speed, desired, gap, leader)
+    assert idm(D, F(speed), F(desired), F(gap), F(leader)) == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+def test_without_a_leader_it_is_the_free_road():
+    assert idm(D, F(0.0), F(12.0), F(1e9), F(0.0)) == pytest.approx(2.0, abs=1e-6)
+    assert idm(D, F(12.0), F(12.0), F(1e9), F(0.0)) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 0.95])
+def test_a_platoon_settles_at_the_equilibrium_gap(ring, share):
+    """Six cars behind one that wants less: all gaps are s_e(v) = (s0 + v T) / sqrt(1 - (v / v0)^4)."""
+    rows = [(0, 700.0, 5.0, share)] + [(0, 700.0 - 30.0 * k - 7.0 * (k % 2), 5.0, 1.0) for k in range(1, 7)]
+    last = watch(ring, cars_on(ring, *rows), 900)[-1].astype(float)
+    speed = share * 12.0
+    assert last[:, SPEED] == pytest.approx(speed, abs=5e-3)
+    gaps = (last[:-1, ALONG] - last[1:, ALONG]) % 1024.0 - LENGTH
+    assert gaps == pytest.approx(oracle.equilibrium_gap(CONFIG, speed, 12.0), rel=5e-3)
+
+
+def test_cars_alike_spread_evenly_round_a_ring(ring):
+    """Twenty cars on 1,024 m: a gap of 47.2 m each, and the speed at which that is the equilibrium."""
+    rng = np.random.default_rng(1)
+    places = np.sort(rng.uniform(0, 1024 - 20 * 8, 20)) + 8 * np.arange(20)
+    last = watch(ring, cars_on(ring, *[(0, at, 3.0, 1.0) for at in places]), 3000)[-1].astype(float)
+    gaps = np.diff(np.sort(last[:, ALONG]), append=np.sort(last[:, ALONG])[0] + 1024) - LENGTH
+    assert gaps == pytest.approx(1024 / 20 - LENGTH, abs=2.0)
+    assert oracle.equilibrium_gap(CONFIG, float(last[:, SPEED].mean()), 12.0) == pytest.approx(47.2, rel=0.02)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5, 3.0, 8.0, 15.0, 22.0, 30.0])
+def test_behind_a_standing_car_a_queue_forms_without_touching(ring, speed):
+    """A car stands in the lane. One comes at any speed, from where full braking is just enough, and four follow it."""
+    stands = ego(500.0, 32.0)
+    gap = 4.0 + speed * DT + speed**2 / (2 * CONFIG.traffic.braking)
+    every = gap + LENGTH
+    world = cars_on(ring, *[(0, 500.0 - every * k, speed, 1.0) for k in range(1, 5)])
+    history = watch(ring, world, 240, stands).astype(float)
+    x = history[:, :, ALONG]
+    assert (x < 500.0 - LENGTH).all()
+    assert (history[-1, :, SPEED] < 0.02).all()
+    between = x[-1, :-1] - x[-1, 1:] - LENGTH
+    assert between == pytest.approx(CONFIG.traffic.jam, abs=0.3)
+    assert 2.0 - 0.3 < 500.0 - x[-1, 0] - LENGTH < 5.0
+    deceleration = -np.diff(history[:, :, SPEED], axis=0) / DT
+    assert deceleration.max() <= CONFIG.traffic.braking + 1e-3
+
+
+def test_the_ego_car_in_the_lane_is_followed_and_waited_for(ring):
+    """Traffic keeps behind an ego car at 4 m/s, whose lateral place in the lane is not exact."""
+    world = cars_on(ring, (0, 400.0, 12.0, 1.0), (0, 380.0, 12.0, 1.2))
+    car = ego(440.0, 32.7, 0.05, 4.0)
+    for _ in range(600):
+        car[X] = (car[X] + 0.4) % 1024
+        flow(ring, D, world, car)
+        assert (car[X] - world[0, ALONG]) % 1024 > LENGTH
+    assert world[:, SPEED] == pytest.approx(4.0, abs=0.1)
+    assert (car[X] - world[0, ALONG]) % 1024 < LENGTH + oracle.equilibrium_gap(CONFIG, 4.0, 12.0) + 3.0
+
+
+def test_the_ego_car_beside_the_lane_is_passed(ring):
+    history = watch(ring, cars_on(ring, (0, 400.0, 12.0, 1.0)), 20, ego(500.0, 32.0 + 2.6))
+    assert history[-1, 0, ALONG] == pytest.approx(640.0, abs=1.0)
+    assert history[:, 0, SPEED].min() > 11.9
+
+
+# --- Junctions -------------------------------------------------------------------------------------------------------
+
+
+def front(world, i=0):
+    return world[..., i, ALONG] + LENGTH / 2
+
+
+@pytest.mark.parametrize("offset", np.arange(-24.0, 25.0, 3.0))
+def test_of_two_that_cross_one_waits(crossing, offset):
+    history = watch(crossing, cars_on(crossing, (0, 70.0, 9.0, 1.0), (3, 70.0 + offset, 9.0, 1.0)), 25)
+    lane, permit = history[:, :, LANE], history[:, :, PERMIT]
+    for i in (0, 1):
+        into = np.flatnonzero(lane[:, i] == 3 * i + 1)
+        assert len(into)  # both get there
+        assert permit[into[0] - 1, i] == 3 * i + 1  # by a permit
+        before = lane[:, i] == 3 * i
+        assert (front(history, i)[before & (permit[:, i] < 0)] <= 120.0).all()  # without one, not over the line
+    # Nobody has a permit while the other's rear is still on its way.
+    for i, j in ((0, 1), (1, 0)):
+        inside = (lane[:, j] == 3 * j + 1) & (history[:, j, ALONG] - LENGTH / 2 < 8.0 + 1.0)
+        assert not (inside & (permit[:, i] == 3 * i + 1)).any()
+        assert not (inside & (lane[:, i] == 3 * i + 1)).any()
+
+
+def test_a_car_waits_while_the_crossing_car_has_a_permit(crossing):
+    """It has one and does not come: the ego car stands before it. When that goes, both get through."""
+    world = cars_on(crossing, (0, 100.0, 5.0, 1.0), (3, 80.0, 5.0, 1.0))
+    world[0, PERMIT] = 1
+    stuck = watch(crossing, world, 60, ego(115.0, 128.0))
+    assert (stuck[-1, :, SPEED] < 0.02).all()
+    assert (stuck[-1, :, LANE] == [0, 3]).all()
+    assert 120.0 - 3.0 < front(stuck[-1], 1) <= 120.0
+    after = watch(crossing, stuck[-1], 30)
+    assert {1, 2} <= set(after[:, 0, LANE])
+    assert {4, 5} <= set(after[:, 1, LANE])
+
+
+def test_the_ego_car_in_the_junction_is_waited_for(crossing):
+    world = cars_on(crossing, (0, 60.0, 9.0, 1.0), (3, 90.0, 9.0, 1.0))
+    history = watch(crossing, world, 60, ego(128.0, 128.0, 0.8))
+    assert (history[-1, :, LANE] == [0, 3]).all()
+    assert front(history, 0).max() <= 120.0
+    assert front(history, 1).max() <= 120.0
+    assert (history[-1, :, SPEED] < 0.02).all()
+    after = watch(crossing, history[-1], 30)
+    assert {1, 2} <= set(after[:, 0, LANE])
+    assert {4, 5} <= set(after[:, 1, LANE])
+
+
+@pytest.mark.parametrize("speed", [4.0, 8.0, 15.0])
+@pytest.mark.parametrize("phase", np.arange(0.0, 15.0, 2.5))
+def test_the_ego_car_that_comes_crosswise_goes_first(crossing, speed, phase):
+    """It is two to three seconds from the junction; a car that would be there as soon lets it pass."""
+    world = cars_on(crossing, (0, 105.0, 6.0, 1.0))
+    car = ego(128.0, 128.0 - 2.0 * speed - phase * speed / 15.0, math.pi / 2, speed)
+    while car[Y] < 132.0:
+        flow(crossing, D, world, car)
+        assert world[0, LANE] == 0
+        car[Y] += speed * DT
+    assert {1, 2} <= set(watch(crossing, world, 15)[:, 0, LANE])
+
+
+def test_a_junction_is_left_free_while_there_is_no_room_behind(crossing):
+    """Cars stand behind the junction: who would have to stop in it stays before it."""
+    stands = ego(150.0, 128.0)
+    rows = [(0, 110.0 - 12.0 * k, 6.0, 1.0) for k in range(5)]
+    history = watch(crossing, cars_on(crossing, *rows, (3, 20.0, 6.0, 1.0)), 120, stands)
+    last = history[-1]
+    queue = last[:-1]
+    inside = (queue[:, LANE] == 1) | ((queue[:, LANE] == 2) & (queue[:, ALONG] < LENGTH / 2))
+    assert (queue[:, SPEED] < 0.02).all()
+    assert {0, 2} <= set(queue[:, LANE])
+    assert not inside.any()
+    assert 5 in history[:, -1, LANE]  # and the crossing way is open
+
+
+def test_the_second_of_a_queue_has_no_permit_before_the_first(crossing):
+    """Else two queues can wait for each other for ever: each first car for the other queue's second."""
+    world = cars_on(crossing, (0, 116.0, 0.0, 1.0), (0, 110.0, 0.0, 1.0), (3, 60.0, 0.0, 1.0))
+    world[2, PERMIT] = 4
+    history = watch(crossing, world, 30, ego(128.0, 75.0))
+    assert (history[:, :2, PERMIT] == -1.0).all()
+
+
+# --- Lane changes ----------------------------------------------------------------------------------------------------
+
+
+def test_a_fast_car_passes_a_slow_one(abreast):
+    world = cars_on(abreast, (1, 200.0, 8.0, 0.5), (1, 150.0, 15.0, 1.0))
+    history = watch(abreast, world, 60)
+    assert 0 in history[:, 1, LANE]
+    assert history[-200:, 1, SPEED] == pytest.approx(20.0, abs=0.3)
+    assert history[:, 0, SPEED].max() < 10.5
+    # It moves over: never a jump of more than what a lane change's speed allows.
+    y = history[:, 1, Y].astype(float)
+    assert np.abs(np.diff(y)).max() < CONFIG.traffic.lane_change_speed * DT + 1e-3
+    assert y.max() == pytest.approx(35.75, abs=0.05)
+
+
+def test_a_car_boxed_in_stays(abreast):
+    """The lane beside is held by one who is level."""
+    world = cars_on(abreast, (1, 200.0, 8.0, 0.4), (1, 185.0, 8.0, 1.0), (0, 186.0, 8.0, 0.4), (0, 205.0, 8.0, 0.4))
+    history = watch(abreast, world, 30)
+    assert (history[:, 1, LANE] == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nobody_cuts_in_on_another(seed):
+    """At each change of lanes on a dense highway neither the new follower nor the car itself has to brake harder than
+    is safe, by the oracle's law and their places just before."""
+    network = build("highway", seed).network
+    world = spawn(network, FAR[None], 30, np.array([seed], dtype=np.uint64), CONFIG.traffic)[0]
+    history = watch(network, world, 300)
+    lane, shift = history[:, :, LANE], history[:, :, SHIFT]
+    changes = [(t, i) for t, i in np.argwhere((shift[1:] != 0) & (shift[:-1] == 0)) if lane[t + 1, i] >= 0]
+    assert len(changes) > 20
+    followed = 0
+    for t, i in changes:
+        before, target = history[t].astype(float), int(lane[t + 1, i])
+        ahead: list[tuple[float, int]] = []
+        behind: list[tuple[float, int]] = []
+        mine = before[i]
+        if abs(history[t + 1, i, ALONG] - mine[ALONG]) > 10:
+            continue  # it came to the next piece of road in the same step
+        for j, other in enumerate(before):
+            dx, dy = other[X] - mine[X], other[Y] - mine[Y]
+            dx, dy = (dx + 512) % 1024 - 512, (dy + 64) % 128 - 64
+            if j != i and int(other[LANE]) == target and abs(dx) < 100:
+                forward = dx * mine[COS] + dy * mine[SIN]
+                (ahead if forward > 0 else behind).append((abs(forward), j))
+        for near, leads in ((ahead, True), (behind, False)):
+            if not near:
+                continue
+            gap, j = min(near)
+            rear, lead = (mine, before[j]) if leads else (before[j], mine)
+            at = network.offsets[int(rear[LANE])] + int(rear[ALONG] / network.steps[int(rear[LANE])])
+            desired = rear[FACTOR] * network.speeds[at]
+            # Along bends of 150 m lanes differ in length by a few percent.
+            pace = oracle.idm(CONFIG, rear[SPEED], desired, gap * 1.03 + 0.3 - LENGTH, lead[SPEED])
+            assert pace > -CONFIG.traffic.safe_braking
+            followed += 1
+    assert followed > 20
+
+
+# --- Spawning --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scenario", ["seamless", "highway", "city"])
+def test_cars_spawn_uniformly_over_the_lanes_outside_junctions(scenario):
+    network = build(scenario, 1).network
+    keys = np.arange(4000, dtype=np.uint64)
+    cars = spawn(network, np.repeat(FAR[None], 4000, axis=0), 1, keys, CONFIG.traffic)[:, 0].astype(float)
+    assert (cars[:, LANE] >= 0).mean() > 0.99
+    cars = cars[cars[:, LANE] >= 0]
+    lane = cars[:, LANE].astype(int)
+    lengths = np.array([length_of(network, k) for k in range(len(network.steps))])
+    free = np.diff(network.crossing_offsets) == 0
+    assert free[lane].all()
+    counts = np.bincount(lane, minlength=len(lengths))
+    expected = np.where(free, lengths, 0.0) / lengths[free].sum() * len(cars)
+    assert stats.chisquare(counts[free], expected[free]).pvalue > 1e-3
+    assert stats.kstest(cars[:, ALONG] / lengths[lane], "uniform").pvalue > 1e-3
+    assert stats.kstest(cars[:, FACTOR], "uniform", args=(0.9, 0.3)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("scenario", REGISTRY)
+def test_spawned_cars_keep_their_distance(scenario):
+    network = build(scenario, 2).network
+    rng = np.random.default_rng(0)
+    starts = np.zeros((40, 5), dtype=F)
+    starts[:, :2] = network.points[rng.integers(len(network.points), size=40)] % [network.width, network.height]
+    worlds = spawn(network, starts, 12, np.arange(40, dtype=np.uint64), CONFIG.traffic).astype(float)
+    sides = np.array([network.width, network.height], dtype=float)
+    for world, start in zip(worlds, starts, strict=True):
+        here = world[world[:, LANE] >= 0][:, [X, Y]]
+        assert len(here) >= 8
+
+        def apart(a, b):
+            return np.hypot(*(np.abs((a - b + sides / 2) % sides - sides / 2)).T)
+
+        assert apart(here, start[:2]).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
+        for k in range(1, len(here)):
+            assert apart(here[:k], here[k]).min() >= CONFIG.traffic.spawn_gap - 1e-3
+
+
+def test_the_same_key_gives_the_same_world_in_any_company():
+    network = build("city", 0).network
+    starts, keys = np.repeat(FAR[None], 6, axis=0), np.arange(6, dtype=np.uint64)
+    together = spawn(network, starts, 5, keys, CONFIG.traffic)
+    for k in range(6):
+        assert (
+            spawn(network, starts[k : k + 1], 5, keys[k : k + 1], CONFIG.traffic)[0].tobytes() == together[k].tobytes()
+        )
+    assert len({world.tobytes() for world in together}) == 6
+    assert spawn(network, starts[:1], 3, keys[:1], CONFIG.traffic)[0].tobytes() == together[0, :3].tobytes()
+
+
+def test_more_cars_than_fit_leave_some_out(ring):
+    small = network_of([Path(0.0, 32.0, 0.0, ((128.0, 0.0),))], 128.0, 64.0)
+    world = spawn(
+        small, np.array([[10.0, 32.0, 0, 0, 0]], dtype=F), 30, np.array([4], dtype=np.uint64), CONFIG.traffic
+    )[0]
+    absent = world[:, LANE] < 0
+    assert 3 <= (~absent).sum() <= 84 / 14 + 1
+    history = watch(small, world, 60)
+    still = [X, Y, LANE, ALONG, SPEED]
+    assert (history[:, absent][..., still] == world[absent][:, still]).all()  # they stay away
+    assert history[:, ~absent, SPEED].max() > 5.0
+    assert (spawn(ring, FAR[None], 0, np.zeros(1, dtype=np.uint64), CONFIG.traffic)).shape == (1, 0, FIELDS)
+
+
+# --- Hours on end ----------------------------------------------------------------------------------------------------
+
+
+def open_road(network):
+    """Mean speed (m/s) of one who drives over all lanes as fast as they allow."""
+    metres = np.repeat(network.steps.astype(np.float64), np.diff(network.offsets))
+    return float(metres.sum() / (metres / network.speeds).sum())
+
+
+@pytest.mark.parametrize("cars", [0, 30])
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("scenario", REGISTRY)
+def test_traffic_alone_neither_crashes_nor_stops(scenario, seed, cars):
+    """Five minutes at the default density (6 where that is none), and at several times it; `benchmarks/traffic.py`
+    is the same for hours."""
+    network = build(scenario, seed).network
+    world = spawn(
+        network, FAR[None], cars or REGISTRY[scenario].traffic or 6, np.array([seed], dtype=np.uint64), CONFIG.traffic
+    )
+    history = watch(network, world[0], 300).astype(float)
+    there = history[0, :, LANE] >= 0
+    assert there.sum() >= (cars or 4) * 0.8
+    assert history[:, there, SPEED].mean() > open_road(network) / 2
+    assert (history[-600:, there, SPEED].mean()) > open_road(network) / 2
+    assert np.isfinite(history).all()
+    # On its lane always: nobody is anywhere else than its lane, its metres and its shift say.
+    for lane, along in zip(history[::50, there, LANE].ravel(), history[::50, there, ALONG].ravel(), strict=True):
+        assert 0.0 <= along < length_of(network, int(lane))
