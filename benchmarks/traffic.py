@@ -35,16 +35,16 @@ CARS = 6  # where the scenario's default is none
 
 
 @njit(nogil=True)
-def soak(network, drivers, constants, world, first, steps, stood) -> tuple[int, float, float]:
-    """Let traffic flow for so many control steps from number `first` on.
+def soak(network, drivers, constants, world, steps, stood) -> tuple[int, float, float]:
+    """Let traffic flow for so many control steps.
 
     Args: world [cars, FIELDS], changed; stood int64 [cars], steps for which each car has stood by now, changed.
     Returns: (overlaps, sum of all cars' speeds over all steps in m/s, most steps for which any car stood).
     """
     nobody = np.zeros(5, dtype=np.float32)
     overlaps, total, longest = 0, 0.0, 0
-    for step in range(first, first + steps):
-        flow(network, drivers, world, nobody, np.int32(step))
+    for _ in range(steps):
+        flow(network, drivers, world, nobody)
         for i in range(world.shape[0]):
             car = world[i]
             if car[LANE] < 0.0:
@@ -82,10 +82,10 @@ def measure(scenario: str, cars: int, seeds: int, hours: float) -> dict[str, flo
         world = spawn(network, start, cars, np.array([seed], dtype=np.uint64), sim.traffic)[0]
         there = max(int((world[:, LANE] >= 0).sum()), 1)
         stood = np.zeros(cars, dtype=np.int64)
-        means, done = [], 0
+        means = []
         for part in parts:
-            touched, total, most = soak(network, others, k, world, done, part, stood)
-            overlaps, longest, done = overlaps + touched, max(longest, most), done + part
+            touched, total, most = soak(network, others, k, world, part, stood)
+            overlaps, longest = overlaps + touched, max(longest, most)
             means.append(total / there / max(part, 1))
         totals.append((means[0] * parts[0] + means[1] * parts[1]) / steps)
         ends.append(means[1])

@@ -38,7 +38,7 @@ from gridsim.simulator import (
 from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic import drivers, flow
 
-_F, _I = np.float32, np.int32
+_F = np.float32
 
 #: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
 #: its own target (m) and limit (control steps), where these are not 0.
@@ -146,7 +146,7 @@ def _run(
         if world is not None:
             if keep > 0:
                 world_ring[steps % keep] = world
-            flow(network, drivers, world, car, _I(steps))
+            flow(network, drivers, world, car)
         end = drive(road, constants, car, visits, world, action)
         steps += 1
         if end == 0:

@@ -274,7 +274,7 @@ def _control_some(
             else:
                 acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
             if worlds is not None:
-                flow(network, drivers, worlds[i], car, _I(car[STEPS]))
+                flow(network, drivers, worlds[i], car)
                 car[STEERING] = steering
                 ends[i] = control(road, constants, car, visits[i], worlds[i], acceleration, target, max_steps)
             else:

@@ -1,0 +1,49 @@
+"""The reference driver on the held-out episodes of each scenario: `python benchmarks/reference.py [SCENARIO ...]`."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+
+from cluster.coordinator import Maps, held_out_episodes
+from gridsim.config import SimConfig
+from gridsim.reference import ReferenceDriver
+from gridsim.scenarios import REGISTRY
+from gridsim.simulator import DISTANCE, PACED, End
+
+TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default is none
+
+
+def main() -> None:
+    """Print a line for each scenario, without and with traffic; failures as (episode, end, steps)."""
+    print(f"{'scenario':>10} {'traffic':>7} {'success':>7} {'m/s':>6} {'paced':>5}  interval  ends")
+    for name in sys.argv[1:] or REGISTRY:
+        spec = REGISTRY[name]
+        maps = Maps(name, SimConfig())
+        for cars in (0, spec.traffic or TRAFFIC[name]):
+            episodes = held_out_episodes(maps, cars)
+            scenarios = [maps.get(seed) for seed in episodes.maps]
+            driver = ReferenceDriver(scenarios)
+            drives = [
+                driver.drive(scenarios[row["map"]], row["start"], world, k)
+                for k, (row, world) in enumerate(zip(episodes.rows, episodes.worlds, strict=True))
+            ]
+            speeds = [drive.car[DISTANCE] / drive.time[-1] for drive in drives]
+            paced = np.mean([drive.car[PACED] / drive.car[DISTANCE] for drive in drives])
+            ends = [drive.end for drive in drives]
+            low, high = spec.speed_interval
+            bad = [
+                (k, end.name, len(d.time))
+                for k, (end, d) in enumerate(zip(ends, drives, strict=True))
+                if end != End.SUCCESS
+            ]
+            print(
+                f"{name:>10} {cars:7d} {np.mean([end == End.SUCCESS for end in ends]):7.3f} {np.mean(speeds):6.2f} "
+                f"{paced:5.2f}  {low:.0f} - {high:.0f}  {len(bad)} {bad[:12]}",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,238 @@
+"""The reference driver and its profile: closed forms on a straight and a circle, and drives on every scenario."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evolution.episodes import lane_starts
+from gridsim.config import TrafficConfig
+from gridsim.lanes import Path, lay_lanes, strips_along
+from gridsim.reference import ReferenceDriver
+from gridsim.roads import Lanes, clearance_nodes, freeze, make_road
+from gridsim.routes import ReferenceConfig, locate, plan, profile, top_speed, unwrapped
+from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build, sample_starts
+from gridsim.simulator import DISTANCE, End, Simulator, X
+from gridsim.traffic import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, make_network
+from gridsim.traffic import X as TRAFFIC_X
+from gridsim.traffic import Y as TRAFFIC_Y
+from gridsim.vehicle import Action
+
+CONFIG = ReferenceConfig()
+INTERVAL = (5.0, 12.0)
+TOP = top_speed(INTERVAL, CONFIG)
+TRAFFIC = {"seamless": 6, "curved": 6}
+NOBODY = np.zeros((0, FIELDS), dtype=np.float32)
+START = np.array([10.0, 32.0, 0.0, 0.0, 0.0], dtype=np.float32)
+
+
+def on_path(path: Path, width: float, height: float) -> Scenario:
+    """A map of one lane, 8 m wide."""
+    strips = strips_along(path, 4.0)
+    lanes = lay_lanes([path], width, height)
+    lanes = Lanes(**{name: freeze(array) for name, array in vars(lanes).items()})
+    return Scenario(
+        name="one lane",
+        seed=0,
+        road=make_road(clearance_nodes(strips, width, height), INTERVAL, 50.0),
+        lanes=lanes,
+        strips=strips,
+        network=make_network(lanes, width, height, 8.0, TrafficConfig()),
+    )
+
+
+@pytest.fixture(scope="module")
+def straight():
+    return on_path(Path(0.0, 32.0, 0.0, ((512.0, 0.0),)), 512.0, 64.0)
+
+
+@pytest.fixture(scope="module")
+def seamless():
+    return build("seamless", HELD_OUT_SEED)
+
+
+def lateral(drive, scenario):
+    """M to the left of the route's rail, at each step of a drive."""
+    sides = np.array([scenario.road.width, scenario.road.height])
+    result = []
+    for position, s, rail in zip(drive.pose[:, :2], drive.arc, drive.rail, strict=True):
+        points, arc = drive.route.points[rail].astype(float), drive.route.arc[rail]
+        k = min(max(int(np.searchsorted(arc, s)) - 1, 0), len(arc) - 2)
+        along = (points[k + 1] - points[k]) / np.hypot(*(points[k + 1] - points[k]))
+        away = position - points[k]
+        away -= np.round(away / sides) * sides
+        result.append(along[0] * away[1] - along[1] * away[0])
+    return np.array(result)
+
+
+def test_straight_road_is_driven_straight_at_the_speed_it_should(straight):
+    drive = ReferenceDriver([straight]).drive(straight, START, NOBODY, 0, max_steps=300)
+    steady = drive.arc > drive.arc[0] + 40.0
+    assert steady.sum() > 200
+    assert np.abs(drive.speed[steady] - TOP).max() < 0.3
+    assert np.abs(lateral(drive, straight)).max() < 0.1
+    assert drive.speed[20] == pytest.approx(20 * 0.3, abs=1e-4)  # flat out from rest
+
+
+def test_start_beside_the_lane_comes_back_to_it(straight):
+    start = START + np.array([0, 1.5, 0.1, 0, 0], dtype=np.float32)
+    off = lateral(ReferenceDriver([straight]).drive(straight, start, NOBODY, 0, max_steps=200), straight)
+    assert off[0] == pytest.approx(1.5, abs=1e-3)
+    assert np.abs(off[100:]).max() < 0.1
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_circle_is_driven_at_the_lateral_acceleration_it_should(side):
+    radius = 20.0
+    ring = on_path(Path(64.0, 64.0 - side * radius, 0.0, ((2 * math.pi * radius, side / radius),)), 128.0, 128.0)
+    start = np.array([64.0, 64.0 - side * radius, 0.0, 0.0, 0.0], dtype=np.float32)
+    driver = ReferenceDriver([ring])
+    drive = driver.drive(ring, start, NOBODY, 0, target=110.0)
+    steady = slice(40, None)
+    assert drive.end == End.SUCCESS
+    assert np.abs(drive.speed[steady] - math.sqrt(CONFIG.lateral * radius)).max() < 0.35
+    assert np.abs(lateral(drive, ring)[steady]).max() < 0.25
+    slip = math.asin(1.25 / radius)
+    assert np.mean(drive.steering[steady]) == pytest.approx(side * math.atan(2.0 * math.tan(slip)), abs=0.04)
+
+
+def test_profile_of_a_straight_is_flat_out_and_then_steady():
+    points = np.stack([np.linspace(0.0, 200.0, 401), np.full(401, 3.0)], axis=1)
+    found = profile(points, INTERVAL)
+    s = np.array([0.0, 3.0, 10.0, 100.0])
+    assert found.speed_at(s) == pytest.approx([0.0, math.sqrt(18.0), math.sqrt(60.0), TOP], rel=1e-6)
+    assert found.steering_at(s) == pytest.approx(0.0, abs=1e-12)
+    assert profile(points, INTERVAL, start_speed=TOP).speed_at(0.0) == pytest.approx(TOP)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_profile_of_a_circle_is_the_bicycles(side):
+    angle = np.linspace(0.0, 3.0, 500)
+    points = 15.0 * np.stack([np.sin(angle), side * (1.0 - np.cos(angle))], axis=1)
+    found = profile(points, INTERVAL, start_speed=30.0)
+    inside = slice(1, -1)
+    assert found.speed[inside] == pytest.approx(math.sqrt(CONFIG.lateral * 15.0), rel=2e-3)
+    slip = math.asin(1.25 / 15.0)
+    assert found.steering[inside] == pytest.approx(side * math.atan(2.0 * math.tan(slip)), rel=5e-3)
+
+
+def test_profile_brakes_and_accelerates_no_harder_than_it_may(seamless):
+    start = sample_starts(seamless, 1, np.random.default_rng(3))[0]
+    route = plan(seamless, start, 600.0, 1)
+    found = profile(route.points[0], INTERVAL, start_speed=2.0)
+    rate = np.diff(found.speed**2) / (2.0 * np.diff(found.arc))
+    assert rate.min() >= -CONFIG.braking - 1e-6
+    assert rate.max() <= CONFIG.acceleration + 1e-6
+    assert np.abs(found.steering).max() <= math.radians(27.0) + 1e-9
+    assert found.speed[1:].min() > 2.0
+    assert found.speed.max() <= TOP
+
+
+def test_profile_along_its_own_path_is_what_the_driver_does(seamless):
+    start = sample_starts(seamless, 1, np.random.default_rng(5))[0]
+    drive = ReferenceDriver([seamless]).drive(seamless, start, NOBODY, 2)
+    points = unwrapped(drive.pose[:, :2], seamless.road.width, seamless.road.height)
+    found = profile(points, INTERVAL)
+    error = drive.speed[: len(found.arc)] - found.speed
+    assert np.abs(error).mean() < 0.5
+    assert np.abs(np.degrees(drive.steering[: len(found.arc)] - found.steering)).mean() < 5.0
+
+
+@pytest.mark.parametrize("points", [np.zeros((1, 2)), np.ones((5, 2)), np.zeros((4, 3)), np.full((4, 2), np.nan)])
+def test_path_that_leads_nowhere_is_refused(points):
+    with pytest.raises(ValueError, match="path"):
+        profile(points, INTERVAL)
+
+
+def test_map_without_lanes_is_refused(straight):
+    none = replace(straight, lanes=lay_lanes([], 512.0, 64.0))
+    with pytest.raises(ValueError, match="lanes"):
+        plan(none, START, 100.0, 0)
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_starts_are_located_and_routes_are_continuous(name):
+    scenario = build(name, HELD_OUT_SEED)
+    for k, start in enumerate(sample_starts(scenario, 12, np.random.default_rng(0))):
+        lane, along = locate(scenario, start)
+        points = scenario.lanes.lane(lane).astype(float)
+        at = along / scenario.lanes.steps[lane]
+        where = [np.interp(at, np.arange(len(points)), axis) for axis in points.T]
+        assert np.hypot(*(where - start[:2])) < 0.02
+        route = plan(scenario, start, 300.0, k)
+        gaps = np.hypot(*np.moveaxis(np.diff(route.points, axis=1), -1, 0))
+        assert gaps.max() < 1.2
+        assert route.lanes[route.rail, 0] == lane
+        for before, after in zip(route.lanes[:, :-1].T, route.lanes[:, 1:].T, strict=True):
+            assert all(b in scenario.lanes.successors[a] for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+@pytest.mark.parametrize("traffic", [0, None])
+def test_it_finishes_inside_the_interval(name, traffic):
+    spec = REGISTRY[name]
+    cars = (spec.traffic or TRAFFIC[name]) if traffic is None else 0
+    scenarios = [build(name, HELD_OUT_SEED + k) for k in range(2)]
+    rows, worlds = lane_starts(scenarios, np.arange(6) % 2, np.random.default_rng(1), cars)
+    driver = ReferenceDriver(scenarios)
+    low, high = spec.speed_interval
+    for k, (row, world) in enumerate(zip(rows, worlds.reshape(6, cars, FIELDS), strict=True)):
+        drive = driver.drive(scenarios[row["map"]], row["start"], world, k)
+        assert drive.end == End.SUCCESS
+        assert low <= drive.car[DISTANCE] / drive.time[-1] <= high
+        assert np.abs(drive.steering).max() <= math.radians(27.0) + 1e-6
+        assert drive.speed.max() <= high
+        assert set(drive.action) <= set(Action)
+        if not cars:  # on straights, once it has come up to speed
+            top = top_speed(spec.speed_interval, CONFIG)
+            clear = np.interp(drive.arc, drive.route.arc[0], drive.route.speeds[0]) >= top - 0.01
+            steady = clear & np.roll(clear, 50)
+            steady[:100] = False
+            assert np.all(drive.speed[steady] >= low)
+
+
+def test_same_seed_same_drive_other_seed_other_route(seamless):
+    rows, worlds = lane_starts([seamless], np.zeros(1, dtype=int), np.random.default_rng(2), 6)
+    driver = ReferenceDriver([seamless])
+    one, two, other = (driver.drive(seamless, rows["start"][0], worlds[0], seed) for seed in (4, 4, 5))
+    assert np.array_equal(one.pose, two.pose)
+    assert np.array_equal(one.action, two.action)
+    assert not np.array_equal(one.route.lanes, other.route.lanes)
+
+
+def test_batch_in_the_simulator_drives_as_alone(seamless):
+    rows, worlds = lane_starts([seamless], np.zeros(3, dtype=int), np.random.default_rng(2), 6)
+    driver = ReferenceDriver([seamless])
+    alone = [
+        driver.drive(seamless, start, world, k)
+        for k, (start, world) in enumerate(zip(rows["start"], worlds, strict=True))
+    ]
+    sim = Simulator([seamless], 3, traffic=6)
+    sim.reset(rows["start"], worlds=worlds)
+    driver.reset(rows["start"], 0, [0, 1, 2])
+    for step in range(150):
+        for k, drive in enumerate(alone):
+            assert sim.state.cars[k, X] == drive.pose[step, 0]
+        actions = driver.act(sim.state.cars, sim.state.worlds)
+        assert actions.tolist() == [drive.action[step] for drive in alone]
+        sim.step(actions)
+
+
+def test_it_stops_behind_a_standing_car(straight):
+    world = np.zeros((1, 1, FIELDS), dtype=np.float32)
+    world[0, 0, [LANE, PAST, PERMIT]] = 0, -1, -1
+    world[0, 0, [ALONG, TRAFFIC_X, TRAFFIC_Y, COS, FACTOR]] = 90, 90, 32, 1, 0
+    sim = Simulator([straight], 1, traffic=1)
+    driver = ReferenceDriver([straight])
+    sim.reset(START[None], worlds=world)
+    driver.reset(START[None], 0, [0])
+    speeds = []
+    for _ in range(250):
+        sim.state.worlds[:] = world
+        sim.step(driver.act(sim.state.cars, sim.state.worlds))
+        speeds.append(float(sim.state.cars[0, 4]))
+    assert sim.state.ends[0] == End.RUNNING
+    assert max(speeds) > 8.0
+    assert max(np.abs(speeds[-50:])) < 0.05
+    assert 1.0 < 90.0 - sim.state.cars[0, X] - 4.0 < 4.5  # m from bumper to bumper
