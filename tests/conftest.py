@@ -1,6 +1,7 @@
 """What the tests share: the checkout's root, a clean environment, and commands run as a user runs them."""
 
 import os
+import signal
 import subprocess
 import sysconfig
 from collections.abc import Callable
@@ -12,6 +13,9 @@ from hypothesis import settings
 # Nothing may reach a cluster or a tracking server that the shell happens to name.
 for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "MLFLOW_RUN_ID", "RAY_ADDRESS"):
     os.environ.pop(_name, None)
+
+# A shell ignores Ctrl-C for what it starts in the background, and so would the commands that tests interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No deadline: an example that comes first may compile a kernel. CI's examples are the same in every run.
 settings.register_profile("gridsim", settings.get_profile("ci" if os.environ.get("CI") else "default"), deadline=None)
