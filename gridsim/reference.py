@@ -25,6 +25,7 @@ from gridsim.simulator import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, En
 from gridsim.traffic import (
     AFTER,
     ALONG,
+    CLOCK,
     FACTOR,
     GAP,
     HORIZON,
@@ -124,8 +125,8 @@ def _find_conflicts(network, half_length, half_width, enter, free):
                 length = math.hypot(ux, uy)
                 ux, uy = ux / length, uy / length
                 for q in range(network.offsets[other], network.offsets[other + 1] - 1):
-                    dx = traffic._turned(network.points[q, 0] - network.points[p, 0], network.width)
-                    dy = traffic._turned(network.points[q, 1] - network.points[p, 1], network.height)
+                    dx = traffic.turned(network.points[q, 0] - network.points[p, 0], network.width)
+                    dy = traffic.turned(network.points[q, 1] - network.points[p, 1], network.height)
                     if abs(dx * ux + dy * uy) < half_length and abs(dy * ux - dx * uy) < half_width:
                         vx = network.points[q + 1, 0] - network.points[q, 0]
                         vy = network.points[q + 1, 1] - network.points[q, 1]
@@ -189,8 +190,8 @@ def _progress(network, route, rail, k, x, y):
         ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
         uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
         length = max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-        dx = traffic._turned(x - route.points[rail, k, 0], network.width)
-        dy = traffic._turned(y - route.points[rail, k, 1], network.height)
+        dx = traffic.turned(x - route.points[rail, k, 0], network.width)
+        dy = traffic.turned(y - route.points[rail, k, 1], network.height)
         along = (dx * ux + dy * uy) / length
         if along <= length or k >= last:
             return k, route.arc[rail, k] + along, (dy * ux - dx * uy) / length
@@ -209,8 +210,8 @@ def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
     ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
     uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
     norm = blend / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-    dx = traffic._turned(x - norm * uy - car[X], network.width)
-    dy = traffic._turned(y + norm * ux - car[Y], network.height)
+    dx = traffic.turned(x - norm * uy - car[X], network.width)
+    dy = traffic.turned(y + norm * ux - car[Y], network.height)
     forward, left = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
     distance = max(math.sqrt(forward * forward + left * left), _F(0.1))
     tangent = (left / distance) / max(distance / (_TWO * constants.rear_axle) + forward / distance, _F(0.1))
@@ -258,7 +259,7 @@ def _seat(network, route, rail, m, s, car, me):
     me[LANE] = route.lanes[rail, m]
     me[NEXT] = route.lanes[rail, min(m + _I(1), last)]
     me[AFTER] = route.lanes[rail, min(m + _I(2), last)]
-    length = traffic._lane_length(network, _I(me[LANE]))
+    length = traffic.lane_length(network, _I(me[LANE]))
     me[ALONG] = min(max(s - route.arc[rail, route.offsets[m]], _ZERO), length)
 
 
@@ -282,9 +283,9 @@ def _give_way(network, conflicts, drivers, me, world):
                 if _I(world[j, LANE]) == other:
                     at = world[j, ALONG]
                 elif _I(world[j, PERMIT]) == other:
-                    at = world[j, ALONG] - traffic._lane_length(network, _I(world[j, LANE]))
+                    at = world[j, ALONG] - traffic.lane_length(network, _I(world[j, LANE]))
                 elif _I(world[j, PAST]) == other:
-                    at = world[j, ALONG] + traffic._lane_length(network, other)
+                    at = world[j, ALONG] + traffic.lane_length(network, other)
                 else:
                     continue
                 rest = conflicts.free[c] + drivers.half_length + _HALF - at
@@ -304,7 +305,7 @@ def _give_way(network, conflicts, drivers, me, world):
                 else:
                     slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * way))
                 allowed, least = min(allowed, slower), min(least, way)
-        ahead += traffic._lane_length(network, lane)
+        ahead += traffic.lane_length(network, lane)
     return allowed, least
 
 
@@ -332,7 +333,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
                 dx, dy = wrapped(world[j, X] - car[X], network.width), wrapped(world[j, Y] - car[Y], network.height)
                 if math.sqrt(dx * dx + dy * dy) - _F(5.0) < me[HORIZON]:
                     before = me[GAP]
-                    traffic._follow(network, drivers, me, world[j], False)
+                    traffic.follow(network, drivers, me, world[j], False)
                     along = me[COS] * world[j, COS] + me[SIN] * world[j, SIN]
                     if me[GAP] < before:
                         touch = min(touch, me[GAP])
@@ -350,7 +351,8 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
         at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
         me[FACTOR] = wish / network.speeds[at]
         me[PACE] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD])
-        traffic._change_lanes(network, drivers, others, n, nobody, _I(car[STEPS]))
+        me[CLOCK] = _F(_I(car[STEPS]) % _I(10))  # it thinks of another lane once a second
+        traffic.change_lanes(network, drivers, others, n, nobody)
         if _I(me[LANE]) != lane:
             memory[LEFT_RAIL] = rail
             memory[RAIL] = rail + 1 if _I(me[LANE]) == network.right[lane] else rail - 1
@@ -402,8 +404,10 @@ def _drive(
         row[0], row[1], row[2], row[3] = car[X], car[Y], math.atan2(car[SIN], car[COS]), car[SPEED]
         row[4], row[5], row[7] = car[STEERING], action, memory[RAIL]
         _, row[6], _ = _progress(network, route, _I(memory[RAIL]), _I(memory[POINT]), car[X], car[Y])
-        flow(network, traffic_drivers, world, car, _I(steps))
-        end = control(road, constants, car, visits, world, action, target, max_steps)
+        flow(network, traffic_drivers, world, car)
+        acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
+        car[STEERING] = steering
+        end = control(road, constants, car, visits, world, acceleration, target, max_steps)
         steps += 1
     return car, steps, end
 

@@ -204,13 +204,14 @@ def wrapped(difference, side):
 
 
 @leaf
-def _turned(difference, side):
+def turned(difference, side):
     """The same for any difference: lanes' points are not wrapped."""
     return difference - math.floor(difference / side + _HALF) * side
 
 
 @leaf
-def _lane_length(network, lane):
+def lane_length(network, lane):
+    """Length (m) of a lane."""
     return _F(network.offsets[lane + 1] - network.offsets[lane] - 1) * network.steps[lane]
 
 
@@ -343,11 +344,11 @@ def _ahead(network, car, other_lane, other_along):
     lane, after, third = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
     if other_lane == lane and other_along > car[ALONG]:
         return other_along - car[ALONG]
-    rest = _lane_length(network, lane) - car[ALONG]
+    rest = lane_length(network, lane) - car[ALONG]
     if other_lane == after:
         return rest + other_along
     if other_lane == third:
-        return rest + _lane_length(network, after) + other_along
+        return rest + lane_length(network, after) + other_along
     return _F(1e9)
 
 
@@ -364,14 +365,14 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
     travelled = drivers.half_length
     along += travelled
     for _ in range(3):
-        length = _lane_length(network, lane)
+        length = lane_length(network, lane)
         first = network.offsets[lane]
         step = network.steps[lane]
         while along <= length:
             if travelled > horizon:
                 return _F(1e9)
             k = first + _I(along / step)
-            dx, dy = _turned(network.points[k, 0] - x, network.width), _turned(network.points[k, 1] - y, network.height)
+            dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
             forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
             away = max(abs(forward) - half_length, abs(aside) - half_width)
             if away < _ZERO:
@@ -399,8 +400,8 @@ def _passes(network, drivers, lane, other):
     q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
     reach = _F(2.0) * drivers.half_width + _F(2.0) * _CAUTION
     for p in range(network.offsets[lane], network.offsets[lane + 1]):
-        dx = _turned(network.points[p, 0] - network.points[q, 0], network.width)
-        dy = _turned(network.points[p, 1] - network.points[q, 1], network.height)
+        dx = turned(network.points[p, 0] - network.points[q, 0], network.width)
+        dy = turned(network.points[p, 1] - network.points[q, 1], network.height)
         if dx * dx + dy * dy < reach * reach:
             return True
     return False
@@ -411,7 +412,7 @@ def _reaches(network, lane, x, y, within):
     """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
     first, k = network.offsets[lane], network.offsets[lane]
     while k < network.offsets[lane + 1]:
-        dx, dy = _turned(network.points[k, 0] - x, network.width), _turned(network.points[k, 1] - y, network.height)
+        dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
         apart = math.sqrt(dx * dx + dy * dy)
         if apart < within:
             return _F(k - first) * network.steps[lane]
@@ -429,7 +430,7 @@ def _may_enter(network, drivers, world, i, ego):
     # one, else for as many as the lane beyond holds.
     chained = _is_junction(network, beyond)
     place = _F(2.0) * drivers.half_length + drivers.jam
-    room, needed = max(_lane_length(network, beyond), place), place
+    room, needed = max(lane_length(network, beyond), place), place
     for j in range(world.shape[0]):
         if j == i or world[j, LANE] < _ZERO:
             continue
@@ -441,7 +442,7 @@ def _may_enter(network, drivers, world, i, ego):
                 return False
             if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + _HALF:
                 return False
-            if past == other and _lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
+            if past == other and lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
                 network.clear[c] + _HALF
             ):
                 return False
@@ -475,7 +476,7 @@ def _may_enter(network, drivers, world, i, ego):
         dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
         forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
         way = _CROSSING_TIME * max(ego[SPEED], _ZERO)
-        far = car[HORIZON] + _lane_length(network, lane) + way + _F(2.0) * place
+        far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
         if dx * dx + dy * dy < far * far and not (forward < _ZERO and abs(aside) < _F(2.5)):
             for k in range(1 + _I(way / _F(4.0))):
                 x, y = ego[X] + _F(4.0) * _F(k) * ego[COS], ego[Y] + _F(4.0) * _F(k) * ego[SIN]
@@ -487,7 +488,7 @@ def _may_enter(network, drivers, world, i, ego):
 
 
 @leaf
-def _follow(network, drivers, car, other, is_ego):
+def follow(network, drivers, car, other, is_ego):
     """Take another car within a car's horizon into account: whether it is the nearest thing to keep behind."""
     along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
     at = _F(1e9)
@@ -530,15 +531,15 @@ def _see(network, drivers, world, ego):
             dx, dy = wrapped(world[j, X] - x, network.width), wrapped(world[j, Y] - y, network.height)
             apart = math.sqrt(dx * dx + dy * dy) - _F(5.0)
             if apart < world[i, HORIZON]:
-                _follow(network, drivers, world[i], world[j], False)
+                follow(network, drivers, world[i], world[j], False)
             if apart < world[j, HORIZON]:
-                _follow(network, drivers, world[j], world[i], False)
+                follow(network, drivers, world[j], world[i], False)
         dx, dy = wrapped(ego[X] - x, network.width), wrapped(ego[Y] - y, network.height)
         if (
             math.sqrt(dx * dx + dy * dy) - _F(5.0) < world[i, HORIZON]
             and ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
         ):
-            _follow(network, drivers, world[i], ego, True)
+            follow(network, drivers, world[i], ego, True)
 
 
 @leaf
@@ -550,7 +551,7 @@ def _desired(network, car):
 
 
 @njit(_nrt=False)
-def _change_lanes(network, drivers, world, i, ego):
+def change_lanes(network, drivers, world, i, ego):
     """MOBIL (Kesting et al. 2007): move car i to a neighbouring lane where that is safe and it gains by it."""
     car = world[i]
     lane = _I(car[LANE])
@@ -589,9 +590,9 @@ def _change_lanes(network, drivers, world, i, ego):
                 if there == target:
                     ahead = place - along
                 elif network.successors[target, 0] == there:
-                    ahead = _lane_length(network, target) - along + place
+                    ahead = lane_length(network, target) - along + place
                 elif network.successors[there, 0] == target:
-                    ahead = along + _lane_length(network, there) - place
+                    ahead = along + lane_length(network, there) - place
                     ahead = -ahead
                 elif there != lane and other[SHIFT] != _ZERO and dx * dx + dy * dy < _F(400.0):
                     free = False  # somebody else is moving over, from beyond the target lane or out of it
@@ -632,7 +633,7 @@ def _change_lanes(network, drivers, world, i, ego):
         k = _I(car[ALONG] / network.steps[best])
         dx = network.points[second + k, 0] - network.points[first + k, 0]
         dy = network.points[second + k, 1] - network.points[first + k, 1]
-        dx, dy = _turned(dx, network.width), _turned(dy, network.height)
+        dx, dy = turned(dx, network.width), turned(dy, network.height)
         car[SHIFT] = -toward * math.sqrt(dx * dx + dy * dy)
         car[LANE] = _F(best)
         car[NEXT] = _F(_choose(network, best, car))
@@ -655,7 +656,7 @@ def _go(network, drivers, car):
             car[SHIFT] = _ZERO
         sway = slide / max(after * drivers.dt, _F(0.1))
         sway = min(max(sway, _F(-0.2)), _F(0.2))
-    length = _lane_length(network, _I(car[LANE]))
+    length = lane_length(network, _I(car[LANE]))
     if car[ALONG] >= length:
         lane = _I(car[LANE])
         car[ALONG] -= length
@@ -686,7 +687,7 @@ def flow(network, drivers, world, ego):
         pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD])
         if _is_junction(network, onward) and car[PERMIT] != car[NEXT]:
             # A junction comes: up to its line without a permit.
-            line = _lane_length(network, lane) - car[ALONG] - drivers.half_length
+            line = lane_length(network, lane) - car[ALONG] - drivers.half_length
             if line < car[HORIZON]:
                 if _may_enter(network, drivers, world, i, ego):
                     car[PERMIT] = car[NEXT]
@@ -695,7 +696,7 @@ def flow(network, drivers, world, ego):
         car[PACE] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
-            _change_lanes(network, drivers, world, i, ego)
+            change_lanes(network, drivers, world, i, ego)
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
             _go(network, drivers, world[i])

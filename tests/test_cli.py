@@ -294,13 +294,9 @@ WRONG = {
     "config that is none": (["--config", "/etc/hostname"], "config.json"),
     "init that is missing": (["--init", "nothing.npz"], "nothing.npz"),
     "policy": (["--policy", "mlp:0"], "policy"),
-<<<<<<< HEAD
     "negative traffic": (["--traffic", "-3"], "--traffic must be 0 to 100"),
     "traffic that no road holds": (["--traffic", "100000"], "--traffic must be 0 to 100"),
     "traffic that is no number": (["--traffic", "x"], "--traffic"),
-=======
-    "traffic": (["--traffic", "-5"], "--traffic"),
->>>>>>> w-ci
     "dead cluster": (["--address", "127.0.0.1:1"], "127.0.0.1:1"),
     "dead MLflow": (["--tracking-uri", "http://127.0.0.1:1"], "127.0.0.1:1"),
     "MLflow file store": (["--tracking-uri", "file:///tmp/mlruns"], "file"),

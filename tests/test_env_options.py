@@ -1,6 +1,8 @@
 """What the Gymnasium environments can be asked for: sensing, actions, traffic, pictures, and Gymnasium's wrappers."""
 
+import copy
 import math
+import pickle
 import warnings
 from pathlib import Path
 from typing import Any
@@ -138,6 +140,18 @@ def test_an_episode_follows_from_seed_and_number_alone(
             assert (reward, terminated, truncated) == tuple(x[car] for x in ours[2:5])
         np.testing.assert_array_equal(seen, ours[0][car])
         np.testing.assert_array_equal(single.cars.simulator.state.worlds[0], ours[1][car])
+
+
+def test_traffic_follows_from_the_seed_too(maps: dict[str, list[Scenario]]) -> None:
+    env = GridSimVectorEnv(2, scenario="city", maps=maps["city"])
+    same = {"map_seed": 0, "start": [*maps["city"][0].lanes.points[0], 0.0, 0.0, 0.0]}
+    env.reset(seed=1, options=same)
+    first = env.simulator.state.worlds.copy()
+    assert not np.array_equal(first[0], first[1])
+    env.reset(options=same)
+    assert not np.array_equal(env.simulator.state.worlds[0], first[0])  # the next episode's
+    env.reset(seed=1, options=same)
+    np.testing.assert_array_equal(env.simulator.state.worlds, first)
 
 
 # --- rewards and observations
