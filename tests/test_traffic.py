@@ -14,7 +14,7 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.lanes import Path, lay_lanes
 from gridsim.roads import freeze
-from gridsim.scenarios import REGISTRY, build
+from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.traffic import (
     AFTER,
     ALONG,
@@ -442,3 +442,15 @@ def test_traffic_alone_neither_crashes_nor_stops(scenario, seed, cars):
     # On its lane always: nobody is anywhere else than its lane, its metres and its shift say.
     for lane, along in zip(history[::50, there, LANE].ravel(), history[::50, there, ALONG].ravel(), strict=True):
         assert 0.0 <= along < length_of(network, int(lane))
+
+
+@pytest.mark.parametrize("seed", [0, 3, 17])
+def test_neighbouring_junctions_do_not_wait_for_each_other(seed):
+    """On these maps, within the hour, cars that waited half a metre before the line of the next junction stood in each
+    other's way for ever: one's rear was still 2 cm too far in the junction that the other wanted to enter."""
+    network = build("seamless", HELD_OUT_SEED + seed).network
+    world = spawn(network, FAR[None], 6, np.array([seed], dtype=np.uint64), CONFIG.traffic)[0]
+    for _ in range(30):
+        history = watch(network, world, 120)
+        assert history[:, :, SPEED].max(axis=0).min() > 1.0  # everybody moves within each two minutes
+        world = history[-1]
