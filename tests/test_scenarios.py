@@ -195,7 +195,7 @@ def test_no_loop_is_so_short_that_driving_it_counts_nothing(laid):
 
 def test_a_car_on_rails_touches_nothing(laid):
     """A car of 4 m x 2 m, its middle on the centre line, heading along it: its outline stays on the exact road."""
-    for m in laid[:8]:
+    for m in laid[:4]:
         exact = oracle.ExactRoad(m.strips, *m.sides)
         poses = [np.column_stack([p, headings(p)]) for p in map(m.lanes.lane, range(len(m.lanes)))]
         assert exact.outline_on_road(np.concatenate(poses), 2.0, 1.0).all()
