@@ -45,6 +45,7 @@ CLOCK = 19  # control steps until it thinks of another lane
 FIELDS = 20
 
 _THINKING = _F(10.0)  # control steps from one thought of another lane to the next
+_LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
 _CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
 _CROSSING_TIME = _F(4.0)  # s, what it takes to leave a junction
@@ -691,7 +692,7 @@ def flow(network, drivers, world, ego):
                 if _may_enter(network, drivers, world, i, ego):
                     car[PERMIT] = car[NEXT]
                 else:
-                    pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - _HALF, _ZERO))
+                    pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - _LINE, _ZERO))
         car[PACE] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:

@@ -1,0 +1,94 @@
+"""The generation loop among traffic: what it remembers of crashes survives a checkpoint, and changes nothing."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cluster.checkpoint import CheckpointError, load, save
+from cluster.coordinator import Evolution, Maps
+from cluster.pool import SerialPool
+from cluster.settings import EvolveSettings
+from gridsim.config import SimConfig
+from gridsim.traffic import FIELDS, LANE
+
+SETTINGS = EvolveSettings(traffic=3, population=32, generations=2, elites=2, parents=8, seed=9)
+
+
+@pytest.fixture(scope="module")
+def maps():
+    maps = Maps(SETTINGS.scenario, SimConfig())
+    yield maps
+    maps.close()
+
+
+def begin(maps, settings=SETTINGS):
+    """A run with a short validation."""
+    evolution = Evolution(settings, SerialPool(maps.build), maps)
+    curriculum = evolution.curriculum
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4, contenders=2)
+    return evolution
+
+
+def go_on(evolution):
+    """One generation more, at a second each."""
+    evolution.timed(evolution.step(), float(evolution.generation), None)
+
+
+@pytest.fixture(scope="module")
+def halfway(maps, tmp_path_factory):
+    """The file of a run after the first of two generations."""
+    evolution = begin(maps)
+    go_on(evolution)
+    path = tmp_path_factory.mktemp("run") / "checkpoint.npz"
+    save(path, *evolution.state())
+    return path
+
+
+def test_a_run_among_traffic_goes_on_exactly(maps, halfway):
+    straight = begin(maps)
+    go_on(straight)
+    go_on(straight)
+    resumed = begin(maps)
+    resumed.restore(*load(halfway))
+    go_on(resumed)
+    assert straight.champion is not None
+    assert resumed.champion is not None
+    assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
+    assert resumed.champion.score == straight.champion.score
+    arrays, meta = straight.state()
+    again, same = resumed.state()
+    assert same == meta
+    for name, array in arrays.items():
+        assert again[name].tobytes() == array.tobytes()
+
+
+def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
+    arrays, _ = load(halfway)
+    worlds = arrays["crash_worlds"]
+    assert len(worlds) == len(arrays["crashes"]) > 0
+    assert worlds.shape[1:] == (3, FIELDS)
+    assert (worlds[..., LANE] >= 0).any()
+    evolution = begin(maps)
+    evolution.restore(*load(halfway))
+    episodes = evolution.curriculum.episodes(1)
+    starts = evolution.curriculum.config.crash_starts
+    remembered = {world.tobytes() for world in worlds}
+    assert all(world.tobytes() in remembered for world in episodes.worlds[-starts:])
+    assert len(episodes.worlds) == len(episodes.rows)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda w: w[:-1], lambda w: w[:, :2], lambda w: w[..., :-1], lambda w: w.astype(np.float64), lambda w: w[0]],
+)
+def test_crash_worlds_that_do_not_fit_are_refused(maps, halfway, spoil):
+    arrays, meta = load(halfway)
+    arrays["crash_worlds"] = spoil(arrays["crash_worlds"])
+    with pytest.raises(CheckpointError, match="does not belong to this run"):
+        begin(maps).restore(arrays, meta)
+
+
+def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):
+    with pytest.raises(CheckpointError, match="does not belong to this run"):
+        begin(maps, dataclasses.replace(SETTINGS, traffic=4)).restore(*load(halfway))
