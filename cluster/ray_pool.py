@@ -56,9 +56,9 @@ MANY = 256  # members, from which on a call tells what members cost
 WORTH_SENDING_S = 0.01  # of evaluation: ten times what it costs to send a chunk and to take in its results
 MAX_KILLS = 3  # workers that one chunk may cost
 MAX_FAILED_STARTS = 3  # in a row
-STORE_BYTES = 384 << 20  # of shared memory, taken page by page as it is used
+STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used
 LEAST_STORE_BYTES = 80 << 20  # Ray takes no less than 75 MiB
-MAP_BYTES = 240 << 20  # of maps that are kept in the object store
+MAP_BYTES = 512 << 20  # of maps kept there: those of training and validation, or they are sent every generation
 
 # Read when Ray is imported.
 _ENVIRONMENT = {
