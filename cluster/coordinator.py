@@ -7,10 +7,11 @@ the workers return; nothing follows from the clock or from who returned it.
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from cluster.checkpoint import CheckpointError
-from cluster.pool import Outcome, WorkerPool
+from cluster.pool import Chunk, Outcome, WorkerPool
 from cluster.settings import EvolveSettings
 from cluster.worker import Task
 from evolution import fitness
@@ -39,6 +40,7 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of history.csv after `generation`; the names that MLflow has them under."""
 
+TRIED_KEPT = 256  # members that are not validated again
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 
 
@@ -99,6 +101,39 @@ class Champion:
 
 
 @dataclass
+class Trials:
+    """Members that are being validated, beside the evaluation of the generation that comes next.
+
+    Those of `first` are on validation's first stage; the best of them is then `last`, and is judged by the episodes of
+    the second stage alone, since it was chosen on the first.
+
+    Attributes:
+        first: genomes float32 [k, genes].
+        first_generation: the one that they come from.
+        last: genomes float32 [0 or 1, genes].
+        last_generation: the one that it comes from.
+        tried: uint64 [n], digests of whom the first stage has seen lately.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    first_generation: int = -1
+    last_generation: int = -1
+    tried: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
+
+    def __len__(self) -> int:
+        return len(self.first) + len(self.last)
+
+    def enter(self, genomes: np.ndarray, generation: int) -> None:
+        """Let those of [k, genes] try who did not lately."""
+        digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
+        new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]
+        self.first, self.first_generation = genomes[new], generation
+        entered = np.array([digests[k] for k in new], dtype=np.uint64)
+        self.tried = np.concatenate([self.tried, entered])[-TRIED_KEPT:]
+
+
+@dataclass
 class Evolution:
     """One run of the genetic algorithm, between pool and files.
 
@@ -121,6 +156,7 @@ class Evolution:
     wall_before_s: float = 0.0
     started: float = 0.0  # time.perf_counter() of this process's start
     on_progress: Callable[[str, int, int], None] | None = None
+    meanwhile: Callable[[], None] | None = None  # called in each generation when the workers are busy
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -144,6 +180,8 @@ class Evolution:
         )
         if self.initial is not None:
             self.genetic.seed_with(self.initial)
+        none = np.zeros((0, self.spec.size), dtype=np.float32)
+        self.trials = Trials(none, none)
         self.outcomes: list[Outcome] = []  # of the last generation, for statistics
 
     # ------------------------------------------------------------------------------------------------- evaluating
@@ -162,7 +200,7 @@ class Evolution:
 
     def _evaluate(
         self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, episodes: Episodes, limits: Limits,
-        rewind: int = 0,
+        rewind: int = 0, asked: Sequence[Chunk] | None = None, meanwhile: Callable[[], None] | None = None,
     ) -> np.ndarray:  # fmt: skip
         task = Task(
             policy=self.settings.policy,
@@ -177,16 +215,15 @@ class Evolution:
             rewind=rewind,
         )
         progress = self.on_progress
-        outcome = self.pool.evaluate(task, recipes, (lambda k, n: progress(stage, k, n)) if progress else None)
+        tell = (lambda k, n: progress(stage, k, n)) if progress else None
+        outcome = self.pool.evaluate(task, recipes, tell, asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
         return outcome.results
 
     def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, rewind: int = 0) -> np.ndarray:
         """Results RESULT [n, e] of given genomes [n, genes]: recipes that are plain copies."""
-        recipes = np.zeros(len(genomes), dtype=RECIPE)
-        recipes["a"] = recipes["b"] = np.arange(len(genomes))
-        return self._evaluate(stage, genomes, recipes, 0, episodes, limits, rewind)
+        return self._evaluate(stage, genomes, copies(len(genomes)), 0, episodes, limits, rewind)
 
     # ------------------------------------------------------------------------------------------------ a generation
 
@@ -211,9 +248,8 @@ class Evolution:
         self.outcomes.clear()
         generation, limits = self.generation, curriculum.limits()
         episodes = curriculum.episodes(generation)
-        recipes, key = self.genetic.ask(self._mutation())
         self.maps.ahead(curriculum.map_seeds[: generation + 4])
-        results = self._evaluate("evolve", self.genetic.parents, recipes, key, episodes, limits)
+        results = self._evaluate_all(episodes, limits)
         goals = targets(episodes.rows, limits)
         score = self._score(results, goals)
         rank = fitness.pareto(fitness.elements(results, goals)) if s.ranking == "pareto" else score
@@ -235,8 +271,11 @@ class Evolution:
         if self.champion is not None:
             self.genetic.readmit(self.champion.genome)
 
-        if limits.target >= curriculum.config.validation_target or self._is_last(generation):
-            self._validate(racers[order[: curriculum.config.contenders]])
+        last = self._is_last(generation)
+        if limits.target >= curriculum.config.validation_target or last:
+            self.trials.enter(racers[order[: curriculum.config.contenders]], generation)
+        while last and len(self.trials):
+            self._validate()
         self.elites.append(racers[order[0]])
         top = order[0]
         seconds = results["steps"] * self.sim.episode.control_period
@@ -257,23 +296,70 @@ class Evolution:
         self.history.append(row)
         return row
 
-    def _validate(self, contenders: np.ndarray) -> None:
-        """Find out whether one of [n, genes] beats the champion; only who passes a first stage is tried whole."""
-        episodes = self.curriculum.validation()
-        limits = self.curriculum.goal_limits()
-        first = self.curriculum.config.first_validation
-        trial = self.drive("validate", contenders, episodes.part(0, first), limits)
-        score = self.curriculum.validation_score(trial)
-        k = int(np.lexsort((trial["distance"].mean(axis=1), score))[-1])
-        if self.champion is not None and score[k] < self.champion.score - 0.02:
-            return
-        rest = self.drive("validate", contenders[k : k + 1], episodes.part(first), limits)
-        whole = np.concatenate([trial[k : k + 1], rest], axis=1)
-        total, distance = float(self.curriculum.validation_score(whole)[0]), float(whole["distance"].mean())
-        if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
-            rate = float(success_rate(whole)[0])
-            self.champion = Champion(contenders[k].copy(), total, rate, distance, self.generation - 1)
-        self.solved = self.champion.score >= self.settings.until
+    def _evaluate_all(self, episodes: Episodes, limits: Limits) -> np.ndarray:
+        """Results RESULT [population, e] of a generation; who is on trial drives beside it."""
+        recipes, key = self.genetic.ask(self._mutation())
+        parents, n, e = self.genetic.parents, len(recipes), len(episodes.rows)
+        if not len(self.trials):
+            return self._evaluate("evolve", parents, recipes, key, episodes, limits, meanwhile=self.meanwhile)
+        trial, asked = self._trial()
+        both = episodes.and_then(trial)
+        asked = [
+            Chunk(slice(n + rows.start, n + rows.stop), slice(e + columns.start, e + columns.stop))
+            for rows, columns in asked
+        ]
+        results = self._evaluate(
+            "evolve",
+            np.concatenate([parents, self.trials.first, self.trials.last]),
+            np.concatenate([recipes, copies(len(self.trials), len(parents))]),
+            key,
+            both,
+            limits,
+            asked=[*asked, Chunk(slice(0, n), slice(0, e))],  # the longest first
+            meanwhile=self.meanwhile,
+        )
+        self._judge(results[n:, e:])
+        return results[:n, :e]
+
+    def _trial(self) -> tuple[Episodes, list[Chunk]]:
+        """Validation's episodes, and who of `trials` drives which of them."""
+        episodes = self.curriculum.validation().within(self.curriculum.goal_limits())
+        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
+        parts = [
+            Chunk(slice(k, len(self.trials)), slice(stage, len(episodes.rows))),
+            Chunk(slice(0, k), slice(0, stage)),
+        ]
+        return episodes, [part for part in parts if part.rows.stop > part.rows.start]
+
+    def _validate(self) -> None:
+        """Go on with the trials, with nothing beside them."""
+        episodes, asked = self._trial()
+        genomes = np.concatenate([self.trials.first, self.trials.last])
+        recipes, limits = copies(len(genomes)), self.curriculum.goal_limits()
+        self._judge(self._evaluate("validate", genomes, recipes, 0, episodes, limits, asked=asked))
+
+    def _judge(self, results: np.ndarray) -> None:
+        """Find out whether `trials.last` beats the champion, and who of `trials.first` is tried next.
+
+        Args: RESULT [members, validation], zero where a member's stage has no such episode.
+        """
+        trials, score = self.trials, self.curriculum.validation_score
+        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
+        if len(trials.last):
+            whole = results[k:, stage:]
+            total, distance = float(score(whole)[0]), float(whole["distance"].mean())
+            if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
+                rate = float(success_rate(whole)[0])
+                self.champion = Champion(trials.last[0].copy(), total, rate, distance, trials.last_generation)
+            self.solved = self.champion.score >= self.settings.until
+        trials.last = trials.first[:0]
+        if k:
+            first = results[:k, :stage]
+            scores = score(first)
+            best = int(np.lexsort((first["distance"].mean(axis=1), scores))[-1])
+            if self.champion is None or scores[best] >= self.champion.score - 0.02:
+                trials.last, trials.last_generation = trials.first[best : best + 1], trials.first_generation
+        trials.first = trials.first[:0]
 
     def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
         """Add the wall clock's columns to a row."""
@@ -305,6 +391,9 @@ class Evolution:
             "crash_worlds": self.curriculum.crash_worlds,
             "history": np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS)),
             "elites": np.array(self.elites, dtype=np.float32).reshape(-1, genes),
+            "trials_first": self.trials.first,
+            "trials_last": self.trials.last,
+            "trials_tried": self.trials.tried,
             "champion": champion.genome if champion else np.zeros(0, dtype=np.float32),
         }
         meta = {
@@ -314,6 +403,7 @@ class Evolution:
             "car_steps": self.car_steps,
             "solved": self.solved,
             "columns": list(COLUMNS),
+            "trials": [self.trials.first_generation, self.trials.last_generation],
             "champion": [champion.score, champion.success_rate, champion.distance_m, champion.generation]
             if champion
             else [],
@@ -326,6 +416,7 @@ class Evolution:
         try:
             history, parents, elites = arrays["history"], arrays["parents"], arrays["elites"]
             generation, crashes, worlds = int(meta["generation"]), arrays["crashes"], arrays["crash_worlds"]
+            first, last, tried = arrays["trials_first"], arrays["trials_last"], arrays["trials_tried"]
             fits = (
                 meta["columns"] == list(COLUMNS)
                 and history.shape == (generation, len(COLUMNS))
@@ -340,6 +431,10 @@ class Evolution:
                 and worlds.dtype == np.float32
                 and 0 <= int(meta["elite_rows"]) <= len(parents)
                 and arrays["champion"].size in (0, genes)
+                and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
+                and len(last) <= 1
+                and tried.ndim == 1
+                and tried.dtype == np.uint64
             )
             if not fits or not np.isfinite(history).all() or not 0.0 < float(meta["target_m"]) <= self.curriculum.goal:
                 raise ValueError("its parts do not fit each other")
@@ -350,6 +445,8 @@ class Evolution:
             self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
             self.history = [dict(zip(COLUMNS, row.tolist(), strict=True)) for row in history]
             self.elites = list(elites)
+            first_generation, last_generation = (int(k) for k in meta["trials"])
+            self.trials = Trials(first, last, first_generation, last_generation, tried)
             if meta["champion"]:
                 score, rate, distance, found = meta["champion"]
                 self.champion = Champion(arrays["champion"], float(score), float(rate), float(distance), int(found))
@@ -365,6 +462,13 @@ class Evolution:
         for k, row in enumerate(self.history):
             writer.writerow([k, *(repr(row[name]) for name in COLUMNS)])
         return text.getvalue().encode()
+
+
+def copies(n: int, first: int = 0) -> np.ndarray:
+    """Recipes [n] that are plain copies of the parents from `first` on."""
+    recipes = np.zeros(n, dtype=RECIPE)
+    recipes["a"] = recipes["b"] = np.arange(first, first + n)
+    return recipes
 
 
 def held_out_episodes(maps: Maps, traffic: int) -> Episodes:

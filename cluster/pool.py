@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from cluster.worker import Task, Worker
+from evolution.rollout import targets
 from gridsim.roads import freeze
 from gridsim.scenarios import Scenario
 
 BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
 Progress = Callable[[int, int], None]  # (members done, members in all)
 
-SHARES = 5  # chunks for each worker, at least, where there is enough to do
-SMALLEST_CHUNK = 4  # members
+METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it is known better
+WORTH_SENDING_S = 0.004  # of evaluation: several times what it costs to send a chunk and to take in its results
 
 
 class PoolError(Exception):
@@ -26,7 +26,7 @@ class PoolError(Exception):
 
 
 class Chunk(NamedTuple):
-    """What is sent to a worker at once: some members, on some of the task's episodes."""
+    """Some members, on some of the task's episodes: what is asked for, and what is sent to a worker at once."""
 
     rows: slice
     columns: slice
@@ -37,7 +37,8 @@ class Outcome:
     """What one call of `evaluate` brought.
 
     Attributes:
-        results: `task.row` [members, episodes], in the order of the recipes.
+        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
+        asked: episodes of members that were asked for.
         wall_s: seconds from call to return.
         busy_s: seconds that each worker (by its number) was evaluating. A replaced worker's number goes on counting.
         retries: chunks that were sent again because their worker died.
@@ -47,6 +48,7 @@ class Outcome:
     """
 
     results: np.ndarray
+    asked: int
     wall_s: float = 0.0
     busy_s: dict[int, float] = field(default_factory=dict)
     retries: int = 0
@@ -57,11 +59,11 @@ class Outcome:
 
     def members(self) -> int:
         """Members that are done, counting the parts of those that are done in part."""
-        return len(self.results) * self._done // self.results.size if self.results.size else 0
+        return len(self.results) * self._done // self.asked if self.asked else 0
 
     def whole(self) -> bool:
         """Whether every result is there."""
-        return self._done >= self.results.size
+        return self._done >= self.asked
 
     def add(self, worker: int, chunk: Chunk, results: np.ndarray, seconds: float) -> None:
         """Take in a chunk's results [rows, columns] and the time that they took."""
@@ -76,8 +78,22 @@ class WorkerPool(Protocol):
     def workers(self) -> int:
         """Workers that are up now."""
 
-    def evaluate(self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None) -> Outcome:
-        """Breed and drive recipes RECIPE [n]. Raises PoolError where that cannot be done."""
+    def evaluate(
+        self,
+        task: Task,
+        recipes: np.ndarray,
+        on_progress: Progress | None = None,
+        asked: Sequence[Chunk] | None = None,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> Outcome:
+        """Breed recipes RECIPE [n] and drive them through the task's episodes.
+
+        Args:
+            asked: who is to drive what, the most promising first; None is all members on all episodes.
+            meanwhile: called once, when the workers are busy.
+
+        Raises: PoolError where that cannot be done.
+        """
 
     def close(self) -> None:
         """Stop all that the pool started. May be called again, and at any moment."""
@@ -93,12 +109,22 @@ class SerialPool:
     def workers(self) -> int:
         return 1
 
-    def evaluate(self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None) -> Outcome:
+    def evaluate(
+        self,
+        task: Task,
+        recipes: np.ndarray,
+        on_progress: Progress | None = None,
+        asked: Sequence[Chunk] | None = None,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> Outcome:
         started = time.perf_counter()
         recipes = freeze(recipes)
-        outcome = new_outcome(task, recipes)
+        asked = everything(task, recipes) if asked is None else asked
+        outcome = new_outcome(task, recipes, asked)
         maps = [self._build_map(*name) for name in task.maps]
-        for index, chunk in enumerate(cut(len(recipes), len(task.episodes), 1)):
+        if meanwhile:
+            meanwhile()
+        for index, chunk in enumerate(cut(task, asked, 1)):
             try:
                 part = of_episodes(task, chunk.columns.start, chunk.columns.stop)
                 outcome.add(0, chunk, *self._worker.evaluate(part, maps, recipes[chunk.rows]))
@@ -113,40 +139,56 @@ class SerialPool:
         pass
 
 
-def new_outcome(task: Task, recipes: np.ndarray) -> Outcome:
+def everything(task: Task, recipes: np.ndarray) -> list[Chunk]:
+    """All members on all episodes."""
+    return [Chunk(slice(0, len(recipes)), slice(0, len(task.episodes)))]
+
+
+def size(chunk: Chunk) -> int:
+    """Episodes of members in a chunk."""
+    return (chunk.rows.stop - chunk.rows.start) * (chunk.columns.stop - chunk.columns.start)
+
+
+def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outcome:
     """An outcome to be filled, its results all zero."""
-    return Outcome(np.zeros((len(recipes), len(task.episodes)), dtype=task.row))
+    results = np.zeros((len(recipes), len(task.episodes)), dtype=task.row)
+    return Outcome(results, sum(size(chunk) for chunk in asked))
 
 
-def chunks(n: int, workers: int, smallest: int = SMALLEST_CHUNK) -> list[slice]:
-    """Cut n members into chunks, about 8 for each worker at 512 members: large ones first, small ones last.
+def metres(task: Task, chunk: Chunk) -> float:
+    """How far the members of a chunk drive if all of them reach their targets."""
+    return float(targets(task.episodes[chunk.columns], task.limits).sum()) * (chunk.rows.stop - chunk.rows.start)
+
+
+def cut(task: Task, asked: Sequence[Chunk], workers: int, metre_s: float = METRE_S) -> list[Chunk]:
+    """Cut what is asked for into chunks, by the metres to be driven: large ones first, small ones last.
 
     Each takes half of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
-    little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). Depends on the arguments alone.
+    little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one's
+    episodes where that is enough, so that every worker has its share even of one member. Depends on the arguments
+    alone, and no result depends on it.
     """
-    cut: list[slice] = []
-    at = 0
-    while at < n:
-        size = max((n - at) // (2 * workers), smallest)
-        cut.append(slice(at, min(at + size, n)))
-        at += size
-    return cut
-
-
-def cut(n: int, episodes: int, workers: int, smallest: int = SMALLEST_CHUNK) -> list[Chunk]:
-    """Cut n members on so many episodes into chunks. Depends on the arguments alone.
-
-    Many members are cut into groups that drive all episodes; few, as in a race or in validation, one by one and
-    across the episodes as well, so that every worker has its share even of one member.
-    """
-    wanted = SHARES * workers
-    if n >= wanted * smallest:
-        return [Chunk(rows, slice(0, episodes)) for rows in chunks(n, workers, smallest)]
-    size = max(n // wanted, 1)
-    rows_of = [slice(at, min(at + size, n)) for at in range(0, n, size)]
-    parts = min(-(-wanted // max(len(rows_of), 1)), episodes)
-    edges = [episodes * k // parts for k in range(parts + 1)] if parts else []
-    return [Chunk(rows, slice(a, b)) for rows in rows_of for a, b in itertools.pairwise(edges)]
+    chunks: list[Chunk] = []
+    left = sum(metres(task, block) for block in asked)
+    least = min(WORTH_SENDING_S / metre_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    goals = targets(task.episodes, task.limits)
+    for rows, columns in asked:
+        mileage = np.concatenate([[0.0], np.cumsum(goals[columns])])  # m, of one member
+        row, column = rows.start, 0
+        while row < rows.stop and columns.stop > columns.start:
+            share = max(left / (2 * workers), least)
+            if column == 0 and share >= mileage[-1]:
+                stop = min(row + int(share / mileage[-1]), rows.stop)
+                chunks.append(Chunk(slice(row, stop), columns))
+                left -= (stop - row) * mileage[-1]
+                row = stop
+            else:
+                stop = int(np.searchsorted(mileage, mileage[column] + share, side="right")) - 1
+                stop = min(max(stop, column + 1), len(mileage) - 1)
+                chunks.append(Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)))
+                left -= mileage[stop] - mileage[column]
+                row, column = (row + 1, 0) if stop == len(mileage) - 1 else (row, stop)
+    return chunks
 
 
 def of_episodes(task: Task, first: int, stop: int) -> Task:

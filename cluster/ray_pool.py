@@ -24,7 +24,7 @@ import socket
 import threading
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -33,27 +33,29 @@ from typing import Any
 import numpy as np
 
 from cluster.pool import (
-    SMALLEST_CHUNK,
+    METRE_S,
     BuildMap,
+    Chunk,
     Outcome,
     PoolError,
     Progress,
     cut,
     describe,
+    everything,
     last_line,
+    metres,
     new_outcome,
     of_episodes,
 )
 from cluster.worker import Task, Worker
 from evolution.breeding import RECIPE
+from evolution.rollout import Limits
 from gridsim.roads import freeze
 from gridsim.scenarios import Scenario
 
 PROBE_S = 3.0
 CONNECT_S = 60.0
 QUEUE = 2  # chunks that a worker holds: one that it works on, one so that it need not wait for us
-MANY = 256  # members, from which on a call tells what members cost
-WORTH_SENDING_S = 0.01  # of evaluation: ten times what it costs to send a chunk and to take in its results
 MAX_KILLS = 3  # workers that one chunk may cost
 MAX_FAILED_STARTS = 3  # in a row
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used
@@ -78,8 +80,10 @@ _TOKEN = secrets.token_hex(32)
 _AUTH_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
-#: What a worker needs to take up a task: references to it and to its maps, and the maps that the object store holds.
-_News = tuple[Any, list[Any], set[tuple[str, int]]]
+_Name = tuple[str, int]  # of a map: scenario and seed
+
+#: What a worker needs to take up a task: references to it and to the maps that it lacks, and maps to be forgotten.
+_News = tuple[Any, dict[_Name, Any], list[_Name]]
 
 
 class _Actor:
@@ -92,7 +96,7 @@ class _Actor:
         self._worker = factory()
         self._serial = 0
         self._task: Task | None = None
-        self._maps: dict[tuple[str, int], Scenario] = {}
+        self._maps: dict[_Name, Scenario] = {}
 
     def hello(self) -> int:
         return os.getpid()
@@ -100,8 +104,7 @@ class _Actor:
     def run(self, serial: int, recipes: bytes, first: int, stop: int, news: _News | None) -> bytes:
         """A chunk's seconds as float64, then its results [n, episodes], as bytes: a fifth of what pickled arrays take.
 
-        `first` and `stop` say which of the task's episodes; `news` holds references to the task and its maps, for a
-        worker that does not have them yet.
+        `first` and `stop` say which of the task's episodes; `news` is for a worker that does not have the task yet.
         """
         if news:
             self._take_up(serial, *news)
@@ -112,17 +115,18 @@ class _Actor:
         results, seconds = self._worker.evaluate(part, maps, np.frombuffer(recipes, RECIPE))
         return np.float64(seconds).tobytes() + results.tobytes()
 
-    def _take_up(self, serial: int, task_ref: Any, map_refs: list[Any], held: set[tuple[str, int]]) -> None:
+    def _take_up(self, serial: int, task_ref: Any, map_refs: dict[_Name, Any], gone: list[_Name]) -> None:
         import ray
 
         self._task = None
-        task: Task = ray.get(task_ref)
-        for name, ref in zip(task.maps, map_refs, strict=True):
+        for name, ref in map_refs.items():
             if name not in self._maps:
                 self._maps[name] = Scenario.from_arrays(ray.get(ref))
         # A map in use stays in the object store: those that the coordinator has let go are let go here.
-        self._maps = {name: scenario for name, scenario in self._maps.items() if name in held}
-        self._serial, self._task = serial, task
+        for name in gone:
+            self._maps.pop(name, None)
+        self._task = ray.get(task_ref)
+        self._serial = serial
 
 
 @dataclass
@@ -134,6 +138,7 @@ class _Slot:
     hello: Any  # the answer that says it is up; None once it is
     pid: int = 0
     serial: int = 0  # of the last task that it was told of
+    maps: set[_Name] = field(default_factory=set)  # that it was told of
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (chunk, answer), oldest first
 
 
@@ -168,11 +173,11 @@ class RayPool:
         self._factory = worker_factory
         self._start_timeout_s = start_timeout_s or (60.0 if address is None else 300.0)
         self._slots: list[_Slot] = []
-        self._maps: OrderedDict[tuple[str, int], tuple[Any, int]] = OrderedDict()  # references and bytes
+        self._maps: OrderedDict[_Name, tuple[Any, int]] = OrderedDict()  # references and bytes
         self._map_bytes = MAP_BYTES
         self._serial = 0
         self._failed_starts = 0
-        self._smallest = SMALLEST_CHUNK
+        self._metre_s: dict[Limits, float] = {}  # what a metre of such tasks took the last time
         self._session: str | None = None  # folder of our own Ray's logs
         self._failure: BaseException | None = None
         self._connected = self._troubled = False
@@ -187,21 +192,29 @@ class RayPool:
         """Process ids of the workers that are up, on whichever machine they are."""
         return [slot.pid for slot in self._slots if slot.pid]
 
-    def evaluate(self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None) -> Outcome:
+    def evaluate(
+        self,
+        task: Task,
+        recipes: np.ndarray,
+        on_progress: Progress | None = None,
+        asked: Sequence[Chunk] | None = None,
+        meanwhile: Callable[[], None] | None = None,
+    ) -> Outcome:
         import ray
 
         started = time.perf_counter()
         self._wait_for_ray()
         recipes = freeze(recipes)
-        outcome = new_outcome(task, recipes)
-        parts = cut(len(recipes), len(task.episodes), self._asked, self._smallest)
+        asked = everything(task, recipes) if asked is None else asked
+        outcome = new_outcome(task, recipes, asked)
+        parts = cut(task, asked, self._asked, self._metre_s.get(task.limits, METRE_S))
         todo = deque(range(len(parts)))
         kills: Counter[int] = Counter()
         suspects: set[int] = set()
         self._serial += 1
         for slot in self._slots:
             slot.sent.clear()  # left over where the last call was interrupted
-        news = self._broadcast(task, outcome)
+        task_ref = self._broadcast(task, outcome)
         nobody_since = time.monotonic()
 
         while not outcome.whole():
@@ -209,11 +222,14 @@ class RayPool:
                 chunk = todo.popleft()
                 rows, columns = parts[chunk]
                 raw = recipes[rows].tobytes()
-                what = None if slot.serial == self._serial else news
+                what = None if slot.serial == self._serial else self._news(slot, task, task_ref)
                 answer = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, what)
                 slot.sent.append((chunk, answer))
                 slot.serial = self._serial
                 outcome.bytes_down += len(raw)
+            if meanwhile and self.pids():
+                meanwhile()
+                meanwhile = None
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
             for ref in ray.wait(list(waiting), num_returns=1, timeout=1.0)[0]:
                 slot = waiting[ref]
@@ -250,11 +266,11 @@ class RayPool:
                 nobody_since = time.monotonic()
             elif time.monotonic() - nobody_since > self._start_timeout_s:
                 raise PoolError(f"no worker came up within {self._start_timeout_s:g} s: {_capacity()}")
-        if (
-            len(recipes) >= MANY
-        ):  # where members are cheap, sending many small chunks costs more than waiting for a larger one
-            member_s = sum(outcome.busy_s.values()) / len(recipes)
-            self._smallest = int(np.clip(WORTH_SENDING_S / max(member_s, 1e-9), SMALLEST_CHUNK, 8 * SMALLEST_CHUNK))
+        if meanwhile:  # there was nothing to do
+            meanwhile()
+        if outcome.asked:
+            driven = sum(metres(task, block) for block in asked)
+            self._metre_s[task.limits] = max(sum(outcome.busy_s.values()) / driven, 1e-9)
         outcome.wall_s = time.perf_counter() - started
         return outcome
 
@@ -357,8 +373,8 @@ class RayPool:
             if len(todo) > len(up) and 0 < len(slot.sent) < QUEUE and suspects.isdisjoint([todo[0], slot.sent[0][0]]):
                 yield slot
 
-    def _broadcast(self, task: Task, outcome: Outcome) -> _News:
-        """Put the task, and those of its maps that are not there yet, into the object store."""
+    def _broadcast(self, task: Task, outcome: Outcome) -> Any:
+        """Put the task, and those of its maps that are not there yet, into the object store; returns its reference."""
         import ray
 
         buffers: list[pickle.PickleBuffer] = []
@@ -374,7 +390,15 @@ class RayPool:
         used = sum(size for _, size in self._maps.values())
         while used > self._map_bytes and len(self._maps) > len(set(task.maps)):
             used -= self._maps.popitem(last=False)[1][1]
-        return ray.put(task), [self._maps[name][0] for name in task.maps], set(self._maps)
+        return ray.put(task)
+
+    def _news(self, slot: _Slot, task: Task, task_ref: Any) -> _News:
+        """What a worker needs to take up a task; from then on it has that."""
+        gone = [name for name in slot.maps if name not in self._maps]
+        refs = {name: self._maps[name][0] for name in task.maps if name not in slot.maps}
+        slot.maps.difference_update(gone)
+        slot.maps.update(refs)
+        return task_ref, refs, gone
 
 
 def check_address(address: str) -> str:

@@ -1,8 +1,8 @@
 """A run's folder and its life: prepare or resume, evolve, save after every generation, close.
 
 The order of saving, after each generation: the checkpoint (which holds the history), history.csv made from it, the
-MLflow row. Whatever kills the process, the folder holds the last whole generation, and a resumed run gives the same
-champion.
+MLflow row. It is saved while the workers are busy with the next one. Whatever kills the process, the folder holds a
+whole generation, the last or the one before, and a resumed run gives the same champion.
 """
 
 from __future__ import annotations
@@ -204,6 +204,7 @@ class Session:
     on_progress: Callable[[str, int, int], None] | None = None
     lost: str = ""
     evolution: Evolution = field(init=False)
+    _unsaved: bool = False  # whether the last generation is in memory alone
 
     def __post_init__(self) -> None:
         self.evolution = Evolution(self.run.settings, self.pool, self.maps, self.initial, on_progress=self.on_progress)
@@ -215,14 +216,29 @@ class Session:
         evolution = self.evolution
         for step, past in enumerate(evolution.history):
             self._log(step, past)  # what MLflow has is skipped
-        while not evolution.done():
-            row = evolution.step()
-            wall = evolution.wall_before_s + now() - self.process_started
-            evolution.timed(row, wall, evolution.history[-2] if len(evolution.history) > 1 else None)
+        evolution.meanwhile = self._save_last
+        try:
+            while not evolution.done():
+                row = evolution.step()
+                wall = evolution.wall_before_s + now() - self.process_started
+                evolution.timed(row, wall, evolution.history[-2] if len(evolution.history) > 1 else None)
+                self._unsaved = True
+                if self.on_row:
+                    self.on_row(evolution.generation, row)
+        except CheckpointError:
+            raise
+        except BaseException:
+            self._save_last()  # the state is whole until the next generation's results are there
+            raise
+        self._save_last()
+
+    def _save_last(self) -> None:
+        """Save and log the last generation, if that was not done."""
+        if self._unsaved:
+            evolution = self.evolution
             self.save()
-            self._log(evolution.generation - 1, row)
-            if self.on_row:
-                self.on_row(evolution.generation, row)
+            self._unsaved = False
+            self._log(evolution.generation - 1, evolution.history[-1])
 
     def _log(self, step: int, row: dict[str, float]) -> None:
         self.tracker.log_row(step, {name: row[name] for name in METRICS})

@@ -19,7 +19,7 @@ from gridsim.roads import freeze
 #: Parents' rows and the child's seed. Seed 0 with a == b is an unmodified copy; a == FRESH is a new random genome.
 RECIPE = np.dtype([("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
 FRESH = 65_535
-MAX_PARENTS = 65_535
+MAX_PARENTS = 65_500  # some rows are left for copies of others
 
 _F, _U = np.float32, np.uint64
 _UNIT24 = _F(1.0 / (1 << 24))

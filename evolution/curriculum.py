@@ -79,6 +79,7 @@ class Curriculum:
         self.goal_steps = round(time_s / period_s)
         self.target = min(config.first_target, target_m)
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), traffic)
+        self._validation: Episodes | None = None
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
         self.map_seeds = [
             int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
@@ -165,7 +166,11 @@ class Curriculum:
 
     def validation(self) -> Episodes:
         """What champions are chosen on, the same for every run of the scenario."""
-        return spread_starts(self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation, self.traffic)
+        if self._validation is None:
+            self._validation = spread_starts(
+                self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation, self.traffic
+            )
+        return self._validation
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:
         """How good members are, in [0, 1], by results [n, e] of validation: success, worth less below the pace."""

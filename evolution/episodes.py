@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.rollout import EPISODE, no_traffic
+from evolution.rollout import EPISODE, Limits, no_traffic
 from gridsim.config import TrafficConfig
 from gridsim.scenarios import Scenario, sample_starts
 from gridsim.traffic import FIELDS, spawn
@@ -23,6 +23,23 @@ class Episodes(NamedTuple):
     def part(self, first: int, stop: int | None = None) -> Episodes:
         """Some of them."""
         return Episodes(self.maps, self.rows[first:stop], self.worlds[first:stop])
+
+    def within(self, limits: Limits) -> Episodes:
+        """The same, each with its own target and limit: these where it had none."""
+        rows = self.rows.copy()
+        rows["target"] = np.where(rows["target"] > 0, rows["target"], limits.target)
+        rows["steps"] = np.where(rows["steps"] > 0, rows["steps"], limits.steps)
+        return Episodes(self.maps, rows, self.worlds)
+
+    def and_then(self, others: Episodes) -> Episodes:
+        """These and others after them, which have as many cars around."""
+        rows = others.rows.copy()
+        rows["map"] += len(self.maps)
+        return Episodes(
+            self.maps + others.maps,
+            np.concatenate([self.rows, rows]),
+            np.concatenate([self.worlds, others.worlds]),
+        )
 
 
 def lane_starts(

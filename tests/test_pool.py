@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.pool import SMALLEST_CHUNK, PoolError, SerialPool, chunks, cut, last_line
+from cluster.pool import METRE_S, WORTH_SENDING_S, Chunk, PoolError, SerialPool, cut, everything, last_line, metres
 from cluster.worker import Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.episodes import lane_starts
@@ -83,40 +83,45 @@ def drive_task() -> tuple[Task, list[Scenario]]:
     return make_task(MAPS, episodes), scenarios
 
 
-@given(st.integers(0, 3000), st.integers(1, 64))
-def test_chunks_cover_all_members_once(n: int, workers: int) -> None:
-    cut = chunks(n, workers)
-    assert [i for rows in cut for i in range(n)[rows]] == list(range(n))
-    sizes = [rows.stop - rows.start for rows in cut]
-    assert sizes == sorted(sizes, reverse=True)
-    assert all(size >= SMALLEST_CHUNK for size in sizes[:-1])
+def goals(*metres: float) -> np.ndarray:
+    """Episodes with these targets (m)."""
+    episodes = np.zeros(len(metres), dtype=EPISODE)
+    episodes["target"] = metres
+    return episodes
+
+
+@given(st.integers(0, 900), st.lists(st.floats(1.0, 2000.0), min_size=1, max_size=60), st.integers(1, 64))
+def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[float], workers: int) -> None:
+    """Also where some members drive some episodes and others drive others."""
+    task = make_task(episodes=goals(*targets))
+    half = len(targets) // 2
+    for asked in (
+        everything(task, make_recipes(n)),
+        [Chunk(slice(n // 3, n), slice(half, len(targets))), Chunk(slice(0, n // 3), slice(0, half))],
+    ):
+        wanted, seen = np.zeros((n, len(targets)), dtype=int), np.zeros((n, len(targets)), dtype=int)
+        for rows, columns in asked:
+            wanted[rows, columns] += 1
+        for rows, columns in cut(task, asked, workers):
+            assert rows.stop > rows.start
+            assert columns.stop > columns.start
+            seen[rows, columns] += 1
+        assert np.array_equal(seen, wanted)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 4, 16])
-def test_chunks_let_nobody_wait_for_the_slowest(workers: int) -> None:
-    """Simulated with equal members: from the first worker that runs out to the last, at most two small chunks pass."""
-    busy = [0] * workers
-    for rows in chunks(512, workers):
-        k = busy.index(min(busy))
-        busy[k] += rows.stop - rows.start
-    assert max(busy) - min(busy) <= 2 * SMALLEST_CHUNK
-
-
-@given(st.integers(0, 600), st.integers(1, 300), st.integers(1, 16))
-def test_cut_covers_every_episode_of_every_member_once(n: int, episodes: int, workers: int) -> None:
-    seen = np.zeros((n, episodes), dtype=int)
-    for rows, columns in cut(n, episodes, workers):
-        assert rows.stop > rows.start
-        assert columns.stop > columns.start
-        seen[rows, columns] += 1
-    assert (seen == 1).all()
-
-
-@pytest.mark.parametrize(("n", "episodes"), [(1, 208), (4, 48), (24, 16)])
-def test_few_members_keep_all_workers_busy(n: int, episodes: int) -> None:
-    parts = cut(n, episodes, 2)
-    largest = max((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in parts)
-    assert largest <= n * episodes / 8
+@pytest.mark.parametrize(
+    ("n", "episodes", "target"), [(512, 12, 400.0), (24, 16, 1000.0), (4, 48, 2000.0), (1, 208, 2000.0)]
+)
+def test_chunks_let_nobody_wait_for_the_slowest(workers: int, n: int, episodes: int, target: float) -> None:
+    """Simulated with equal metres: from the first worker that runs out to the last, one small chunk passes."""
+    task = make_task(episodes=goals(*[target] * episodes))
+    parts = cut(task, everything(task, make_recipes(n)), workers)
+    busy = [0.0] * workers
+    for part in parts:
+        busy[busy.index(min(busy))] += metres(task, part)
+    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / METRE_S, target) + 1e-6
+    assert len(parts) <= 16 * workers, "as few as that needs"
 
 
 def test_no_members_no_results() -> None:
@@ -135,6 +140,19 @@ def test_results_are_in_the_recipes_order_and_progress_is_told() -> None:
     assert len(told) > 5
     assert (outcome.retries, outcome.bytes_down, outcome.bytes_up, outcome.broadcast_bytes) == (0, 0, 0, 0)
     assert 0 < sum(outcome.busy_s.values()) <= outcome.wall_s
+
+
+def test_only_what_is_asked_for_is_driven_while_something_else_is_done() -> None:
+    recipes, done = make_recipes(20), []
+    asked = [Chunk(slice(15, 20), slice(1, 2)), Chunk(slice(0, 10), slice(0, 1))]
+    pool = SerialPool(never_built, Answering)
+    outcome = pool.evaluate(make_task(), recipes, asked=asked, meanwhile=lambda: done.append(1))
+    wanted = np.zeros((20, 2))
+    wanted[15:, 1], wanted[:10, 0] = recipes["seed"][15:] * 16.0 + 1, recipes["seed"][:10] * 16.0
+    assert np.array_equal(outcome.results["distance"], wanted)
+    assert outcome.whole()
+    assert outcome.members() == 20
+    assert done == [1]
 
 
 def test_a_failing_worker_ends_in_one_line_that_names_the_chunk() -> None:
