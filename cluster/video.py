@@ -17,7 +17,7 @@ from evolution.rollout import Limits, trajectory
 from gridsim.render import Renderer, between
 from gridsim.scenarios import Scenario
 from gridsim.simulator import DISTANCE, SPEED, End, X, Y, views
-from gridsim.traffic import LANE
+from gridsim.world import LANE
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, FPS, SECONDS = (640, 360), 15, 60.0  # of champion.mp4, which a run waits for: a few seconds of one core
@@ -58,7 +58,7 @@ def record(
 ) -> Recording:
     """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for so many seconds.
 
-    Args: world float32 [others, traffic.FIELDS], the traffic at the start.
+    Args: world float32 [others, world.FIELDS], the traffic at the start.
     """
     episode = champion.sim.episode
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))

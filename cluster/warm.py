@@ -27,8 +27,8 @@ from gridsim.config import SimConfig
 from gridsim.jit import CACHE_FOLDER
 from gridsim.scenarios import blank, build, is_map_file, sample_starts
 from gridsim.simulator import FIELDS, views
-from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
-from gridsim.traffic import LANE, spawn
+from gridsim.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.world import LANE, spawn
 
 STEPS = 1  # of the episodes that are driven to compile what drives them
 

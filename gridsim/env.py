@@ -44,8 +44,8 @@ from gridsim.scenarios import (
     starts_at,
 )
 from gridsim.simulator import DISTANCE, SPEED, End, Simulator
-from gridsim.traffic import LANE
 from gridsim.vehicle import Action
+from gridsim.world import LANE
 
 if TYPE_CHECKING:
     from gridsim.render import Renderer, Window

@@ -20,9 +20,10 @@ from gridsim.jit import leaf, njit
 from gridsim.roads import VISIT_CELL, Road, clearance
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan, sense
-from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
-from gridsim.traffic import Drivers, drivers, flow, spawn
+from gridsim.traffic import Drivers, drivers, flow
 from gridsim.vehicle import Action, act, act_continuous, advance, path_curvature
+from gridsim.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.world import spawn
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
@@ -352,7 +353,7 @@ class State:
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         maps: int32 [n], index of the car's map among the simulator's scenarios.
         ends: uint8 [n], End.
-        worlds: float32 [n, traffic, traffic.FIELDS], the other cars around each.
+        worlds: float32 [n, traffic, world.FIELDS], the other cars around each.
     """
 
     cars: np.ndarray
@@ -431,7 +432,7 @@ class Simulator:
             maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
             keys: uint64 [k], or one for all, from which the traffic around each is spawned.
-            worlds: float32 [k, traffic, traffic.FIELDS], the traffic itself in place of keys.
+            worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
         Raises: ValueError with one line for a wrong shape, a number that is not finite, or a map that is not there.
@@ -560,7 +561,7 @@ def _views(road, constants, fan, cars, worlds, ranges):
 
 
 def views(scenario: Scenario, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> np.ndarray:
-    """Ranges float32 [n, rays] (m) that cars in states [n, FIELDS] see among traffic [n, others, traffic.FIELDS]."""
+    """Ranges float32 [n, rays] (m) that cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS]."""
     k = constants(config)
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)

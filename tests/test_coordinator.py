@@ -10,7 +10,7 @@ from cluster.coordinator import Evolution, Maps
 from cluster.pool import SerialPool
 from cluster.settings import EvolveSettings
 from gridsim.config import SimConfig
-from gridsim.traffic import FIELDS, LANE
+from gridsim.world import FIELDS, LANE
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=2, elites=2, parents=8, seed=9)
 

@@ -21,8 +21,8 @@ from gridsim.grid import CELLS, grid_table, grids
 from gridsim.render import NoDisplayError
 from gridsim.scenarios import REGISTRY, Scenario, build
 from gridsim.simulator import DISTANCE, SPEED, views
-from gridsim.traffic import LANE
 from gridsim.vehicle import Action
+from gridsim.world import LANE
 
 F = np.float32
 SENSING = [("rays", 1), ("grid", 1), ("grid", 4)]

@@ -38,9 +38,9 @@ from gridsim.simulator import (
     look,
     place,
 )
-from gridsim.traffic import ALONG, LANE, SHIFT, spawn
-from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
 from gridsim.vehicle import Action
+from gridsim.world import ALONG, LANE, SHIFT, spawn
+from gridsim.world import FIELDS as TRAFFIC_FIELDS
 
 F = np.float32
 CONFIG = SimConfig()
