@@ -14,9 +14,10 @@ import numpy as np
 from cluster.champion import Champion
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
+from gridsim.ego import DISTANCE, SPEED, End, X, Y
 from gridsim.render import Renderer, between
 from gridsim.scenarios import Scenario
-from gridsim.simulator import DISTANCE, SPEED, End, X, Y, views
+from gridsim.simulator import views
 from gridsim.world import LANE
 
 SUFFIXES = (".mp4", ".gif")
@@ -33,7 +34,7 @@ class Recording:
 
     Attributes:
         scenario: the map.
-        cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.simulator`).
+        cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.ego`).
         ranges: float32 [steps + 1, rays], what its rays say, m.
         boxes: float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine).
         end: how it ended; RUNNING where the recording did.

@@ -18,8 +18,8 @@ import numpy as np
 
 from evolution.episodes import Episodes, lane_starts
 from evolution.rollout import EPISODE, Limits
+from gridsim.ego import End
 from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
-from gridsim.simulator import End
 
 HELD_OUT_MAPS = 8
 HELD_OUT_EPISODES = 64

@@ -18,9 +18,10 @@ from types import TracebackType
 import numpy as np
 
 from gridsim.config import SimConfig
+from gridsim.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.render import Renderer, Window, between
 from gridsim.scenarios import Scenario, check_name
-from gridsim.simulator import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, Simulator, X, Y
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 from gridsim.world import LANE
 

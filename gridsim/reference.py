@@ -16,12 +16,12 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import Constants, SimConfig, constants
+from gridsim.ego import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
 from gridsim.jit import leaf, njit
 from gridsim.network import lane_length, turned, wrapped
 from gridsim.roads import VISIT_CELL, freeze
 from gridsim.routes import ReferenceConfig, Route, plan
 from gridsim.scenarios import Scenario
-from gridsim.simulator import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
 from gridsim.traffic import Drivers, change_lanes, drivers, flow, follow, idm
 from gridsim.vehicle import act, path_curvature
 from gridsim.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
@@ -76,7 +76,7 @@ class Drive:
         action: int64 [n].
         arc: float64 [n], m along the route.
         rail: int64 [n], which of the route's rails it was on.
-        car: float32 [simulator.FIELDS], the state at the end.
+        car: float32 [ego.FIELDS], the state at the end.
         end: how it ended.
         route: where it went.
     """
@@ -433,7 +433,7 @@ class ReferenceDriver:
         self._memory[:, POINT] = [route.first for route in self._routes]
 
     def act(self, cars: np.ndarray, worlds: np.ndarray) -> np.ndarray:
-        """Actions int64 [n] for cars float32 [n, simulator.FIELDS] in worlds [n, cars, world.FIELDS]."""
+        """Actions int64 [n] for cars float32 [n, ego.FIELDS] in worlds [n, cars, world.FIELDS]."""
         others = np.zeros((worlds.shape[1] + 2, worlds.shape[2]), dtype=np.float32)
         return np.array(
             [

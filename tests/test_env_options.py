@@ -16,11 +16,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
+from gridsim.ego import DISTANCE, SPEED
 from gridsim.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv, env_id
 from gridsim.grid import CELLS, grid_table, grids
 from gridsim.render import NoDisplayError
 from gridsim.scenarios import REGISTRY, Scenario, build
-from gridsim.simulator import DISTANCE, SPEED, views
+from gridsim.simulator import views
 from gridsim.vehicle import Action
 from gridsim.world import LANE
 

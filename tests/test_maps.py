@@ -20,13 +20,14 @@ from cluster.run import RunError, new_run, open_run, read_config
 from cluster.settings import EvolveSettings, SettingsError, from_dict
 from evolution.policy import PolicySpec
 from gridsim.config import SimConfig, constants
+from gridsim.ego import collides
 from gridsim.env import GridSimEnv, GridSimVectorEnv
 from gridsim.jit import njit
 from gridsim.maps import MAX_PIXELS, MapFile, load_map, map_digest, read_free, read_map_file
 from gridsim.raster import signed_clearance
 from gridsim.roads import Strips, clearance, freeze
 from gridsim.scenarios import Scenario, build, label, sample_starts, starts_at
-from gridsim.simulator import Simulator, collides
+from gridsim.simulator import Simulator
 
 PPM = 16
 W, H = 100.0, 72.0  # m

@@ -14,11 +14,7 @@ from evolution.episodes import lane_starts
 from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
 from evolution.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
 from gridsim.config import EpisodeConfig, SimConfig, constants
-from gridsim.jit import njit
-from gridsim.roads import Strips, clearance_nodes, make_road
-from gridsim.scenarios import build, sample_starts
-from gridsim.sensors import LANES, fan
-from gridsim.simulator import (
+from gridsim.ego import (
     COS,
     DISTANCE,
     FIELDS,
@@ -30,7 +26,6 @@ from gridsim.simulator import (
     STEERING,
     STEPS,
     End,
-    Simulator,
     X,
     Y,
     collides,
@@ -38,6 +33,11 @@ from gridsim.simulator import (
     look,
     place,
 )
+from gridsim.jit import njit
+from gridsim.roads import Strips, clearance_nodes, make_road
+from gridsim.scenarios import build, sample_starts
+from gridsim.sensors import LANES, fan
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 from gridsim.world import ALONG, LANE, SHIFT, spawn
 from gridsim.world import FIELDS as TRAFFIC_FIELDS
