@@ -36,7 +36,7 @@ from gridsim.sensors import LANES, fan
 from gridsim.traffic import Drivers, drivers, flow
 from gridsim.vehicle import Action, act, act_continuous
 from gridsim.world import FIELDS as TRAFFIC_FIELDS
-from gridsim.world import spawn
+from gridsim.world import check_worlds, spawn
 
 _F = np.float32
 _ZERO = _F(0.0)
@@ -257,7 +257,8 @@ class Simulator:
             worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
-        Raises: ValueError with one line for a wrong shape, a number that is not finite, or a map that is not there.
+        Raises: ValueError with one line for a wrong shape, a number that is not finite, a map that is not there, or
+        traffic that is on no lane of its map (`world.check_worlds`). Nothing is changed then.
         """
         n = len(self)
         cars = np.arange(n) if cars is None else np.asarray(cars, dtype=np.intp)
@@ -272,6 +273,7 @@ class Simulator:
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
         if not len(cars):
             return ranges, starts[:, 3]
+        traffic = self._traffic(starts, maps, keys, worlds) if self.state.worlds.shape[1] else None
         rows = self._chart(maps, everyone=len(cars) == n)
         cells = max(_visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
@@ -279,8 +281,8 @@ class Simulator:
             visits[:, : self.state.visits.shape[1]] = self.state.visits
             self.state = replace(self.state, visits=visits)
         state = self.state
-        if state.worlds.shape[1]:
-            state.worlds[cars] = self._traffic(starts, maps, keys, worlds)
+        if traffic is not None:
+            state.worlds[cars] = traffic
         _place_all(
             self._atlas,
             self._constants,
@@ -312,8 +314,10 @@ class Simulator:
         count = self.state.worlds.shape[1]
         if worlds is not None:
             worlds = np.asarray(worlds, dtype=np.float32)
-            if worlds.shape != (len(starts), count, TRAFFIC_FIELDS) or not np.isfinite(worlds).all():
+            if worlds.shape != (len(starts), count, TRAFFIC_FIELDS):
                 raise ValueError(f"traffic must be {len(starts)} worlds of {count} cars, not {worlds.shape}")
+            for m in np.unique(maps):
+                check_worlds(worlds[maps == m], self.scenarios[m].network)
             return worlds
         keys = np.broadcast_to(np.asarray(keys, dtype=np.uint64), maps.shape)
         spawned = np.empty((len(starts), count, TRAFFIC_FIELDS), dtype=np.float32)

@@ -38,6 +38,8 @@ LEAD = 18  # m/s of what is there
 CLOCK = 19  # control steps until it thinks of another lane
 FIELDS = 20
 
+_MOST = 1 << 24  # float32 holds all whole numbers up to it
+_FASTEST = 40.0  # m/s; nobody drives as fast on any map, and nobody passes a whole lane in a control period
 THINKING = _F(10.0)  # control steps from one thought of another lane to the next
 
 
@@ -140,3 +142,39 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
     else:
         worlds[:, :, LANE] = -1.0
     return worlds
+
+
+def check_worlds(worlds: np.ndarray, network: Network | None = None) -> None:
+    """Refuse traffic [..., FIELDS] with which kernels would read what is not there; they do not look for themselves.
+
+    Cars that are not there (LANE is -1) may hold any finite numbers. Without the network that the traffic is on, lanes
+    and metres along them are checked from below only.
+    Raises: ValueError with one line.
+    """
+    if not np.isfinite(worlds).all():
+        raise ValueError("traffic must be finite numbers")
+    cars = worlds[worlds[..., LANE] != -1.0].astype(np.float64)
+    if not len(cars):
+        return
+    lanes = _MOST if network is None else len(network.steps)
+    if not lanes:
+        raise ValueError("there are no lanes for traffic on this map")
+    lowest = np.array([0, 0, 0, -1, -1, 0, 0])
+    highest = np.array([*[lanes - 1] * 5, _MOST, _MOST])
+    whole = cars[:, [LANE, NEXT, AFTER, PAST, PERMIT, SEED, TURNS]]
+    k, field = np.nonzero((whole < lowest) | (whole > highest) | (whole % 1.0 != 0.0))
+    if len(k):
+        name = ("LANE", "NEXT", "AFTER", "PAST", "PERMIT", "SEED", "TURNS")[field[0]]
+        wanted = f"a whole number from {lowest[field[0]]} to {highest[field[0]]}"
+        raise ValueError(f"traffic's {name} must be {wanted}, not {whole[k[0], field[0]]:g}")
+    length = np.full(len(cars), np.inf)
+    if network is not None:
+        lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
+        length = lengths[whole[:, 0].astype(np.intp)]
+    for name, column, most in (
+        ("ALONG (m)", cars[:, ALONG], length + 1e-3),  # float32 may round up
+        ("SPEED (m/s)", cars[:, SPEED], np.full(len(cars), _FASTEST)),
+    ):
+        wrong = (column < 0.0) | (column > most)
+        if wrong.any():
+            raise ValueError(f"traffic's {name} must be from 0 to {most[wrong][0]:g}, not {column[wrong][0]:g}")
