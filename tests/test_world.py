@@ -37,7 +37,7 @@ LANES, LENGTH = "lanes", "length"  # of the map, and m of the car's lane
 
 
 @pytest.mark.parametrize("name", REGISTRY)
-def test_what_traffic_comes_to_is_taken(name: str) -> None:
+def test_what_traffic_comes_to_is_taken(name):
     """Two minutes of a crowd, some of whom find no room."""
     network = build(name, 3).network
     world = spawn(network, FAR, 150, np.array([4], dtype=np.uint64), CONFIG.traffic)[0]
@@ -63,7 +63,7 @@ def maps_with_traffic():
     return scenarios, starts, worlds
 
 
-WRONG: list[tuple[int, object, str]] = [
+WRONG = [
     (LANE, -2.0, "LANE must be a whole number from 0"),
     (LANE, 0.5, "LANE must be a whole number from 0"),
     (LANE, LANES, "LANE must be a whole number from 0"),
@@ -88,7 +88,7 @@ WRONG: list[tuple[int, object, str]] = [
 
 
 @pytest.mark.parametrize(("field", "number", "text"), WRONG)
-def test_traffic_that_kernels_cannot_read_is_refused(maps_with_traffic, field: int, number: object, text: str) -> None:
+def test_traffic_that_kernels_cannot_read_is_refused(maps_with_traffic, field, number, text):
     """And then nothing has changed, though all cars were to be on another map."""
     scenarios, starts, worlds = maps_with_traffic
     here, twin = (Simulator(scenarios, 4, CONFIG, traffic=3) for _ in range(2))
@@ -97,7 +97,7 @@ def test_traffic_that_kernels_cannot_read_is_refused(maps_with_traffic, field: i
     wrong = worlds[1::2].repeat(2, axis=0)
     network, car = scenarios[1].network, wrong[2, 1]
     known = {LANES: len(network.steps), LENGTH: lane_length(network, int(car[LANE])) + F(0.01)}
-    car[field] = known.get(number, number)  # type: ignore[call-overload]
+    car[field] = known.get(number, number)
     with pytest.raises(ValueError, match=text) as error:
         here.reset(starts[1::2].repeat(2, axis=0), 1, worlds=wrong)
     assert "\n" not in str(error.value)
@@ -107,7 +107,7 @@ def test_traffic_that_kernels_cannot_read_is_refused(maps_with_traffic, field: i
     np.testing.assert_array_equal(here.state.worlds, twin.state.worlds)
 
 
-def test_each_world_is_held_against_its_own_map(maps_with_traffic) -> None:
+def test_each_world_is_held_against_its_own_map(maps_with_traffic):
     scenarios, starts, worlds = maps_with_traffic
     fewer, more = sorted(range(2), key=lambda m: len(scenarios[m].network.steps))
     count = len(scenarios[fewer].network.steps)
@@ -121,7 +121,7 @@ def test_each_world_is_held_against_its_own_map(maps_with_traffic) -> None:
         simulator.reset(starts, np.arange(4) % 2, worlds=last)
 
 
-def test_who_is_not_there_may_be_anywhere(maps_with_traffic, tmp_path) -> None:
+def test_who_is_not_there_may_be_anywhere(maps_with_traffic, tmp_path):
     scenarios, starts, _ = maps_with_traffic
     absent = np.full((4, 3, FIELDS), 1e9, dtype=F)
     absent[..., LANE] = -1.0
