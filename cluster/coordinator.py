@@ -29,8 +29,8 @@ from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, targets
 from gridsim.config import SimConfig
+from gridsim.ego import End
 from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, map_of
-from gridsim.simulator import End
 from gridsim.world import check_worlds
 
 COLUMNS = (

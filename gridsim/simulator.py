@@ -12,23 +12,7 @@ import numpy as np
 
 from gridsim.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.ego import (  # noqa: F401, some are for who knows cars from here alone
-    COS,
-    DISTANCE,
-    FIELDS,
-    PACED,
-    SIN,
-    SPEED,
-    STEERING,
-    STEPS,
-    End,
-    X,
-    Y,
-    control,
-    drive,
-    look,
-    place,
-)
+from gridsim.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place
 from gridsim.jit import njit
 from gridsim.roads import VISIT_CELL, Road
 from gridsim.scenarios import Scenario

@@ -39,7 +39,6 @@ from gridsim.world import (
     choose_lane,
     set_pose,
 )
-from gridsim.world import FIELDS as FIELDS  # for who knows worlds from here alone
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
