@@ -8,9 +8,9 @@ import numpy as np
 
 from cluster.coordinator import Maps, held_out_episodes
 from gridsim.config import SimConfig
+from gridsim.ego import DISTANCE, PACED, End
 from gridsim.reference import ReferenceDriver
 from gridsim.scenarios import REGISTRY
-from gridsim.simulator import DISTANCE, PACED, End
 
 TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default is none
 

@@ -40,9 +40,9 @@ from evolution.breeding import RECIPE, Mutation, breed
 from evolution.episodes import lane_starts
 from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
 from evolution.rollout import Limits, evaluate
+from gridsim.ego import DISTANCE
 from gridsim.jit import njit
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build
-from gridsim.simulator import DISTANCE
 
 MAPS = 8
 EPISODES = 16  # of the rollout, over all maps

@@ -28,8 +28,10 @@ import numpy as np
 from gridsim.boxes import boxes_touch
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
+from gridsim.network import Network, wrapped
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.traffic import COS, LANE, SIN, SPEED, Network, X, Y, drivers, flow, spawn, wrapped
+from gridsim.traffic import drivers, flow
+from gridsim.world import COS, LANE, SIN, SPEED, X, Y, spawn
 
 CARS = 6  # where the scenario's default is none
 

@@ -31,7 +31,7 @@ def evolve(
     Args:
         settings: as the command's flags; default all of theirs.
         fitness: scores float64 [n], greater is better, from the episodes' results (structured, [n, episodes], with
-            fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.simulator.End`)) and
+            fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.ego.End`)) and
             the episodes' targets (m). It runs here, never in the workers. Default: `evolution.fitness.scalar`.
         workers: Ray workers on this machine; 0 evaluates in this process.
         on_generation: told the number of generations done and the last one's figures.

@@ -310,8 +310,9 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
         status, code = "KILLED", 143
     except Exception as error:
         from cluster.checkpoint import CheckpointError
+        from evolution.curriculum import CrashError
 
-        if not isinstance(error, PoolError | CheckpointError | MemoryError | OSError):
+        if not isinstance(error, PoolError | CheckpointError | CrashError | MemoryError | OSError):
             raise
         message = str(error) or type(error).__name__
     finally:

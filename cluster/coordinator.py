@@ -30,8 +30,9 @@ from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, targets
 from gridsim.config import SimConfig
+from gridsim.ego import End
 from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, map_of
-from gridsim.simulator import End
+from gridsim.world import check_worlds
 
 COLUMNS = (
     "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
@@ -438,6 +439,10 @@ class Evolution:
             )
             if not fits or not np.isfinite(history).all() or not 0.0 < float(meta["target_m"]) <= self.curriculum.goal:
                 raise ValueError("its parts do not fit each other")
+            maps = np.arange(len(self.curriculum.map_seeds))
+            if not np.isfinite(crashes).all() or not np.isin(crashes[:, 0], maps).all():
+                raise ValueError("a crash is nowhere on its maps")
+            check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
             self.genetic.generation, self.genetic.elites = generation, int(meta["elite_rows"])
             self.genetic.parents = parents
             self.curriculum.target = float(meta["target_m"])

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from gridsim.ego import X, Y
 from gridsim.roads import FIELD_FLOOR, FIELD_UNITS
 from gridsim.scenarios import Scenario
-from gridsim.simulator import X, Y
 
 _ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
 
@@ -73,7 +73,7 @@ def trajectory(scenario: Scenario, states: np.ndarray, path: str | os.PathLike[s
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
 
-    from gridsim.simulator import SPEED
+    from gridsim.ego import SPEED
 
     figure, (axis,) = _figure(8.6, 7.6)
     draw_map(axis, scenario)

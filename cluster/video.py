@@ -14,10 +14,11 @@ import numpy as np
 from cluster.champion import Champion
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
+from gridsim.ego import DISTANCE, SPEED, End, X, Y
 from gridsim.render import Renderer, between
 from gridsim.scenarios import Scenario
-from gridsim.simulator import DISTANCE, SPEED, End, X, Y, views
-from gridsim.traffic import LANE
+from gridsim.simulator import views
+from gridsim.world import LANE
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, FPS, SECONDS = (640, 360), 15, 60.0  # of champion.mp4, which a run waits for: a few seconds of one core
@@ -33,7 +34,7 @@ class Recording:
 
     Attributes:
         scenario: the map.
-        cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.simulator`).
+        cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.ego`).
         ranges: float32 [steps + 1, rays], what its rays say, m.
         boxes: float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine).
         end: how it ended; RUNNING where the recording did.
@@ -58,7 +59,7 @@ def record(
 ) -> Recording:
     """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for so many seconds.
 
-    Args: world float32 [others, traffic.FIELDS], the traffic at the start.
+    Args: world float32 [others, world.FIELDS], the traffic at the start.
     """
     episode = champion.sim.episode
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))

@@ -24,11 +24,12 @@ from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, trajectory
 from gridsim.config import SimConfig
+from gridsim.ego import FIELDS
 from gridsim.jit import CACHE_FOLDER
 from gridsim.scenarios import blank, build, is_map_file, sample_starts
-from gridsim.simulator import FIELDS, views
-from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
-from gridsim.traffic import LANE, spawn
+from gridsim.simulator import views
+from gridsim.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.world import LANE, spawn
 
 STEPS = 1  # of the episodes that are driven to compile what drives them
 

@@ -26,10 +26,10 @@ from cluster.video import SUFFIXES, Recording, VideoError, frames, others, pictu
 from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.drive import DriveError, Recorder, drive, read_drive, replay
+from gridsim.ego import End
 from gridsim.render import NoDisplayError, Renderer, Window
 from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, check_name, default_traffic, label, sample_starts
-from gridsim.simulator import End
-from gridsim.traffic import spawn
+from gridsim.world import spawn
 
 FILM_S = 60.0  # s of a film, unless told
 FOLLOW_S = 10.0  # s that an elite is watched before a newer one may take its place

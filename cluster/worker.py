@@ -26,7 +26,7 @@ class Task:
         key: the generation's number for breeding, 64 bits.
         mutation: how children differ from their parents.
         episodes: EPISODE [episodes], the same for every member.
-        worlds: the traffic that each begins with, float32 [episodes, cars, traffic.FIELDS].
+        worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
         maps: (scenario, seed) of each map that `episodes` indexes.
         limits: where an episode ends if nothing happens.
         config: the simulator's.

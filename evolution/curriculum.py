@@ -18,12 +18,17 @@ import numpy as np
 
 from evolution.episodes import Episodes, lane_starts
 from evolution.rollout import EPISODE, Limits
+from gridsim.ego import End
 from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
-from gridsim.simulator import End
+from gridsim.world import check_worlds
 
 HELD_OUT_MAPS = 8
 HELD_OUT_EPISODES = 64
 VALIDATION_MAPS = 48
+
+
+class CrashError(ValueError):
+    """A remembered crash, from a checkpoint, that cannot be started from; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +127,15 @@ class Curriculum:
         return used, *lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng, self.traffic)
 
     def episodes(self, generation: int) -> Episodes:
-        """What every member of a generation meets: new episodes, and some that start before crashes."""
+        """What every member of a generation meets: new episodes, and some that start before crashes.
+
+        Raises: CrashError if the traffic of such a start does not fit its map.
+        """
         used, fresh, worlds = self._new_starts(generation, self.config.starts, 0)
         if len(self.crashes) and self.config.crash_starts:
             chosen = self._rng(generation, 1).integers(len(self.crashes), size=self.config.crash_starts)
             crashes = self.crashes[chosen].copy()
+            self._check(crashes["map"], self.crash_worlds[chosen])
             for m in sorted({int(m) for m in crashes["map"]} - set(used)):
                 used.append(m)
             crashes["map"] = [used.index(int(m)) for m in crashes["map"]]
@@ -135,6 +144,16 @@ class Curriculum:
             fresh = np.concatenate([fresh, crashes])
             worlds = np.concatenate([worlds, self.crash_worlds[chosen]])
         return Episodes([self.map_seeds[m] for m in used], fresh, worlds)
+
+    def _check(self, maps: np.ndarray, worlds: np.ndarray) -> None:
+        """Refuse traffic [n, cars, fields] that is not on its map [n]; only here are the maps at hand for nothing."""
+        if worlds.shape[1]:
+            for m in np.unique(maps):
+                seed = self.map_seeds[m]
+                try:
+                    check_worlds(worlds[maps == m], self.build(seed).network)
+                except ValueError as error:
+                    raise CrashError(f"a crash in the checkpoint does not fit map {seed}: {error}") from error
 
     def race(self, generation: int) -> Episodes:
         """The race that decides among the generation's best."""

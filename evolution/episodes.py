@@ -10,7 +10,7 @@ import numpy as np
 from evolution.rollout import EPISODE, Limits, no_traffic
 from gridsim.config import TrafficConfig
 from gridsim.scenarios import Scenario, sample_starts
-from gridsim.traffic import FIELDS, spawn
+from gridsim.world import FIELDS, spawn
 
 
 class Episodes(NamedTuple):
@@ -18,7 +18,7 @@ class Episodes(NamedTuple):
 
     maps: list[int]  # seeds of the maps
     rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
-    worlds: np.ndarray  # float32 [e, cars, traffic.FIELDS], the traffic that each begins with
+    worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
 
     def part(self, first: int, stop: int | None = None) -> Episodes:
         """Some of them."""
@@ -51,7 +51,7 @@ def lane_starts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Episodes that start uniformly over the lanes of `scenarios[maps[k]]`, at rest, with so many other cars.
 
-    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, traffic.FIELDS]).
+    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
     """
     episodes, worlds = np.zeros(len(maps), dtype=EPISODE), no_traffic(len(maps))
     episodes["map"] = maps

@@ -15,12 +15,7 @@ import numpy as np
 from evolution import convnet
 from evolution.policy import BLOCK, INPUTS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size
 from gridsim.config import SimConfig, constants
-from gridsim.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.jit import njit
-from gridsim.roads import VISIT_CELL, freeze
-from gridsim.scenarios import Scenario
-from gridsim.sensors import LANES, fan
-from gridsim.simulator import (
+from gridsim.ego import (
     COS,
     DISTANCE,
     FIELDS,
@@ -35,8 +30,13 @@ from gridsim.simulator import (
     look,
     place,
 )
-from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
+from gridsim.grid import CELLS, GridTable, fill_grid, grid_table
+from gridsim.jit import njit
+from gridsim.roads import VISIT_CELL, freeze
+from gridsim.scenarios import Scenario
+from gridsim.sensors import LANES, fan
 from gridsim.traffic import drivers, flow
+from gridsim.world import FIELDS as TRAFFIC_FIELDS
 
 _F = np.float32
 
@@ -259,10 +259,10 @@ def evaluate(
         scenarios: the maps that the episodes index.
         episodes: EPISODE [e].
         rewind: control steps before each end whose state is wanted, 0 for none.
-        worlds: the traffic that each episode begins with, float32 [e, cars, traffic.FIELDS]; None is no traffic.
+        worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
 
     Returns: (RESULT [n, e], the states `rewind` steps before the ends, or at the starts of shorter episodes, as starts
-    float32 [n, e, 5] and the traffic of then, float32 [n, e, cars, traffic.FIELDS]; empty if none are wanted).
+    float32 [n, e, 5] and the traffic of then, float32 [n, e, cars, world.FIELDS]; empty if none are wanted).
     Raises: ValueError where shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -322,9 +322,9 @@ def trajectory(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive one genome through one episode and keep its path.
 
-    Args: as `evaluate`'s; start float32 [5], world float32 [cars, traffic.FIELDS].
+    Args: as `evaluate`'s; start float32 [5], world float32 [cars, world.FIELDS].
     Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
-    `gridsim.simulator`, and the traffic then, float32 [steps + 1, cars, traffic.FIELDS]).
+    `gridsim.ego`, and the traffic then, float32 [steps + 1, cars, world.FIELDS]).
     """
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.jit import njit
+from gridsim.network import Network
 from gridsim.roads import Road, freeze
-from gridsim.traffic import Network
 
 LANE_ARRAYS = (
     "points", "speeds", "offsets", "steps", "successors", "left", "right", "crossing_offsets", "crossings", "clear",

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from gridsim.jit import leaf
-from gridsim.traffic import COS, LANE, SIN, SPEED, X, Y, wrapped
+from gridsim.network import wrapped
+from gridsim.world import COS, LANE, SIN, SPEED, X, Y
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)

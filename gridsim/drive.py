@@ -18,11 +18,12 @@ from types import TracebackType
 import numpy as np
 
 from gridsim.config import SimConfig
+from gridsim.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.render import Renderer, Window, between
 from gridsim.scenarios import Scenario, check_name
-from gridsim.simulator import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, Simulator, X, Y
-from gridsim.traffic import LANE
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
+from gridsim.world import LANE
 
 COLUMNS = (
     "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "traffic",
@@ -217,7 +218,7 @@ def replay(drive: Drive, scenario: Scenario, config: SimConfig | None = None) ->
     """Drive a recorded drive again, by its actions alone.
 
     Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
-    traffic float32 [n, others, traffic.FIELDS]).
+    traffic float32 [n, others, world.FIELDS]).
     Raises: DriveError with one line if an episode has a collision before its end: map and drive do not belong together.
     """
     simulator = _simulator(scenario, config, drive.traffic)

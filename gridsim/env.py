@@ -29,6 +29,7 @@ from gymnasium.vector.utils import batch_space
 
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
+from gridsim.ego import DISTANCE, SPEED, End
 from gridsim.grid import CELLS, grid_table, grids, push_frames
 from gridsim.jit import njit
 from gridsim.roads import clearance
@@ -43,9 +44,9 @@ from gridsim.scenarios import (
     map_of,
     starts_at,
 )
-from gridsim.simulator import DISTANCE, SPEED, End, Simulator
-from gridsim.traffic import LANE
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
+from gridsim.world import LANE
 
 if TYPE_CHECKING:
     from gridsim.render import Renderer, Window

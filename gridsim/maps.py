@@ -28,6 +28,7 @@ import yaml
 from PIL import Image
 
 from gridsim.config import SimConfig, VehicleConfig
+from gridsim.network import make_network
 from gridsim.raster import OUTSIDE, complete_starts, find_starts, signed_clearance
 from gridsim.roads import (
     CELLS_PER_M,
@@ -42,7 +43,6 @@ from gridsim.roads import (
     power_of_two,
 )
 from gridsim.scenarios import FILE_SPEEDS, START_SPEED, Scenario
-from gridsim.traffic import make_network
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}

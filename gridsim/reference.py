@@ -15,34 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim import traffic
 from gridsim.config import Constants, SimConfig, constants
+from gridsim.ego import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
 from gridsim.jit import leaf, njit
+from gridsim.network import lane_length, turned, wrapped
 from gridsim.roads import VISIT_CELL, freeze
 from gridsim.routes import ReferenceConfig, Route, plan
 from gridsim.scenarios import Scenario
-from gridsim.simulator import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
-from gridsim.traffic import (
-    AFTER,
-    ALONG,
-    CLOCK,
-    FACTOR,
-    GAP,
-    HORIZON,
-    LANE,
-    LEAD,
-    NEXT,
-    PACE,
-    PAST,
-    PERMIT,
-    SHIFT,
-    Drivers,
-    drivers,
-    flow,
-    idm,
-    wrapped,
-)
+from gridsim.traffic import Drivers, change_lanes, drivers, flow, follow, idm
 from gridsim.vehicle import act, path_curvature
+from gridsim.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE, _TWO = _F(0.0), _F(0.5), _F(1.0), _F(2.0)
@@ -94,7 +76,7 @@ class Drive:
         action: int64 [n].
         arc: float64 [n], m along the route.
         rail: int64 [n], which of the route's rails it was on.
-        car: float32 [simulator.FIELDS], the state at the end.
+        car: float32 [ego.FIELDS], the state at the end.
         end: how it ended.
         route: where it went.
     """
@@ -125,8 +107,8 @@ def _find_conflicts(network, half_length, half_width, enter, free):
                 length = math.hypot(ux, uy)
                 ux, uy = ux / length, uy / length
                 for q in range(network.offsets[other], network.offsets[other + 1] - 1):
-                    dx = traffic.turned(network.points[q, 0] - network.points[p, 0], network.width)
-                    dy = traffic.turned(network.points[q, 1] - network.points[p, 1], network.height)
+                    dx = turned(network.points[q, 0] - network.points[p, 0], network.width)
+                    dy = turned(network.points[q, 1] - network.points[p, 1], network.height)
                     if abs(dx * ux + dy * uy) < half_length and abs(dy * ux - dx * uy) < half_width:
                         vx = network.points[q + 1, 0] - network.points[q, 0]
                         vy = network.points[q + 1, 1] - network.points[q, 1]
@@ -190,8 +172,8 @@ def _progress(network, route, rail, k, x, y):
         ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
         uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
         length = max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-        dx = traffic.turned(x - route.points[rail, k, 0], network.width)
-        dy = traffic.turned(y - route.points[rail, k, 1], network.height)
+        dx = turned(x - route.points[rail, k, 0], network.width)
+        dy = turned(y - route.points[rail, k, 1], network.height)
         along = (dx * ux + dy * uy) / length
         if along <= length or k >= last:
             return k, route.arc[rail, k] + along, (dy * ux - dx * uy) / length
@@ -210,8 +192,8 @@ def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
     ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
     uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
     norm = blend / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-    dx = traffic.turned(x - norm * uy - car[X], network.width)
-    dy = traffic.turned(y + norm * ux - car[Y], network.height)
+    dx = turned(x - norm * uy - car[X], network.width)
+    dy = turned(y + norm * ux - car[Y], network.height)
     forward, left = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
     distance = max(math.sqrt(forward * forward + left * left), _F(0.1))
     tangent = (left / distance) / max(distance / (_TWO * constants.rear_axle) + forward / distance, _F(0.1))
@@ -259,7 +241,7 @@ def _seat(network, route, rail, m, s, car, me):
     me[LANE] = route.lanes[rail, m]
     me[NEXT] = route.lanes[rail, min(m + _I(1), last)]
     me[AFTER] = route.lanes[rail, min(m + _I(2), last)]
-    length = traffic.lane_length(network, _I(me[LANE]))
+    length = lane_length(network, _I(me[LANE]))
     me[ALONG] = min(max(s - route.arc[rail, route.offsets[m]], _ZERO), length)
 
 
@@ -283,9 +265,9 @@ def _give_way(network, conflicts, drivers, me, world):
                 if _I(world[j, LANE]) == other:
                     at = world[j, ALONG]
                 elif _I(world[j, PERMIT]) == other:
-                    at = world[j, ALONG] - traffic.lane_length(network, _I(world[j, LANE]))
+                    at = world[j, ALONG] - lane_length(network, _I(world[j, LANE]))
                 elif _I(world[j, PAST]) == other:
-                    at = world[j, ALONG] + traffic.lane_length(network, other)
+                    at = world[j, ALONG] + lane_length(network, other)
                 else:
                     continue
                 rest = conflicts.free[c] + drivers.half_length + _HALF - at
@@ -305,7 +287,7 @@ def _give_way(network, conflicts, drivers, me, world):
                 else:
                     slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * way))
                 allowed, least = min(allowed, slower), min(least, way)
-        ahead += traffic.lane_length(network, lane)
+        ahead += lane_length(network, lane)
     return allowed, least
 
 
@@ -333,7 +315,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
                 dx, dy = wrapped(world[j, X] - car[X], network.width), wrapped(world[j, Y] - car[Y], network.height)
                 if math.sqrt(dx * dx + dy * dy) - _F(5.0) < me[HORIZON]:
                     before = me[GAP]
-                    traffic.follow(network, drivers, me, world[j], False)
+                    follow(network, drivers, me, world[j], False)
                     along = me[COS] * world[j, COS] + me[SIN] * world[j, SIN]
                     if me[GAP] < before:
                         touch = min(touch, me[GAP])
@@ -352,7 +334,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
         me[FACTOR] = wish / network.speeds[at]
         me[PACE] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD])
         me[CLOCK] = _F(_I(car[STEPS]) % _I(10))  # it thinks of another lane once a second
-        traffic.change_lanes(network, drivers, others, n, nobody)
+        change_lanes(network, drivers, others, n, nobody)
         if _I(me[LANE]) != lane:
             memory[LEFT_RAIL] = rail
             memory[RAIL] = rail + 1 if _I(me[LANE]) == network.right[lane] else rail - 1
@@ -364,7 +346,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
 def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others):
     """The driver's action for one control period.
 
-    Args: what it keeps in mind float64 [FIELDS_KEPT], changed; `others` [cars + 2, traffic.FIELDS] is scratch, of which
+    Args: what it keeps in mind float64 [FIELDS_KEPT], changed; `others` [cars + 2, world.FIELDS] is scratch, of which
     the last row is 0.
     """
     rail = _I(memory[RAIL])
@@ -451,7 +433,7 @@ class ReferenceDriver:
         self._memory[:, POINT] = [route.first for route in self._routes]
 
     def act(self, cars: np.ndarray, worlds: np.ndarray) -> np.ndarray:
-        """Actions int64 [n] for cars float32 [n, simulator.FIELDS] in worlds [n, cars, traffic.FIELDS]."""
+        """Actions int64 [n] for cars float32 [n, ego.FIELDS] in worlds [n, cars, world.FIELDS]."""
         others = np.zeros((worlds.shape[1] + 2, worlds.shape[2]), dtype=np.float32)
         return np.array(
             [
@@ -475,7 +457,7 @@ class ReferenceDriver:
         target: float | None = None,
         max_steps: int | None = None,
     ) -> Drive:
-        """A whole episode from a start float32 [5] in the traffic float32 [cars, traffic.FIELDS] around it.
+        """A whole episode from a start float32 [5] in the traffic float32 [cars, world.FIELDS] around it.
 
         Ends as `simulator.Simulator`'s episodes do; `target` (m) and `max_steps` are the configuration's unless given.
         """

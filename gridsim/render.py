@@ -21,11 +21,11 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from gridsim.config import SimConfig, constants
+from gridsim.ego import COS, SIN, STEERING, X, Y
 from gridsim.jit import leaf, njit
 from gridsim.marks import lane_marks
 from gridsim.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, freeze
 from gridsim.scenarios import Scenario
-from gridsim.simulator import COS, SIN, STEERING, X, Y
 
 if TYPE_CHECKING:
     import pygame
@@ -274,7 +274,7 @@ class Renderer:
         """Draw a state: uint8 [h, w, 3].
 
         Args:
-            car: the car's state float32 [FIELDS] (`gridsim.simulator`); it is read only.
+            car: the car's state float32 [FIELDS] (`gridsim.ego`); it is read only.
             boxes: other cars [n, 4 or more]: x, y (m), heading (cosine, sine).
             ranges: of the car's rays [rays], m.
             grid: occupancy grid uint8 [cells, cells]: row 0 farthest ahead, column 0 leftmost; 0 unknown, 127 free, 255

@@ -17,6 +17,7 @@ from gridsim.config import SimConfig
 from gridsim.curved import curved_layout
 from gridsim.highway import highway_layout
 from gridsim.jit import njit
+from gridsim.network import Network, make_network, network_of_lanes
 from gridsim.roads import (
     CELLS_PER_M,
     HEADING_BINS,
@@ -30,7 +31,6 @@ from gridsim.roads import (
     make_road,
 )
 from gridsim.seamless import roundabout_layout, seamless_layout
-from gridsim.traffic import Network, make_network, network_of_lanes
 
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion

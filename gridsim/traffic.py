@@ -1,12 +1,8 @@
 """Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change lanes on the highway.
 
 Longitudinal motion is the intelligent driver model (Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
-(Kesting, Treiber and Helbing 2007). A car is on rails: its centre of mass lies on its lane, shifted sideways while it
-changes lanes. A junction lane is entered only with a permit, which nobody gets while the ground it crosses is taken.
-The ego car is an obstacle like any other, and has the right of way at junctions.
-
-A world is the traffic around one ego car: float32 [cars, FIELDS], the fields below. Whatever happens in it follows from
-that array and from the ego car alone.
+(Kesting, Treiber and Helbing 2007). The ego car is an obstacle like any other, and has the right of way at junctions
+(`junctions.py`). What a car's state holds is in `world.py`, a map's lanes are in `network.py`.
 """
 
 from __future__ import annotations
@@ -16,57 +12,39 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import SimConfig, TrafficConfig
-from gridsim.counter import GOLDEN, mix, uniform
+from gridsim.config import SimConfig
 from gridsim.jit import leaf, njit
-from gridsim.roads import Lanes, freeze
+from gridsim.junctions import CAUTION, may_enter
+from gridsim.network import is_junction, lane_length, turned, wrapped
+from gridsim.world import (
+    AFTER,
+    ALONG,
+    CLOCK,
+    COS,
+    FACTOR,
+    GAP,
+    HORIZON,
+    LANE,
+    LEAD,
+    NEXT,
+    PACE,
+    PAST,
+    PERMIT,
+    SHIFT,
+    SIN,
+    SPEED,
+    THINKING,
+    X,
+    Y,
+    choose_lane,
+    set_pose,
+)
 
-_F, _I, _U = np.float32, np.int32, np.uint64
+_F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
-# Fields of a traffic car's state; X to SPEED are where the ego car's are.
-X, Y = 0, 1  # m, centre of mass
-COS, SIN = 2, 3  # heading
-SPEED = 4  # m/s
-LANE = 5  # index of its lane, -1 for a car that is not there
-ALONG = 6  # m along it
-NEXT, AFTER = 7, 8  # the two lanes that come then
-PAST = 9  # junction lane that its rear may still be on, or -1
-PERMIT = 10  # junction lane that it may enter next, or -1
-SHIFT = 11  # m to the left of its lane, while it changes lanes
-FACTOR = 12  # desired speed over the lane's
-SEED = 13  # of its turns, below 2 ** 24
-TURNS = 14  # lanes it has chosen so far
-PACE = 15  # m/s2, its acceleration in this step
-HORIZON = 16  # m ahead that it looks in this step
-GAP = 17  # m from its middle to where it must not get
-LEAD = 18  # m/s of what is there
-CLOCK = 19  # control steps until it thinks of another lane
-FIELDS = 20
-
-_THINKING = _F(10.0)  # control steps from one thought of another lane to the next
 _LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
-_CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
-_CROSSING_TIME = _F(4.0)  # s, what it takes to leave a junction
-_REACH = _F(2.4)  # m from the middle of a car within which all of it lies
-
-
-class Network(NamedTuple):
-    """Lanes as the kernels read them; arrays flat, read-only and C-contiguous. The rest is in `roads.Lanes`."""
-
-    points: np.ndarray  # float32 [n, 2], m
-    speeds: np.ndarray  # float32 [n], m/s: greatest speed there, so that bends ahead are met in comfort
-    offsets: np.ndarray  # int32 [lanes + 1]
-    steps: np.ndarray  # float32 [lanes], m between a lane's points
-    successors: np.ndarray  # int32 [lanes, k]
-    left: np.ndarray  # int32 [lanes], neighbour for a change of lanes, or -1
-    right: np.ndarray
-    crossing_offsets: np.ndarray  # int32 [lanes + 1]
-    crossings: np.ndarray  # int32 [c], junction lanes that cross each lane
-    clear: np.ndarray  # float32 [c], m along those from which on a car's middle is out of the way
-    width: np.float32  # m, of the torus
-    height: np.float32
 
 
 class Drivers(NamedTuple):
@@ -103,220 +81,6 @@ def drivers(sim: SimConfig) -> Drivers:
         half_width=f(sim.vehicle.width / 2),
         dt=f(sim.episode.control_period),
     )
-
-
-# --- Tables of a map -------------------------------------------------------------------------------------------------
-
-
-@njit
-def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, speeds):
-    """Greatest speed at each point: by lateral acceleration, and so that braking for what comes is comfortable."""
-    lanes = offsets.shape[0] - 1
-    for lane in range(lanes):
-        first, last = offsets[lane], offsets[lane + 1] - 1
-        for p in range(first, last + 1):
-            a, b, c = max(p - 2, first), min(max(p, first + 2), last - 2), min(p + 2, last)
-            if last - first < 4:
-                a, b, c = first, (first + last) // 2, last
-            ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
-            vx, vy = points[c, 0] - points[b, 0], points[c, 1] - points[b, 1]
-            turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy))
-            length = 0.5 * (math.hypot(ux, uy) + math.hypot(vx, vy))
-            speeds[p] = min(top, math.sqrt(lateral * length / max(turn, 1e-6))) if length > 1e-6 else top
-    for _ in range(4):  # a bend is felt through the lanes before it
-        for lane in range(lanes):
-            first, last = offsets[lane], offsets[lane + 1] - 1
-            onward = speeds[last]
-            for k in range(successors.shape[1]):
-                if successors[lane, k] >= 0:
-                    onward = min(onward, speeds[offsets[successors[lane, k]]])
-            speeds[last] = onward
-            for p in range(last - 1, first - 1, -1):
-                speeds[p] = min(speeds[p], math.sqrt(speeds[p + 1] ** 2 + 2.0 * comfort * steps[lane]))
-
-
-@njit
-def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, height, apart, clear):
-    """For each crossing, the last point of the other lane within `apart` m of this one, as m along it."""
-    for lane in range(offsets.shape[0] - 1):
-        for c in range(crossing_offsets[lane], crossing_offsets[lane + 1]):
-            other = crossings[c]
-            last = -1
-            for q in range(offsets[other + 1] - 1, offsets[other] - 1, -1):
-                for p in range(offsets[lane], offsets[lane + 1]):
-                    dx, dy = points[p, 0] - points[q, 0], points[p, 1] - points[q, 1]
-                    dx -= round(dx / width) * width
-                    dy -= round(dy / height) * height
-                    if dx * dx + dy * dy < apart * apart:
-                        last = q - offsets[other]
-                        break
-                if last >= 0:
-                    break
-            clear[c] = last * steps[other]
-
-
-def make_network(lanes: Lanes, width: float, height: float, speed_limit: float, config: TrafficConfig) -> Network:
-    """Tables of a map's lanes; `speed_limit` (m/s) is the scenario's own."""
-    f = np.float32
-    speeds = np.empty(len(lanes.points), dtype=np.float32)
-    clear = np.zeros(len(lanes.crossings), dtype=np.float32)
-    points, offsets, steps = freeze(lanes.points), freeze(lanes.offsets), freeze(lanes.steps)
-    successors = freeze(lanes.successors)
-    if len(lanes):
-        _speed_profile(points, offsets, steps, successors, f(speed_limit), f(config.lateral), f(config.comfort), speeds)
-        _clear_points(
-            points, offsets, steps, freeze(lanes.crossing_offsets), freeze(lanes.crossings), f(width), f(height),
-            f(config.apart), clear,
-        )  # fmt: skip
-    return network_of_lanes(lanes, freeze(speeds), freeze(clear), width, height)
-
-
-def network_of_lanes(lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, width: float, height: float) -> Network:
-    """Tables from what `make_network` computed before; all arrays read-only already."""
-    return Network(
-        points=lanes.points,
-        speeds=speeds,
-        offsets=lanes.offsets,
-        steps=lanes.steps,
-        successors=lanes.successors,
-        left=lanes.left,
-        right=lanes.right,
-        crossing_offsets=lanes.crossing_offsets,
-        crossings=lanes.crossings,
-        clear=clear,
-        width=np.float32(width),
-        height=np.float32(height),
-    )
-
-
-# --- Where a car is --------------------------------------------------------------------------------------------------
-
-
-@leaf
-def wrapped(difference, side):
-    """The shortest way round a torus of a side (m) for a difference of two coordinates on it."""
-    half = _HALF * side
-    if difference > half:
-        return difference - side
-    if difference < -half:
-        return difference + side
-    return difference
-
-
-@leaf
-def turned(difference, side):
-    """The same for any difference: lanes' points are not wrapped."""
-    return difference - math.floor(difference / side + _HALF) * side
-
-
-@leaf
-def lane_length(network, lane):
-    """Length (m) of a lane."""
-    return _F(network.offsets[lane + 1] - network.offsets[lane] - 1) * network.steps[lane]
-
-
-@leaf
-def _pose(network, car, sway):
-    """Put a car where its lane, its metres along it and its shift say; `sway` is the shift's speed over the car's."""
-    lane = _I(car[LANE])
-    first = network.offsets[lane]
-    last = network.offsets[lane + 1] - first - 2
-    at = car[ALONG] / network.steps[lane]
-    k = min(max(_I(at), _I(0)), _I(last))
-    part = at - _F(k)
-    x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
-    dx, dy = network.points[first + k + 1, 0] - x0, network.points[first + k + 1, 1] - y0
-    # The heading turns from the last piece's to the next one's, so that the car does not jerk at every point.
-    before, after = max(k - 1, 0), min(k + 2, last + 1)
-    ax, ay = x0 + dx - network.points[first + before, 0], y0 + dy - network.points[first + before, 1]
-    bx, by = network.points[first + after, 0] - x0, network.points[first + after, 1] - y0
-    tx, ty = ax + part * (bx - ax), ay + part * (by - ay)
-    norm = _ONE / math.sqrt(max(tx * tx + ty * ty, _F(1e-12)))
-    tx, ty = tx * norm, ty * norm
-    x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
-    car[X] = x - math.floor(x / network.width) * network.width
-    car[Y] = y - math.floor(y / network.height) * network.height
-    norm = _ONE / math.sqrt(_ONE + sway * sway)
-    car[COS], car[SIN] = (tx - sway * ty) * norm, (ty + sway * tx) * norm
-
-
-@leaf
-def _draw(car):
-    """A random number in [0, 1) of a car's own."""
-    car[TURNS] += _ONE
-    return uniform(mix(mix(_U(car[SEED])) + _U(car[TURNS]) * GOLDEN))
-
-
-@leaf
-def _choose(network, lane, car):
-    """A lane after `lane`, at random."""
-    count = 0
-    for k in range(network.successors.shape[1]):
-        if network.successors[lane, k] >= 0:
-            count += 1
-    return network.successors[lane, min(_I(_draw(car) * _F(count)), _I(count - 1))]
-
-
-@njit
-def _is_free(network, world, n, x, y, apart):
-    for j in range(n):
-        if world[j, LANE] >= _ZERO:
-            dx, dy = world[j, X] - x, world[j, Y] - y
-            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-            if dx * dx + dy * dy < apart * apart:
-                return False
-    return True
-
-
-@njit(nogil=True)
-def _spawn(network, mileage, start, key, gap, ego_gap, world):
-    """Fill a world [cars, FIELDS]: uniformly over the lanes outside junctions, away from each other and the ego car."""
-    draws = 0
-    for i in range(world.shape[0]):
-        car = world[i]
-        car[:] = _ZERO
-        car[LANE], car[PAST], car[PERMIT] = -_ONE, -_ONE, -_ONE
-        car[CLOCK] = _F(i) % _THINKING  # not all at once
-        for _ in range(60):
-            draws += 1
-            bits = mix(key + _U(draws) * GOLDEN)
-            metres = (bits >> _U(11)) * (1.0 / (1 << 53)) * mileage[-1]
-            lane = np.searchsorted(mileage, metres, side="right") - 1
-            lane = min(lane, len(mileage) - 2)
-            if network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]:
-                continue
-            car[LANE], car[ALONG] = _F(lane), _F(metres - mileage[lane])
-            _pose(network, car, _ZERO)
-            dx, dy = car[X] - start[0], car[Y] - start[1]
-            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-            if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
-                car[SEED] = _F(mix(bits) >> _U(40))
-                car[FACTOR] = _F(0.9) + _F(0.3) * uniform(mix(bits + GOLDEN))
-                car[NEXT] = _F(_choose(network, lane, car))
-                car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
-                at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-                car[SPEED] = _HALF * car[FACTOR] * network.speeds[at]
-                break
-            car[LANE] = -_ONE
-
-
-def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: TrafficConfig) -> np.ndarray:
-    """Worlds float32 [n, cars, FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
-
-    Uniform over the lanes outside junctions; a car for which there is no room is not there (LANE is -1).
-    """
-    worlds = np.zeros((len(starts), cars, FIELDS), dtype=np.float32)
-    if cars and len(network.offsets) > 1:
-        lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
-        mileage = np.concatenate([[0.0], np.cumsum(lengths)])
-        for world, start, key in zip(worlds, np.asarray(starts, dtype=np.float32), keys, strict=True):
-            _spawn(network, mileage, start, _U(key), _F(config.spawn_gap), _F(config.spawn_gap_ego), world)
-    else:
-        worlds[:, :, LANE] = -1.0
-    return worlds
-
-
-# --- Driving ---------------------------------------------------------------------------------------------------------
 
 
 @leaf
@@ -358,8 +122,8 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
 
     Looks at points of the path from the car's front on, up to `horizon` m.
     """
-    half_length = drivers.half_length + drivers.half_width + _CAUTION
-    half_width = drivers.half_width + drivers.half_width + _CAUTION
+    half_length = drivers.half_length + drivers.half_width + CAUTION
+    half_width = drivers.half_width + drivers.half_width + CAUTION
     lane = _I(car[LANE])
     along = car[ALONG]
     travelled = drivers.half_length
@@ -386,105 +150,6 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
         else:
             lane = _I(car[AFTER])
     return _F(1e9)
-
-
-@leaf
-def _is_junction(network, lane):
-    return network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]
-
-
-@leaf
-def _passes(network, drivers, lane, other):
-    """Whether a lane passes where a car's rear is that waits at the end of another lane with the same beginning."""
-    step = network.steps[other]
-    q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
-    reach = _F(2.0) * drivers.half_width + _F(2.0) * _CAUTION
-    for p in range(network.offsets[lane], network.offsets[lane + 1]):
-        dx = turned(network.points[p, 0] - network.points[q, 0], network.width)
-        dy = turned(network.points[p, 1] - network.points[q, 1], network.height)
-        if dx * dx + dy * dy < reach * reach:
-            return True
-    return False
-
-
-@leaf
-def _reaches(network, lane, x, y, within):
-    """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
-    first, k = network.offsets[lane], network.offsets[lane]
-    while k < network.offsets[lane + 1]:
-        dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
-        apart = math.sqrt(dx * dx + dy * dy)
-        if apart < within:
-            return _F(k - first) * network.steps[lane]
-        k += max(_I((apart - within) / network.steps[lane]), _I(1))
-    return _F(1e9)
-
-
-@leaf
-def _may_enter(network, drivers, world, i, ego):
-    """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
-    car = world[i]
-    here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
-    first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
-    # Who enters must be able to leave, or junctions would block each other. Before another junction there is room for
-    # one, else for as many as the lane beyond holds.
-    chained = _is_junction(network, beyond)
-    place = _F(2.0) * drivers.half_length + drivers.jam
-    room, needed = max(lane_length(network, beyond), place), place
-    for j in range(world.shape[0]):
-        if j == i or world[j, LANE] < _ZERO:
-            continue
-        there, past, permit = _I(world[j, LANE]), _I(world[j, PAST]), _I(world[j, PERMIT])
-        onward = _I(world[j, NEXT])
-        for c in range(first, last):
-            other = network.crossings[c]
-            if permit == other:
-                return False
-            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + _HALF:
-                return False
-            if past == other and lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
-                network.clear[c] + _HALF
-            ):
-                return False
-        waits = _I(-1)  # lane at whose end the other may have to wait, still in this junction
-        if there == here and world[j, ALONG] > car[ALONG]:
-            if permit != onward:
-                return False  # who is in front of this one waits for others, who must not wait for this one
-            if _is_junction(network, _I(world[j, AFTER])):
-                waits = permit
-        elif permit != onward and _is_junction(network, there) and _is_junction(network, onward):
-            for k in range(network.successors.shape[1]):
-                if there == network.successors[here, k]:
-                    waits = there
-        if waits >= 0 and waits != lane and _passes(network, drivers, lane, waits):
-            return False
-        if chained:
-            if there == lane or permit == lane:
-                return False
-            for k in range(network.successors.shape[1]):
-                slow = there == network.successors[lane, k] and world[j, SPEED] < _F(2.0)
-                if slow and world[j, ALONG] < place + drivers.half_length:
-                    return False
-        elif there == beyond:
-            rear = world[j, ALONG] - drivers.half_length
-            room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
-        elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and _is_junction(network, there)):
-            needed += place
-    # The ego car goes first, unless it is behind this one.
-    if ego[COS] != _ZERO or ego[SIN] != _ZERO:
-        dx, dy = ego[X] - car[X], ego[Y] - car[Y]
-        dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-        forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-        way = _CROSSING_TIME * max(ego[SPEED], _ZERO)
-        far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
-        if dx * dx + dy * dy < far * far and not (forward < _ZERO and abs(aside) < _F(2.5)):
-            for k in range(1 + _I(way / _F(4.0))):
-                x, y = ego[X] + _F(4.0) * _F(k) * ego[COS], ego[Y] + _F(4.0) * _F(k) * ego[SIN]
-                if _reaches(network, lane, x, y, _F(3.0)) < _F(1e8):
-                    return False
-            rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
-            room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
-    return room >= needed
 
 
 @leaf
@@ -558,7 +223,7 @@ def change_lanes(network, drivers, world, i, ego):
     if car[CLOCK] > _ZERO:
         car[CLOCK] -= _ONE
         return
-    car[CLOCK] = _THINKING - _ONE
+    car[CLOCK] = THINKING - _ONE
     if car[SHIFT] != _ZERO:
         return
     if network.left[lane] < 0 and network.right[lane] < 0:
@@ -636,8 +301,8 @@ def change_lanes(network, drivers, world, i, ego):
         dx, dy = turned(dx, network.width), turned(dy, network.height)
         car[SHIFT] = -toward * math.sqrt(dx * dx + dy * dy)
         car[LANE] = _F(best)
-        car[NEXT] = _F(_choose(network, best, car))
-        car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
+        car[NEXT] = _F(choose_lane(network, best, car))
+        car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
 
 
 @leaf
@@ -660,13 +325,13 @@ def _go(network, drivers, car):
     if car[ALONG] >= length:
         lane = _I(car[LANE])
         car[ALONG] -= length
-        car[PAST] = car[LANE] if _is_junction(network, lane) else -_ONE
+        car[PAST] = car[LANE] if is_junction(network, lane) else -_ONE
         car[LANE], car[NEXT] = car[NEXT], car[AFTER]
         car[PERMIT] = -_ONE
-        car[AFTER] = _F(_choose(network, _I(car[NEXT]), car))
+        car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
     elif car[PAST] >= _ZERO and car[ALONG] > drivers.half_length + _ONE:
         car[PAST] = -_ONE
-    _pose(network, car, sway)
+    set_pose(network, car, sway)
 
 
 @njit(nogil=True, _nrt=False)
@@ -685,11 +350,11 @@ def flow(network, drivers, world, ego):
         lane, onward = _I(car[LANE]), _I(car[NEXT])
         desired = _desired(network, car)
         pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD])
-        if _is_junction(network, onward) and car[PERMIT] != car[NEXT]:
+        if is_junction(network, onward) and car[PERMIT] != car[NEXT]:
             # A junction comes: up to its line without a permit.
             line = lane_length(network, lane) - car[ALONG] - drivers.half_length
             if line < car[HORIZON]:
-                if _may_enter(network, drivers, world, i, ego):
+                if may_enter(network, drivers, world, i, ego):
                     car[PERMIT] = car[NEXT]
                 else:
                     pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - _LINE, _ZERO))

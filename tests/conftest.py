@@ -1,14 +1,21 @@
 """What the tests share: the checkout's root, a clean environment, and commands run as a user runs them."""
 
+from __future__ import annotations
+
 import os
+import shutil
 import signal
 import subprocess
 import sysconfig
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from gridsim.scenarios import Scenario
 
 # Nothing may reach a cluster or a tracking server that the shell happens to name.
 for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "MLFLOW_RUN_ID", "RAY_ADDRESS"):
@@ -41,6 +48,41 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert begun.close("FINISHED") is None
     assert os.listdir(folder) == ["mlflow.db"]
     return folder / "mlflow.db"
+
+
+@pytest.fixture
+def uri(empty_database: Path, tmp_path: Path) -> str:
+    """MLflow's address of a database that holds nothing but the experiment `other`."""
+    from cluster.tracking import check_uri
+
+    (tmp_path / "store").mkdir()
+    shutil.copy(empty_database, tmp_path / "store" / "mlflow.db")
+    return check_uri(f"sqlite:///{tmp_path}/store/mlflow.db")
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Short pauses of a tracker."""
+    from cluster import tracking
+
+    monkeypatch.setattr(tracking, "FLUSH_S", 0.05)
+    monkeypatch.setattr(tracking, "RETRY_S", 0.1)
+    monkeypatch.setattr(tracking, "CHANCE_S", 0.1)
+    monkeypatch.setattr(tracking, "PROBE_S", 0.3)
+
+
+@pytest.fixture(scope="session")
+def maps() -> dict[str, list[Scenario]]:
+    """Two maps of each scenario."""
+    from gridsim.scenarios import REGISTRY, build
+
+    return {name: [build(name, seed) for seed in range(2)] for name in REGISTRY}
+
+
+@pytest.fixture
+def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows that nobody sees."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
 @pytest.fixture

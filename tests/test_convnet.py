@@ -15,9 +15,10 @@ from evolution.policy import CnnSpec, PolicySpec
 from evolution.rollout import Limits, evaluate, trajectory
 from evolution.tiles import plain_tile, vector_tile
 from gridsim.config import SensorConfig, SimConfig
+from gridsim.ego import DISTANCE, STEPS, End
 from gridsim.grid import grid_table, grids, push_frames
 from gridsim.scenarios import build
-from gridsim.simulator import DISTANCE, STEPS, End, Simulator
+from gridsim.simulator import Simulator
 
 torch = pytest.importorskip("torch")
 

@@ -9,8 +9,9 @@ from cluster.checkpoint import CheckpointError, load, save
 from cluster.coordinator import Evolution, Maps
 from cluster.pool import SerialPool
 from cluster.settings import EvolveSettings
+from evolution.curriculum import CrashError
 from gridsim.config import SimConfig
-from gridsim.traffic import FIELDS, LANE
+from gridsim.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=2, elites=2, parents=8, seed=9)
 
@@ -87,6 +88,43 @@ def test_crash_worlds_that_do_not_fit_are_refused(maps, halfway, spoil):
     arrays["crash_worlds"] = spoil(arrays["crash_worlds"])
     with pytest.raises(CheckpointError, match="does not belong to this run"):
         begin(maps).restore(arrays, meta)
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "number"),
+    [
+        ("crash_worlds", LANE, -2.0),
+        ("crash_worlds", LANE, 0.5),
+        ("crash_worlds", NEXT, -1.0),
+        ("crash_worlds", ALONG, -1.0),
+        ("crash_worlds", SPEED, 1e9),
+        ("crash_worlds", FIELDS - 1, np.nan),
+        ("crashes", 0, 16.0),
+        ("crashes", 0, -1.0),
+        ("crashes", 0, 0.5),
+        ("crashes", 1, np.inf),
+    ],
+)
+def test_crashes_on_no_road_are_refused(maps, halfway, name, field, number):
+    arrays, meta = load(halfway)
+    there = arrays["crash_worlds"][..., LANE] >= 0
+    arrays[name] = arrays[name].copy()
+    arrays[name][there if name == "crash_worlds" else ..., field] = number
+    with pytest.raises(CheckpointError, match="does not belong to this run") as error:
+        begin(maps).restore(arrays, meta)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("field", "number"), [(LANE, 1e6), (NEXT, 1e6), (PAST, 1e6), (ALONG, 1e4)])
+def test_a_crash_that_does_not_fit_its_map_is_refused_when_it_is_to_be_driven(maps, halfway, field, number):
+    arrays, meta = load(halfway)
+    arrays["crash_worlds"] = arrays["crash_worlds"].copy()
+    arrays["crash_worlds"][arrays["crash_worlds"][..., LANE] >= 0, field] = number
+    evolution = begin(maps)
+    evolution.restore(arrays, meta)
+    with pytest.raises(CrashError, match=r"a crash in the checkpoint does not fit map \d+: traffic's ") as error:
+        evolution.step()
+    assert "\n" not in str(error.value)
 
 
 def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):

@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridsim.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, unhurried
+from gridsim.ego import End
 from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import End, Simulator
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 
 KEYS = ("up", "down", "left", "right", "space")

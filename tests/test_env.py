@@ -15,10 +15,11 @@ from gymnasium.wrappers.vector import FlattenObservation as FlattenAll
 from evolution.policy import PolicySpec, decide, encode, pack, packed_size
 from evolution.rollout import EPISODE, Limits, evaluate
 from gridsim.config import EpisodeConfig, SimConfig
+from gridsim.ego import End
 from gridsim.env import GridSimEnv, GridSimVectorEnv, env_id
 from gridsim.roads import clearance, freeze
 from gridsim.scenarios import REGISTRY, Scenario, build, sample_starts, starts_at
-from gridsim.simulator import End, Simulator
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 
 SPEC = PolicySpec.parse("mlp:6,7")

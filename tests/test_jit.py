@@ -17,10 +17,10 @@ from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, evaluate
 from gridsim import jit
 from gridsim.config import SimConfig, constants
+from gridsim.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y, drive, look, place
 from gridsim.roads import Strips, clearance_nodes, make_road
 from gridsim.scenarios import Scenario, build, sample_starts
 from gridsim.sensors import LANES, fan
-from gridsim.simulator import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y, drive, look, place
 
 F = np.float32
 
@@ -28,15 +28,15 @@ F = np.float32
 CALLER = """
 import json
 import numpy as np
-from gridsim import jit, roads, simulator
+from gridsim import ego, jit, roads
 from gridsim.config import SimConfig, constants
 u, f = np.uint32, np.float32
 byte = 150  # of clearance at every node: 2.69 m above the floor of -2 m
 word = byte * 0x01010101
 road = roads.Road(roads.freeze(np.full(64, word, dtype=u)), roads.freeze(np.zeros(16, dtype=np.int32)),
                   roads.freeze(np.zeros(200, dtype=np.uint8)), u(8), u(8), f(4), f(4), f(5), f(12))
-hit = simulator.collides(road, constants(SimConfig()), f(1), f(1), f(1), f(0))
-hits = sum(simulator.collides.stats.cache_hits.values())
+hit = ego.collides(road, constants(SimConfig()), f(1), f(1), f(1), f(0))
+hits = sum(ego.collides.stats.cache_hits.values())
 print(json.dumps({"file": roads.__file__, "folder": str(jit.CACHE_FOLDER), "hit": bool(hit), "from_cache": hits}))
 """
 

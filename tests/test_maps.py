@@ -1,110 +1,37 @@
-"""Maps from files: against closed forms, and on whatever bytes a file may hold."""
+"""Maps from files: against closed forms, and as scenarios like others."""
 
 import math
 import os
-import struct
-import time
-import zlib
 from pathlib import Path
 
 import numpy as np
 import oracle
 import pytest
-import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from pictures import (
+    PPM,
+    STRIPS,
+    H,
+    W,
+    crashes,
+    distance,
+    picture,
+    read,
+    save,
+    strip,
+    write_yaml,
+)
 from PIL import Image
 
 from cluster.champion import Champion, evaluate
 from cluster.run import RunError, new_run, open_run, read_config
-from cluster.settings import EvolveSettings, SettingsError, from_dict
+from cluster.settings import EvolveSettings
 from evolution.policy import PolicySpec
-from gridsim.config import SimConfig, constants
+from gridsim.config import SimConfig
 from gridsim.env import GridSimEnv, GridSimVectorEnv
-from gridsim.jit import njit
-from gridsim.maps import MAX_PIXELS, MapFile, load_map, map_digest, read_free, read_map_file
+from gridsim.maps import MapFile, load_map, map_digest, read_free, read_map_file
 from gridsim.raster import signed_clearance
-from gridsim.roads import Strips, clearance, freeze
 from gridsim.scenarios import Scenario, build, label, sample_starts, starts_at
-from gridsim.simulator import Simulator, collides
-
-PPM = 16
-W, H = 100.0, 72.0  # m
-LINES = np.array([[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]])
-ARCS = np.array([[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]])
-STRIPS = Strips(LINES, ARCS)
-
-
-def distance(x, y):
-    """Clearance (m) of the strips above, in closed form."""
-    best = np.full(np.broadcast(x, y).shape, -np.inf)
-    for ax, ay, bx, by, w in LINES:
-        dx, dy = bx - ax, by - ay
-        t = np.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
-        best = np.maximum(best, w - np.hypot(x - ax - t * dx, y - ay - t * dy))
-    for cx, cy, r, *_, w in ARCS:
-        best = np.maximum(best, w - np.abs(np.hypot(x - cx, y - cy) - r))
-    return best
-
-
-def picture(shape=distance, width=W, height=H, ppm=PPM):
-    """An anti-aliased picture uint8 [rows, columns] of a shape, its highest row first, as pictures are."""
-    x = (np.arange(round(width * ppm)) + 0.5) / ppm
-    y = (np.arange(round(height * ppm)) + 0.5) / ppm
-    d = shape(*np.meshgrid(x, y[::-1]))
-    return np.clip(127.5 + 255 * ppm * d, 0, 255).round().astype(np.uint8)
-
-
-def save(path, pixels):
-    Image.fromarray(pixels).save(path)
-    return str(path)
-
-
-def write_yaml(folder, pixels=None, name="map", **values):
-    if pixels is not None:
-        save(folder / "map.png", pixels)
-    values = {"image": "map.png", "resolution": 1 / PPM, "origin": [0, 0, 0], **values}
-    path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump({k: v for k, v in values.items() if v is not None}))
-    return str(path)
-
-
-@njit
-def clearances(road, points, out):
-    for k in range(len(points)):
-        out[k] = clearance(road, points[k, 0], points[k, 1])
-
-
-@njit
-def crashed(road, constants, starts, out):
-    for k in range(len(starts)):
-        out[k] = collides(
-            road, constants, starts[k, 0], starts[k, 1], np.float32(math.cos(starts[k, 2])),
-            np.float32(math.sin(starts[k, 2])),
-        )  # fmt: skip
-
-
-def read(road, points):
-    out = np.empty(len(points), dtype=np.float32)
-    clearances(road, freeze(np.asarray(points, dtype=np.float32)), out)
-    return out
-
-
-def crashes(scenario):
-    out = np.empty(len(scenario.starts), dtype=np.bool_)
-    crashed(scenario.road, constants(SimConfig()), scenario.starts, out)
-    return out
-
-
-def strip(cx, cy, angle, half_width, half_length=45.0):
-    """A corridor's clearance, its ends closed."""
-
-    def shape(x, y):
-        u = (x - cx) * math.cos(angle) + (y - cy) * math.sin(angle)
-        v = -(x - cx) * math.sin(angle) + (y - cy) * math.cos(angle)
-        return np.minimum(half_width - np.abs(v), half_length - np.abs(u))
-
-    return shape
+from gridsim.simulator import Simulator
 
 
 @pytest.fixture(scope="module")
@@ -411,212 +338,3 @@ def test_runs_know_their_map_again(tmp_path, monkeypatch):
     (tmp_path / "a b.png").unlink()
     with pytest.raises(RunError, match="No such file"):
         open_run(run.path)
-
-
-# --------------------------------------------------------------------------------------------------------- bad input
-
-
-def refused(name):
-    """The one line with which a file is refused."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011, what it says is looked at
-        load_map(str(name))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert len(message) < 600
-    with pytest.raises(SettingsError):
-        from_dict({"scenario": str(name)})
-    return message
-
-
-def bomb(path, width, height):
-    """A PNG of a few bytes that would be very large."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
-    return path
-
-
-@pytest.mark.parametrize(("width", "height"), [(10_000, 7_000), (20_000, 20_000), (2**31 - 1, 2**31 - 1), (0, 5)])
-def test_bombs_are_not_decoded(tmp_path, width, height):
-    started = time.perf_counter()
-    message = refused(bomb(tmp_path / "bomb.png", width, height))
-    assert f"{MAX_PIXELS:,}" in message or not width or width > 1 << 30
-    assert time.perf_counter() - started < 2.0
-
-
-def test_pictures_that_are_no_maps(tmp_path):
-    road = picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0)
-    whole = Path(save(tmp_path / "whole.png", road)).read_bytes()
-    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "empty.png").write_bytes(b"")
-    (tmp_path / "folder.png").mkdir()
-    assert "truncated" in refused(tmp_path / "cut.png")
-    assert "no picture" in refused(tmp_path / "empty.png")
-    assert "not a file" in refused(tmp_path / "folder.png")
-    assert "No such file" in refused(tmp_path / "missing.png")
-    assert "no path" in refused("nul\0l.png")
-    assert "picture" in refused(tmp_path / "map.tiff")
-    assert "all road" in refused(save(tmp_path / "road.png", np.full((99, 99), 255, np.uint8)))
-    assert "all wall" in refused(save(tmp_path / "wall.png", np.zeros((99, 99), np.uint8)))
-    assert "no room" in refused(save(tmp_path / "path.png", picture(strip(50, 20, 0.0, 1.0), 100.0, 40.0)))
-    assert "no room" in refused(save(tmp_path / "yard.png", picture(strip(50, 20, 0.0, 5.0, 6.0), 100.0, 40.0)))
-    noise = np.random.default_rng(0).integers(0, 256, (800, 800), dtype=np.uint8)
-    assert "no room" in refused(save(tmp_path / "noise.png", noise))
-
-
-WRONG = {
-    "no mapping": ("[1, 2]", "mapping"),
-    "empty": ("", "mapping"),
-    "no YAML": ("image: [", "no plain YAML"),
-    "deep": ("[" * 5000, "no plain YAML"),
-    "tag": ("!!python/object/apply:os.system ['true']", "no plain YAML"),
-    "no image": ("resolution: 0.1", "image"),
-    "no resolution": ("image: map.png", "resolution"),
-    "both": ("{image: map.png, resolution: 0.1, scale: 10}", "either"),
-    "unknown key": ("{image: map.png, resolution: 0.1, start: []}", "unknown key 'start'"),
-    "negative": ("{image: map.png, resolution: -0.1}", "from 0.01 to 1, not -0.1"),
-    "zero": ("{image: map.png, resolution: 0}", "from 0.01 to 1"),
-    "nan": ("{image: map.png, resolution: .nan}", "not nan"),
-    "infinite": ("{image: map.png, scale: .inf}", "from 1 to 100, not inf"),
-    "absurd": ("{image: map.png, resolution: 1e9}", "from 0.01 to 1"),
-    "bool": ("{image: map.png, resolution: true}", "not True"),
-    "huge number": ("{image: map.png, resolution: 0x" + "f" * 9000 + "}", "resolution"),
-    "image type": ("{image: [map.png], resolution: 0.1}", "image must name"),
-    "absolute": ("{image: /map.png, resolution: 0.1}", "own folder"),
-    "outside": ("{image: ../map.png, resolution: 0.1}", "own folder"),
-    "null": ('{image: "a\\0.png", resolution: 0.1}', "no path"),
-    "link": ("{image: link.png, resolution: 0.1}", "own folder"),
-    "loop": ("{image: loop.png, resolution: 0.1}", "loop.png"),
-    "missing": ("{image: none.png, resolution: 0.1}", "No such file"),
-    "thresholds": ("{image: map.png, resolution: 0.1, free_thresh: 0.7}", "not above occupied_thresh"),
-    "threshold": ("{image: map.png, resolution: 0.1, free_thresh: 2}", "from 0 to 1"),
-    "negate": ("{image: map.png, resolution: 0.1, negate: 2}", "negate"),
-    "mode": ("{image: map.png, resolution: 0.1, mode: raw}", "mode"),
-    "mode type": ("{image: map.png, resolution: 0.1, mode: {}}", "mode"),
-    "yaw": ("{image: map.png, resolution: 0.1, origin: [0, 0, 0.5]}", "yaw"),
-    "origin": ("{image: map.png, resolution: 0.1, origin: [0, 0]}", "origin"),
-    "speed": ("{image: map.png, resolution: 0.1, speed: [9, 3]}", "speed"),
-    "speed limit": ("{image: map.png, resolution: 0.1, speed: [9, 300]}", "speed"),
-    "starts": ("{image: map.png, resolution: 0.1, starts: {x: 1}}", "starts"),
-    "degrees": ("{image: map.png, resolution: 0.1, starts: [[1, 2, 90]]}", "heading"),
-    "itself": ("{image: map.png, resolution: 0.1, starts: &a [*a, *a]}", "start"),
-    "laughs": ("{image: map.png, resolution: [" + "&a [1,1,1]," + "*a," * 99 + "]}", "resolution"),
-    "huge": ("#" * 70_000, "too many"),
-    "torus": ("{image: map.png, resolution: 0.1, torus: yes please}", "torus"),
-    "large": ("{image: map.png, resolution: 1}", "is too large"),
-}
-
-
-@pytest.fixture(scope="module")
-def wrong_folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("outer") / "inner"
-    folder.mkdir()
-    pixels = np.zeros((3000, 3000), dtype=np.uint8)
-    pixels[5:-5, 5:-5] = 255
-    save(folder / "map.png", pixels)
-    save(folder.parent / "map.png", pixels[:50])
-    (folder / "link.png").symlink_to("../map.png")
-    (folder / "loop.png").symlink_to("loop.png")
-    return folder
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_wrong_yaml_is_one_clear_line(wrong_folder, name):
-    text, expected = WRONG[name]
-    path = wrong_folder / "map.yaml"
-    path.write_text(text)
-    assert expected in refused(path)
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """A folder and the bytes of a small, good picture."""
-    folder = tmp_path_factory.mktemp("fuzz")
-    good = Path(save(folder / "good.png", picture(strip(20, 8, 0.0, 4.0, 18.0), 40.0, 16.0, 4)))
-    return folder, good.read_bytes()
-
-
-def only_value_errors(path):
-    started = time.perf_counter()
-    scenario = message = None
-    try:
-        scenario = load_map(str(path))
-    except ValueError as error:
-        message = str(error)
-    if scenario is not None:
-        assert len(scenario.starts)
-        assert not crashes(scenario).any()
-    assert not message or "\n" not in message
-    assert time.perf_counter() - started < 10.0
-
-
-FUZZ = settings(max_examples=40)
-
-
-@FUZZ
-@given(data=st.binary(max_size=300), suffix=st.sampled_from(["png", "pgm", "jpg", "bmp", "yaml"]))
-def test_any_bytes(small, data, suffix):
-    starts = {"png": b"\x89PNG\r\n\x1a\n", "pgm": b"P5 ", "jpg": b"\xff\xd8\xff", "bmp": b"BM", "yaml": b""}
-    path = small[0] / f"fuzz.{suffix}"
-    for content in (data, starts[suffix] + data):
-        path.write_bytes(content)
-        only_value_errors(path)
-
-
-@FUZZ
-@given(
-    edits=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=4),
-    cut=st.one_of(st.none(), st.integers(0, 10_000)),
-)
-def test_mutated_pictures(small, edits, cut):
-    folder, good = small
-    content = bytearray(good)
-    for at, value in edits:
-        content[at % len(content)] = value
-    path = folder / "mutated.png"
-    path.write_bytes(content[: cut % len(content)] if cut is not None else content)
-    (folder / "mutated.yaml").write_text("{image: mutated.png, scale: 4, free_thresh: 0.5}")
-    only_value_errors(folder / "mutated.yaml")
-
-
-scalars = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.dates(), st.binary(max_size=4)
-)
-values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(scalars, inner, max_size=3))
-GOOD = {
-    "image": "good.png", "scale": 4, "origin": [0, 0, 0], "negate": 0, "free_thresh": 0.5, "occupied_thresh": 0.65,
-    "mode": "scale", "starts": [[20, 8]], "torus": False, "speed": [5, 12],
-}  # fmt: skip
-
-
-@FUZZ
-@given(changes=st.dictionaries(st.sampled_from([*GOOD, "resolution", "other"]), values, max_size=3), drop=st.booleans())
-def test_any_values(small, changes, drop):
-    path = small[0] / "values.yaml"
-    keys = {k: v for k, v in GOOD.items() if not (drop and k in ("scale", "starts"))}
-    path.write_text(yaml.safe_dump({**keys, **changes}))
-    only_value_errors(path)
-
-
-@FUZZ
-@given(starts=st.lists(st.lists(st.floats(-5, 45), min_size=2, max_size=3), max_size=4), speed=st.floats(0, 40))
-def test_any_starts(small, starts, speed):
-    path = small[0] / "starts.yaml"
-    path.write_text(yaml.safe_dump({**GOOD, "starts": starts, "speed": [speed / 2, speed]}))
-    only_value_errors(path)
-
-
-@settings(max_examples=25)
-@given(st.integers(0, 2**32), st.floats(0.02, 0.98), st.integers(1, 40), st.sampled_from([1, 4, 10]), st.booleans())
-def test_any_pixels(small, seed, share, grain, ppm, torus):
-    """Blobs of any size: a map, or one clear line."""
-    rng = np.random.default_rng(seed)
-    coarse = (rng.random((64 // min(grain, 32) + 1,) * 2) < share).astype(np.uint8) * 255
-    save(small[0] / "blobs.png", coarse.repeat(grain, axis=0).repeat(grain, axis=1)[:64, :64])
-    path = small[0] / "blobs.yaml"
-    path.write_text(f"{{image: blobs.png, scale: {ppm}, torus: {str(torus).lower()}}}")
-    only_value_errors(path)

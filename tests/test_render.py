@@ -9,10 +9,11 @@ import pytest
 
 from gridsim import render
 from gridsim.config import SimConfig
+from gridsim.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
 from gridsim.render import Renderer, between
 from gridsim.roads import clearance
 from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import COS, FIELDS, SIN, SPEED, STEERING, Simulator, X, Y
+from gridsim.simulator import Simulator
 
 BARE = {**os.environ}
 for _name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR"):

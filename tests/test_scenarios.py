@@ -14,11 +14,11 @@ import gridsim.city as city
 import gridsim.curved as curved
 import gridsim.highway as highway
 from gridsim.config import SimConfig, constants
+from gridsim.ego import collides
 from gridsim.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
 from gridsim.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
 from gridsim.scenarios import REGISTRY, Scenario, build, sample_starts
 from gridsim.seamless import FEWEST_ROUNDABOUTS
-from gridsim.simulator import collides
 
 LAID = range(16)  # seeds of which strips and lanes are looked at
 BUILT = (0, 1)  # ... whole maps

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gridsim.config import SimConfig, constants
+from gridsim.ego import collides
 from gridsim.lanes import LANE_STEP
 from gridsim.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
 from gridsim.seamless import (
@@ -21,7 +22,6 @@ from gridsim.seamless import (
     seamless_layout,
     tile_graph,
 )
-from gridsim.simulator import collides
 
 SEEDS = range(300)  # of which graphs are looked at
 LAID = range(60)  # ... lanes and strips

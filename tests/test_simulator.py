@@ -7,18 +7,8 @@ import numpy as np
 import oracle
 import pytest
 
-from cluster.champion import load_champion
-from cluster.worker import Task, Worker
-from evolution.breeding import RECIPE, Mutation
-from evolution.episodes import lane_starts
-from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
-from evolution.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
 from gridsim.config import EpisodeConfig, SimConfig, constants
-from gridsim.jit import njit
-from gridsim.roads import Strips, clearance_nodes, make_road
-from gridsim.scenarios import build, sample_starts
-from gridsim.sensors import LANES, fan
-from gridsim.simulator import (
+from gridsim.ego import (
     COS,
     DISTANCE,
     FIELDS,
@@ -30,7 +20,6 @@ from gridsim.simulator import (
     STEERING,
     STEPS,
     End,
-    Simulator,
     X,
     Y,
     collides,
@@ -38,8 +27,10 @@ from gridsim.simulator import (
     look,
     place,
 )
-from gridsim.traffic import ALONG, LANE, SHIFT, spawn
-from gridsim.traffic import FIELDS as TRAFFIC_FIELDS
+from gridsim.roads import Strips, clearance_nodes, make_road
+from gridsim.scenarios import build, sample_starts
+from gridsim.sensors import LANES, fan
+from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 
 F = np.float32
@@ -419,177 +410,3 @@ def test_a_start_is_taken_onto_the_torus(straight):
     assert (car[COS], car[SIN]) == pytest.approx((0.0, 1.0), abs=1e-6)
     assert (car[SPEED], car[STEERING]) == (7.0, F(0.1))
     assert not car[[DISTANCE, PACED, ODOMETER, IDLE, STEPS]].any()
-
-
-# --- Whole populations -----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def task(scenarios):
-    rng = np.random.default_rng(8)
-    spec = PolicySpec.parse("mlp:6,7")
-    genomes = rng.normal(size=(6, spec.size)).astype(F) * F(0.5)
-    starts = np.zeros(4, dtype=EPISODE)
-    starts["map"] = [0, 1, 0, 1]
-    starts["start"] = [sample_starts(scenarios[m], 1, rng)[0] for m in starts["map"]]
-    return spec, genomes, starts
-
-
-@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
-def test_a_bad_genome_loses_and_spoils_nothing(scenarios, task, poison):
-    spec, genomes, starts = task
-    limits = Limits(500.0, 800)
-    clean, _, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
-    assert (clean["distance"] > 1.0).any()
-    for gene in (0, spec.size // 2, spec.size - 1):
-        spoilt = genomes.copy()
-        spoilt[1, gene] = poison
-        spoilt[4] = math.nan
-        results, _, _ = evaluate(spec, spoilt, scenarios, starts, limits, CONFIG)
-        others = [0, 2, 3, 5]
-        assert results[others].tobytes() == clean[others].tobytes()
-        assert (results["distance"][4] == 0.0).all()
-        assert (results["end"][4] == End.IDLE).all()
-        assert np.isfinite(results["distance"]).all()
-        if math.isnan(poison):
-            assert (results["distance"][1] == 0.0).all()
-
-
-def test_results_do_not_depend_on_the_company(scenarios, task):
-    spec, genomes, starts = task
-    limits = Limits(500.0, 800)
-    together, _, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
-    for i in range(len(genomes)):
-        for e in range(len(starts)):
-            alone, _, _ = evaluate(spec, genomes[i : i + 1], scenarios, starts[e : e + 1], limits, CONFIG)
-            assert alone[0, 0].tobytes() == together[i, e].tobytes()
-
-
-# --- Among traffic ---------------------------------------------------------------------------------------------------
-
-CARS = 8
-AMONG = Limits(400.0, 700)
-
-
-@njit
-def _decide(packed, layers, ranges, speeds, actions):
-    scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    for i in range(len(actions)):
-        encode(ranges[i], None, speeds[i], scratch)
-        actions[i] = decide(packed, layers, scratch)
-
-
-class Wheel:
-    """A genome that drives the cars of a `Simulator`."""
-
-    def __init__(self, spec, genome):
-        self.layers, self.packed = spec.layers, np.empty(packed_size(spec.layers), dtype=F)
-        pack(genome, spec.layers, self.packed)
-
-    def __call__(self, ranges, speeds):
-        actions = np.zeros(len(ranges), dtype=np.int64)
-        _decide(self.packed, self.layers, ranges, speeds, actions)
-        return actions
-
-
-@pytest.fixture(scope="module")
-def among(root):
-    """(spec, genome, maps, episodes, worlds, trajectory of each): a trained driver on three kinds of road."""
-    champion = load_champion(root / "benchmarks" / "champion_traffic.npz")
-    spec = PolicySpec.parse(champion.policy)
-    maps = [build("seamless", 3), build("highway", 4), build("city", 5)]
-    episodes, worlds = lane_starts(maps, np.arange(9) % 3, np.random.default_rng(2), CARS)
-    paths = [
-        trajectory(spec, champion.genome, maps[e["map"]], e["start"].copy(), AMONG, CONFIG, w)
-        for e, w in zip(episodes, worlds, strict=True)
-    ]
-    return spec, champion.genome, maps, episodes, worlds, paths
-
-
-def test_the_episodes_among_traffic_are_worth_comparing(among):
-    *_, paths = among
-    assert {int(row["end"]) for row, _, _ in paths} >= {End.COLLISION, End.SUCCESS}
-    assert sum(int(row["steps"]) for row, _, _ in paths) > 2000
-    assert any((worlds[..., SHIFT] != 0).any() for _, _, worlds in paths)  # somebody changed lanes
-
-
-def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
-    """Bit for bit: the fused rollout, a worker, and `Simulator.step` with one car or nine on three maps."""
-    spec, genome, maps, episodes, worlds, paths = among
-    results, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, worlds=worlds)
-    assert results.tobytes() == np.array([[row for row, _, _ in paths]], dtype=RESULT).tobytes()
-    recipes = np.zeros(3, dtype=RECIPE)
-    names = tuple((scenario.name, scenario.seed) for scenario in maps)
-    task = Task("mlp:6,7", genome[None].copy(), 0, Mutation(), episodes.copy(), worlds.copy(), names, AMONG, CONFIG)
-    shared, _ = Worker().evaluate(task, maps, recipes)
-    assert all(row.tobytes() == results[0].tobytes() for row in shared)
-
-    wheel = Wheel(spec, genome)
-    for cars in (np.arange(9), np.array([4])):
-        simulator = Simulator(maps, len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
-        ranges, speeds = simulator.reset(episodes["start"][cars], episodes["map"][cars], worlds=worlds[cars])
-        for step in range(1 + max(int(paths[k][0]["steps"]) for k in cars)):
-            for i, k in enumerate(cars):
-                row, states, traffic = paths[k]
-                at = min(step, int(row["steps"]))
-                assert simulator.state.cars[i].tobytes() == states[at].tobytes()
-                assert simulator.state.worlds[i].tobytes() == traffic[at].tobytes()
-            ranges, speeds, _, ends = simulator.step(wheel(ranges, speeds))
-        assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
-
-
-def test_a_key_stands_for_its_world(among):
-    _, _, maps, episodes, _, _ = among
-    keys = np.arange(9, dtype=np.uint64) + 70
-    simulator = Simulator(maps, 9, CONFIG, traffic=CARS)
-    simulator.reset(episodes["start"], episodes["map"], keys=keys)
-    for k, episode in enumerate(episodes):
-        world = spawn(maps[episode["map"]].network, episode["start"][None], CARS, keys[k : k + 1], CONFIG.traffic)
-        assert simulator.state.worlds[k].tobytes() == world[0].tobytes()
-
-
-def test_what_is_rewound_goes_on_as_it_did(among):
-    """64 steps before the end the ego car and its world are those of then, and with the same actions end the same."""
-    spec, genome, maps, episodes, worlds, paths = among
-    _, starts, then = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, 64, worlds)
-    compared = 0
-    for k, (row, states, traffic) in enumerate(paths):
-        first, last = max(int(row["steps"]) - 64, 0), int(row["steps"])
-        assert then[0, k].tobytes() == traffic[first].tobytes()
-        assert starts[0, k] == pytest.approx(
-            [
-                *states[first][[X, Y]],
-                math.atan2(states[first][SIN], states[first][COS]),
-                *states[first][[SPEED, STEERING]],
-            ]
-        )
-        if End(int(row["end"])) != End.COLLISION:
-            continue
-        compared += 1
-        wheel = Wheel(spec, genome)
-        original = Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
-        ranges, speeds = original.reset(episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
-        actions = []
-        for _ in range(last):
-            actions.append(wheel(ranges, speeds))
-            ranges, speeds, *_ = original.step(actions[-1])
-        again = Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
-        again.reset(starts[0, k : k + 1], worlds=then[0, k : k + 1])
-        for step in range(first, last):
-            assert not again.state.ends[0]
-            again.step(actions[step])
-            # A start has an angle where the state has its cosine and sine: what differs is rounding.
-            assert (again.state.worlds[0, :, LANE] == traffic[step + 1][:, LANE]).all()
-            assert again.state.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
-        assert again.state.ends[0] == End.COLLISION
-    assert compared >= 2
-
-
-def test_without_room_for_anybody_there_is_no_traffic(among):
-    """All the cars of a world may be missing: everything is as without traffic."""
-    spec, genome, maps, episodes, _, _ = among
-    absent = np.zeros((9, CARS, TRAFFIC_FIELDS), dtype=F)
-    absent[..., LANE] = -1.0
-    alone, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG)
-    results, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, worlds=absent)
-    assert results.tobytes() == alone.tobytes()

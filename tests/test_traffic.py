@@ -13,30 +13,11 @@ from gridsim.boxes import boxes_touch
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.lanes import Path, lay_lanes
+from gridsim.network import make_network, wrapped
 from gridsim.roads import freeze
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.traffic import (
-    AFTER,
-    ALONG,
-    COS,
-    FACTOR,
-    FIELDS,
-    LANE,
-    NEXT,
-    PAST,
-    PERMIT,
-    SHIFT,
-    SIN,
-    SPEED,
-    X,
-    Y,
-    drivers,
-    flow,
-    idm,
-    make_network,
-    spawn,
-    wrapped,
-)
+from gridsim.traffic import drivers, flow, idm
+from gridsim.world import AFTER, ALONG, COS, FACTOR, FIELDS, LANE, NEXT, PAST, PERMIT, SHIFT, SIN, SPEED, X, Y, spawn
 
 F = np.float32
 CONFIG = SimConfig()

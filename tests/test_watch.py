@@ -20,9 +20,10 @@ from cluster.video import Recording, VideoError, frames, picture, record, write_
 from cluster.watch import Elites, watch_main
 from gridsim.config import SimConfig
 from gridsim.drive import Recorder, pose, unhurried
+from gridsim.ego import DISTANCE, End
 from gridsim.render import Renderer
 from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import DISTANCE, End, Simulator
+from gridsim.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["--workers", "0", "--population", "48", "--generations", "4", "--seed", "5", "--elites", "4"]

@@ -1,0 +1,90 @@
+"""Pictures of roads for the tests of maps, and what is where on the maps made of them."""
+
+import math
+
+import numpy as np
+import yaml
+from PIL import Image
+
+from gridsim.config import SimConfig, constants
+from gridsim.ego import collides
+from gridsim.jit import njit
+from gridsim.roads import Strips, clearance, freeze
+
+PPM = 16
+W, H = 100.0, 72.0  # m
+LINES = np.array([[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]])
+ARCS = np.array([[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]])
+STRIPS = Strips(LINES, ARCS)
+
+
+def distance(x, y):
+    """Clearance (m) of the strips above, in closed form."""
+    best = np.full(np.broadcast(x, y).shape, -np.inf)
+    for ax, ay, bx, by, w in LINES:
+        dx, dy = bx - ax, by - ay
+        t = np.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
+        best = np.maximum(best, w - np.hypot(x - ax - t * dx, y - ay - t * dy))
+    for cx, cy, r, *_, w in ARCS:
+        best = np.maximum(best, w - np.abs(np.hypot(x - cx, y - cy) - r))
+    return best
+
+
+def picture(shape=distance, width=W, height=H, ppm=PPM):
+    """An anti-aliased picture uint8 [rows, columns] of a shape, its highest row first, as pictures are."""
+    x = (np.arange(round(width * ppm)) + 0.5) / ppm
+    y = (np.arange(round(height * ppm)) + 0.5) / ppm
+    d = shape(*np.meshgrid(x, y[::-1]))
+    return np.clip(127.5 + 255 * ppm * d, 0, 255).round().astype(np.uint8)
+
+
+def save(path, pixels):
+    Image.fromarray(pixels).save(path)
+    return str(path)
+
+
+def write_yaml(folder, pixels=None, name="map", **values):
+    if pixels is not None:
+        save(folder / "map.png", pixels)
+    values = {"image": "map.png", "resolution": 1 / PPM, "origin": [0, 0, 0], **values}
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump({k: v for k, v in values.items() if v is not None}))
+    return str(path)
+
+
+@njit
+def clearances(road, points, out):
+    for k in range(len(points)):
+        out[k] = clearance(road, points[k, 0], points[k, 1])
+
+
+@njit
+def crashed(road, constants, starts, out):
+    for k in range(len(starts)):
+        out[k] = collides(
+            road, constants, starts[k, 0], starts[k, 1], np.float32(math.cos(starts[k, 2])),
+            np.float32(math.sin(starts[k, 2])),
+        )  # fmt: skip
+
+
+def read(road, points):
+    out = np.empty(len(points), dtype=np.float32)
+    clearances(road, freeze(np.asarray(points, dtype=np.float32)), out)
+    return out
+
+
+def crashes(scenario):
+    out = np.empty(len(scenario.starts), dtype=np.bool_)
+    crashed(scenario.road, constants(SimConfig()), scenario.starts, out)
+    return out
+
+
+def strip(cx, cy, angle, half_width, half_length=45.0):
+    """A corridor's clearance, its ends closed."""
+
+    def shape(x, y):
+        u = (x - cx) * math.cos(angle) + (y - cy) * math.sin(angle)
+        v = -(x - cx) * math.sin(angle) + (y - cy) * math.cos(angle)
+        return np.minimum(half_width - np.abs(v), half_length - np.abs(u))
+
+    return shape

@@ -1,0 +1,258 @@
+"""The Gymnasium environments' pictures, and Gymnasium's wrappers around them."""
+
+import copy
+import pickle
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from driving import SENSING, drive
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
+from gymnasium.wrappers import vector as wrappers
+
+from gridsim.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.render import NoDisplayError
+from gridsim.scenarios import Scenario
+from gridsim.vehicle import Action
+
+F = np.float32
+
+
+# --- pictures
+
+
+def test_a_window_without_a_display_is_a_clear_error(
+    maps: dict[str, list[Scenario]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(variable, raising=False)
+    for env in (GridSimEnv, GridSimVectorEnv):
+        human = env(maps=maps["seamless"][:1], render_mode="human")
+        with pytest.raises(NoDisplayError, match="DISPLAY") as error:
+            human.reset(seed=0)
+        assert "\n" not in str(error.value)
+        human.close()
+
+
+@pytest.mark.usefixtures("dummy")
+def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str, list[Scenario]]) -> None:
+    import pygame
+
+    options: dict[str, Any] = {"scenario": "city", "maps": maps["city"]}
+    human, array = GridSimEnv(render_mode="human", **options), GridSimEnv(render_mode="rgb_array", **options)
+    for env in (human, array):
+        env.reset(seed=5)
+        for _ in range(3):
+            env.step(Action.ACCELERATE)
+    assert human.render() is None
+    picture = array.render()
+    assert picture is not None
+    assert picture.dtype == np.uint8
+    assert picture.shape == (RENDER_SIZE[1], RENDER_SIZE[0], 3)
+    surface = pygame.display.get_surface()
+    assert surface is not None
+    shown = pygame.surfarray.array3d(surface).swapaxes(0, 1)
+    np.testing.assert_array_equal(shown, picture)
+
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    human.step(Action.ACCELERATE)
+    assert pygame.display.get_surface() is None
+    human.step(Action.ACCELERATE)  # drives on, unseen
+    human.close()
+    human.close()
+
+
+def test_pictures_show_each_cars_world(maps: dict[str, list[Scenario]]) -> None:
+    env = GridSimVectorEnv(3, scenario="highway", maps=maps["highway"], render_mode="rgb_array", observation="grid")
+    env.reset(seed=0)
+    pictures = env.render()
+    assert pictures is not None
+    assert len(pictures) == 3
+    assert len({p.tobytes() for p in pictures}) == 3
+    again = env.render()
+    assert again is not None
+    np.testing.assert_array_equal(pictures, again)
+
+
+def film(path: Path) -> tuple[int, float]:
+    """Count of pictures, and pictures a second, of a film."""
+    reader = imageio_ffmpeg.read_frames(str(path))
+    fps = next(reader)["fps"]
+    reader.close()
+    return imageio_ffmpeg.count_frames_and_secs(str(path))[0], fps
+
+
+# MoviePy 2 cuts the last picture of films of 8, 10 or 11 at 10 a second: their seconds, added up, are less than that.
+
+
+def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path) -> None:
+    env: Any = gymnasium.make(env_id("city"), maps=1, render_mode="rgb_array", max_episode_steps=12)
+    env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
+    steps = []
+    for seed in (0, None):
+        env.reset(seed=seed)
+        over, count = False, 0
+        while not over:
+            _, _, terminated, truncated, _ = env.step(int(Action.ACCELERATE))
+            over, count = terminated or truncated, count + 1
+        steps.append(count)
+    env.close()
+    films = sorted((tmp_path / "films").glob("*.mp4"))
+    assert [film(path) for path in films] == [(count + 1, 10.0) for count in steps]
+
+
+def test_record_video_works_on_the_vector_environment(tmp_path: Path) -> None:
+    env: Any = gymnasium.make_vec(env_id("highway"), num_envs=2, maps=1, render_mode="rgb_array", max_episode_steps=6)
+    env = wrappers.RecordVideo(env, str(tmp_path / "films"), video_aspect_ratio=(2, 1), episode_trigger=lambda _: True)
+    env.reset(seed=0)
+    for _ in range(6 + 1 + 4):  # an episode, the step that begins the next one, and some of that one
+        env.step(np.full(2, Action.ACCELERATE))
+    env.close()
+    films = sorted((tmp_path / "films").glob("*.mp4"))
+    assert [film(path) for path in films] == [(7, 10.0), (5, 10.0)]
+
+
+# --- other wrappers
+
+
+@pytest.mark.parametrize(("observation", "frames"), SENSING)
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_wrappers_of_a_single_environment(observation: str, frames: int, actions: str) -> None:
+    options: dict[str, Any] = {"maps": 1, "observation": observation, "frames": frames, "actions": actions}
+    plain = gymnasium.make(env_id("city"), **options)
+    env: Any = RecordEpisodeStatistics(
+        FrameStackObservation(FlattenObservation(gymnasium.make(env_id("city"), **options)), 3)
+    )
+    first, _ = plain.reset(seed=2)
+    seen, _ = env.reset(seed=2)
+    past = [first.reshape(-1)] * 3
+    total, steps, over = 0.0, 0, False
+    action: Any = int(Action.ACCELERATE) if actions == "discrete" else np.array([1.0, 0.1], dtype=np.float32)
+    while not over:
+        np.testing.assert_array_equal(seen, np.array(past))
+        assert seen in env.observation_space
+        now, reward, terminated, truncated, _ = plain.step(action)
+        past = [*past[1:], now.reshape(-1)]
+        seen, wrapped, *_, info = env.step(action)
+        assert wrapped == reward
+        total, steps, over = total + float(reward), steps + 1, terminated or truncated
+    assert info["episode"]["l"] == steps > 5
+    assert info["episode"]["r"] == pytest.approx(total, abs=1e-4)
+
+
+def side_by_side(
+    wrap: Any, steps: int = 40, inner: Any = None, **options: Any
+) -> tuple[gymnasium.vector.VectorEnv, list[tuple[Any, ...]], list[tuple[Any, ...]]]:
+    """A wrapped vector environment and a plain one, driven alike: (the first, what it says, what the second says).
+
+    `inner` turns the actions that the wrapped one is given into those of the plain one.
+    """
+    made: list[Any] = [gymnasium.make_vec(env_id("city"), num_envs=3, maps=1, **options) for _ in range(2)]
+    env, plain = wrap(made[0]), made[1]
+    theirs, ours = [plain.reset(seed=3)], [env.reset(seed=3)]
+    for row in drive(made[1].unwrapped, steps, seed=4):
+        ours.append(env.step(row))
+        theirs.append(plain.step(row if inner is None else inner(row)))
+    return env, ours, theirs
+
+
+def test_vector_wrappers_of_observations() -> None:
+    low, high = np.zeros(32, dtype=np.float32), np.full(32, 2.0, dtype=np.float32)
+    expected: list[tuple[Any, dict[str, Any], Any]] = [
+        (lambda env: wrappers.DtypeObservation(env, F), {"observation": "grid"}, lambda seen: seen.astype(F)),
+        (lambda env: wrappers.ReshapeObservation(env, (4, 8)), {}, lambda seen: seen.reshape(-1, 4, 8)),
+        (lambda env: wrappers.FlattenObservation(env), {"observation": "grid"}, lambda seen: seen.reshape(3, -1)),
+        (
+            lambda env: wrappers.TransformObservation(env, lambda seen: 1.0 - seen),
+            {},
+            lambda seen: 1.0 - seen,
+        ),
+        (
+            lambda env: wrappers.RescaleObservation(env, low, high),
+            {},
+            lambda seen: (seen - [*[0.0] * 31, -0.1]) * 2.0 / [*[1.0] * 31, 1.1],
+        ),
+    ]
+    for wrap, options, transform in expected:
+        env, ours, theirs = side_by_side(wrap, **options)
+        assert len(ours) == 41
+        for mine, plain in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(mine[0], transform(plain[0]), atol=1e-6)
+            if len(mine) == 5:
+                np.testing.assert_array_equal(mine[1], plain[1])
+        env.close()
+    _, ours, _ = side_by_side(lambda env: wrappers.NormalizeObservation(env), steps=200)
+    late = np.concatenate([row[0] for row in ours[100:]])
+    assert np.isfinite(late).all()
+    assert np.abs(late.mean()) < 1.0
+
+
+def test_vector_wrappers_of_actions() -> None:
+    continuous: dict[str, Any] = {"actions": "continuous"}
+    low, high = np.full(2, -0.5, dtype=F), np.full(2, 2.0, dtype=F)
+    cases: list[tuple[Any, Any]] = [
+        (lambda env: wrappers.ClipAction(env), lambda row: row),
+        (
+            lambda env: wrappers.RescaleAction(env, low, high),
+            lambda row: np.clip((row + 0.5) / 1.25 - 1.0, -1.0, 1.0),
+        ),
+        (lambda env: wrappers.TransformAction(env, lambda row: -row), lambda row: -row),
+    ]
+    for wrap, inner in cases:
+        _, ours, theirs = side_by_side(wrap, inner=inner, **continuous)
+        for mine, plain in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(mine[0], plain[0], atol=1e-3)
+    # Beyond the limits it is clipped, and not refused.
+    env = wrappers.ClipAction(gymnasium.make_vec(env_id("city"), num_envs=2, maps=1, **continuous))
+    env.reset(seed=0)
+    *_, info = env.step(np.array([[7.0, 0.0], [1.0, 0.0]], dtype=np.float32))
+    np.testing.assert_allclose(info["speed_mps"], 0.3, atol=1e-6)
+
+
+def test_vector_wrappers_of_rewards() -> None:
+    _, ours, theirs = side_by_side(lambda env: wrappers.ClipReward(env, 0.0, 0.4))
+    clipped = np.array([row[1] for row in ours[1:]])
+    np.testing.assert_allclose(clipped, np.clip([row[1] for row in theirs[1:]], 0.0, 0.4))
+    _, ours, theirs = side_by_side(lambda env: wrappers.TransformReward(env, lambda reward: 3.0 * reward))
+    np.testing.assert_allclose([row[1] for row in ours[1:]], [3.0 * row[1] for row in theirs[1:]], rtol=1e-6)
+    _, ours, theirs = side_by_side(lambda env: wrappers.NormalizeReward(env))
+    normal, plain = (np.array([row[1] for row in rows[1:]]) for rows in (ours, theirs))
+    np.testing.assert_array_equal(np.sign(normal), np.sign(plain))
+    assert not np.allclose(normal, plain)
+
+
+def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
+    env, ours, theirs = side_by_side(
+        lambda env: wrappers.DictInfoToList(wrappers.RecordEpisodeStatistics(env)), steps=150, max_episode_steps=30
+    )
+    returns, lengths, counted = np.zeros(3), np.zeros(3, dtype=int), 0
+    over = np.zeros(3, dtype=bool)
+    for (*_, infos), (_, rewards, terminations, truncations, info) in zip(ours[1:], theirs[1:], strict=True):
+        returns, lengths = np.where(over, 0.0, returns + rewards), np.where(over, 0, lengths + 1)
+        over = terminations | truncations
+        assert [each["distance_m"] for each in infos] == info["distance_m"].tolist()
+        assert [each["end"] for each in infos] == info["end"].tolist()
+        for k in range(3):
+            assert ("episode" in infos[k]) == over[k]
+            if over[k]:
+                assert infos[k]["episode"]["r"] == pytest.approx(returns[k], abs=1e-4)
+                assert infos[k]["episode"]["l"] == lengths[k]
+                counted += 1
+    assert counted > 9
+    env.close()
+
+
+def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Scenario]]) -> None:
+    """Gymnasium copies what it is given; a kernel takes arrays that can be written to for another type."""
+    spec = gymnasium.make(env_id("city"), maps=maps["city"][:1]).spec
+    assert spec is not None
+    copied = spec.make().unwrapped.cars.simulator.scenarios[0]  # type: ignore[attr-defined]
+    assert copied.seed == maps["city"][0].seed
+    for again in (copied, copy.deepcopy(maps["city"][0]), pickle.loads(pickle.dumps(maps["city"][0]))):
+        for name, array in again.arrays().items():
+            np.testing.assert_array_equal(array, maps["city"][0].arrays()[name])
+        for array in (*again.road[:3], *(part for part in again.network if np.ndim(part)), again.lanes.points):
+            assert not array.flags.writeable

@@ -1,0 +1,274 @@
+"""What goes wrong between a run and MLflow: stores, servers and addresses that fail, stall or are no such thing."""
+
+import contextlib
+import http.server
+import os
+import re
+import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from tracked import client, row, steps, tracker
+
+from cluster.tracking import TrackingError, check_uri
+
+# ---------------------------------------------------------------------------------------------- what goes wrong
+
+
+def test_an_experiment_that_was_deleted(uri):
+    client(uri).delete_experiment(client(uri).get_experiment_by_name("other").experiment_id)
+    refused = tracker(uri, experiment="other")
+    with pytest.raises(TrackingError, match="'other' has been deleted"):
+        refused.wait_ready()
+    refused.log_row(0, row(0))
+    assert "1 row (step 0), the status FINISHED: experiment 'other' has been deleted" in refused.close("FINISHED")
+
+
+def test_files_that_cannot_be_stored(uri, tmp_path, impatient):
+    logged = tracker(uri)
+    (tmp_path / "store" / "mlartifacts").write_text("in the way")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "a.png").touch()
+    logged.log_row(0, row(0))
+    logged.log_artifacts(tmp_path / "run")
+    report = logged.close("FINISHED")
+    assert re.fullmatch(rf"not logged to MLflow at {uri}: 1 file: (Not a directory|File exists).*", report)
+    assert logged.close("FINISHED") == report
+    assert steps(uri, logged.run_id) == [0]
+    assert client(uri).get_run(logged.run_id).info.status == "FINISHED"
+
+
+def test_a_database_that_is_locked_for_a_while(uri, impatient):
+    logged = tracker(uri)
+    logged.wait_ready()
+    with contextlib.closing(sqlite3.connect(uri.removeprefix("sqlite:///"), isolation_level=None)) as database:
+        database.execute("BEGIN IMMEDIATE")
+        logged.log_row(0, row(0))
+        time.sleep(0.5)
+        with pytest.raises(TrackingError, match="database is locked"):
+            check_uri(uri)
+        database.execute("ROLLBACK")
+    assert logged.close("FINISHED", timeout_s=30) is None
+    assert steps(uri, logged.run_id) == [0]
+
+
+class Silent:
+    """A server that takes connections and never says a word."""
+
+    def __init__(self):
+        self.socket = socket.create_server(("127.0.0.1", 0))
+        self.uri = f"http://127.0.0.1:{self.socket.getsockname()[1]}"
+
+
+@pytest.fixture
+def silent():
+    server = Silent()
+    yield server
+    server.socket.close()
+
+
+def test_a_server_that_says_nothing_is_waited_for_no_longer_than_allowed(silent, monkeypatch):
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "2")
+    stuck = tracker(silent.uri)
+    for step in range(3, 6):
+        stuck.log_row(step, row(step))
+    with pytest.raises(TrackingError, match=r"not ready after 0\.5 s"):
+        stuck.wait_ready(timeout_s=0.5)
+    started = time.perf_counter()
+    report = stuck.close("KILLED", timeout_s=1.0)
+    assert time.perf_counter() - started < 1.5
+    start = f"not logged to MLflow at {silent.uri}: 3 rows (step 3 to 5), the status KILLED: no answer "
+    assert report in (start + "within 1 s", start + "in time")
+    stuck._thread.join(20)
+    assert not stuck._thread.is_alive()
+    assert stuck.error == "no answer in time"
+
+
+@contextlib.contextmanager
+def mlflow_server(folder, port):
+    """MLflow's own, with a database and artifacts in `folder`; what is yielded kills it."""
+    command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1", "--port", str(port)]
+    command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
+    with open(folder / "server.log", "a") as log:
+        quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
+        server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)
+    try:
+        for _ in range(300):
+            with contextlib.suppress(TrackingError):
+                check_uri(f"http://127.0.0.1:{port}")
+                break
+            time.sleep(0.2)
+        yield lambda: os.killpg(server.pid, signal.SIGKILL)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGKILL)
+        server.wait(10)
+
+
+@pytest.mark.e2e
+def test_a_server_that_goes_away_and_comes_back(tmp_path, empty_database, capfd):
+    shutil.copy(empty_database, tmp_path / "served.db")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "summary.json").write_text("{}")
+    with mlflow_server(tmp_path, port) as kill:
+        uri = check_uri(f"http://127.0.0.1:{port}/")
+        assert uri == f"http://127.0.0.1:{port}"
+        logged = tracker(uri)
+        for step in range(5):
+            logged.log_row(step, row(step))
+        run_id = logged.wait_ready(60)
+        while logged.missing(range(5)):
+            time.sleep(0.1)
+        kill()
+        time.sleep(2.0)  # the pause between two batches
+        for step in range(5, 9):
+            logged.log_row(step, row(step))
+        logged.log_artifacts(tmp_path / "run")
+        while logged.error is None:
+            time.sleep(0.1)
+        started = time.perf_counter()
+        report = logged.close("FINISHED")
+        assert time.perf_counter() - started < 5.0
+        assert report == (
+            f"not logged to MLflow at {uri}: 4 rows (step 5 to 8), 1 file, the status FINISHED: Connection refused"
+        )
+    with mlflow_server(tmp_path, port):
+        resumed = tracker(uri, run_id=run_id)
+        for step in range(9):
+            resumed.log_row(step, row(step))
+        resumed.log_artifacts(tmp_path / "run")
+        assert resumed.close("FINISHED", timeout_s=30) is None
+        assert resumed.run_id == run_id
+        assert steps(uri, run_id) == list(range(9))
+        assert client(uri).get_run(run_id).info.status == "FINISHED"
+        assert [each.path for each in client(uri).list_artifacts(run_id)] == ["summary.json"]
+        assert not os.path.exists(tmp_path / "mlartifacts")
+    assert capfd.readouterr() == ("", "")
+
+
+# ---------------------------------------------------------------------------------------------- addresses
+
+
+def refused(uri):
+    started = time.perf_counter()
+    with pytest.raises(TrackingError) as caught:
+        check_uri(uri)
+    assert time.perf_counter() - started < 5.0
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+    return str(caught.value)
+
+
+def test_addresses_become_absolute(tmp_path, monkeypatch, empty_database):
+    (tmp_path / "a folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert check_uri() == f"sqlite:///{tmp_path}/mlflow.db"
+    assert check_uri("sqlite:///a folder/../b.db?timeout=9") == f"sqlite:///{tmp_path}/b.db?timeout=9"
+    assert check_uri(f"sqlite:////{tmp_path}/b.db").endswith(f"{tmp_path}/b.db")
+    assert check_uri(f"sqlite:///{empty_database}") == f"sqlite:///{empty_database}"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "sqlite:///a folder/from the environment.db")
+    assert check_uri() == f"sqlite:///{tmp_path}/a folder/from the environment.db"
+    assert check_uri("sqlite:///given.db") == f"sqlite:///{tmp_path}/given.db"
+    assert os.listdir(tmp_path) == ["a folder"]
+
+
+@pytest.mark.parametrize(
+    ("uri", "reason"),
+    [
+        ("mlruns", "no runs in folders"),
+        ("./mlruns", "no runs in folders"),
+        ("file:///tmp/mlruns", "no runs in folders"),
+        ("sqlite://", "names no file"),
+        ("sqlite:///:memory:", "names no file"),
+        ("sqlite:///no/such/folder/mlflow.db", "there is no folder"),
+        ("sqlite:///.", "is a folder"),
+        ("sqlite:///text.db", "file is not a database"),
+        ("ftp://host/x", "not a tracking address"),
+        ("http://", "no MLflow server"),
+        ("http://no-such-host.invalid:5000", "no MLflow server"),
+        ("postgresql://someone:secret@127.0.0.1:1/db", "Connection refused"),
+        ("http://someone:secret@127.0.0.1:1", "Connection refused"),
+        ("https://127.0.0.1:1", "Connection refused"),
+        ("http://127.0.0.1:99999", "no MLflow server"),
+    ],
+)
+def test_addresses_that_cannot_be_used(tmp_path, monkeypatch, uri, reason):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
+    text = refused(uri)
+    assert reason in text
+    assert "secret" not in text
+    assert os.listdir(tmp_path) == ["text.db"]
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "ro", "tmpfs", str(folder)]
+    as_root = os.geteuid() == 0  # whom permissions do not stop, but a read-only file system does
+    if as_root and subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("root without the right to mount")
+    if not as_root:
+        folder.chmod(0o500)
+    try:
+        assert "cannot be written" in refused(f"sqlite:///{folder}/mlflow.db")
+    finally:
+        if as_root:
+            subprocess.run(["umount", str(folder)], check=True)
+
+
+@pytest.fixture
+def web_server():
+    """Serves `pages`, path to (status, body), and 404 for everything else."""
+    pages: dict[str, tuple[int, bytes]] = {}
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            status, body = pages.get(self.path.partition("?")[0], (404, b"<html>not here</html>"))
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}", pages
+    server.shutdown()
+    server.server_close()
+
+
+SEARCH = "/api/2.0/mlflow/experiments/search"
+
+
+def test_what_else_may_answer(web_server, silent, impatient):
+    uri, pages = web_server
+    assert "something else answers" in refused(uri)
+    pages["/health"] = (200, b"<html>a page of somebody's own</html>")
+    assert "something else answers" in refused(uri)
+    pages["/health"] = (502, b"bad gateway")
+    assert "error 502" in refused(uri)
+    pages["/health"] = (403, b"Invalid Host header - possible DNS rebinding attack detected")
+    assert "refuses this host name" in refused(uri)
+    assert "no answer in time" in refused(silent.uri)
+    for answers in (
+        {"/health": (200, b"OK")},
+        {"/health": (401, b"You are not authenticated")},
+        {SEARCH: (200, b'{"experiments": []}')},
+        {"/health": (200, b"<html></html>"), SEARCH: (403, b"")},
+    ):
+        pages.clear()
+        pages.update(answers)
+        assert check_uri(uri + "/") == uri
+    pages.clear()
+    pages["/prefix/health"] = (200, b"OK")
+    assert check_uri(f"{uri}/prefix/") == f"{uri}/prefix"
