@@ -17,8 +17,11 @@ from gridsim.scenarios import Scenario
 BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
 Progress = Callable[[int, int], None]  # (members done, members in all)
 
+PARTS = 4  # as many workers' chunks are a pool's that has one worker and nothing to send: for progress alone
 METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it is known better
-WORTH_SENDING_S = 0.004  # of evaluation: several times what it costs to send a chunk and to take in its results
+WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to take in its results
+LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
+SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
 
 
 class PoolError(Exception):
@@ -124,7 +127,7 @@ class SerialPool:
         maps = [self._build_map(*name) for name in task.maps]
         if meanwhile:
             meanwhile()
-        for index, chunk in enumerate(cut(task, asked, 1)):
+        for index, chunk in enumerate(cut(task, asked, PARTS)):
             try:
                 part = of_episodes(task, chunk.columns.start, chunk.columns.stop)
                 outcome.add(0, chunk, *self._worker.evaluate(part, maps, recipes[chunk.rows]))
@@ -163,7 +166,7 @@ def metres(task: Task, chunk: Chunk) -> float:
 def cut(task: Task, asked: Sequence[Chunk], workers: int, metre_s: float = METRE_S) -> list[Chunk]:
     """Cut what is asked for into chunks, by the metres to be driven: large ones first, small ones last.
 
-    Each takes half of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
+    Each takes most of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
     little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one's
     episodes where that is enough, so that every worker has its share even of one member. Depends on the arguments
     alone, and no result depends on it.
@@ -176,7 +179,7 @@ def cut(task: Task, asked: Sequence[Chunk], workers: int, metre_s: float = METRE
         mileage = np.concatenate([[0.0], np.cumsum(goals[columns])])  # m, of one member
         row, column = rows.start, 0
         while row < rows.stop and columns.stop > columns.start:
-            share = max(left / (2 * workers), least)
+            share = min(max(SHARE * left / workers, least), LARGEST_S / metre_s)
             if column == 0 and share >= mileage[-1]:
                 stop = min(row + int(share / mileage[-1]), rows.stop)
                 chunks.append(Chunk(slice(row, stop), columns))

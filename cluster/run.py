@@ -208,6 +208,7 @@ class Session:
 
     def __post_init__(self) -> None:
         self.evolution = Evolution(self.run.settings, self.pool, self.maps, self.initial, on_progress=self.on_progress)
+        self._digest = self.run.digest()
         if self.run.saved is not None:
             self.evolution.restore(*self.run.saved)
 
@@ -247,7 +248,7 @@ class Session:
         """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
         arrays, meta = self.evolution.state()
         meta |= {
-            "digest": self.run.digest(),
+            "digest": self._digest,
             "init_sha256": self.run.init_sha256,
             "tracking": {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key},
         }

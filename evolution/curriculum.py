@@ -22,7 +22,7 @@ from gridsim.ego import End
 from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
 from gridsim.world import check_worlds
 
-HELD_OUT_MAPS = 8
+HELD_OUT_MAPS = 16
 HELD_OUT_EPISODES = 64
 VALIDATION_MAPS = 48
 
