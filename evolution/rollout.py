@@ -35,6 +35,7 @@ from gridsim.jit import njit
 from gridsim.roads import VISIT_CELL, freeze
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan
+from gridsim.sides import keeps_side
 from gridsim.traffic import drivers, flow
 from gridsim.world import FIELDS as TRAFFIC_FIELDS
 
@@ -101,6 +102,7 @@ def _packed(genome, layers, eye):
 def _run(
     road,
     network,
+    sides,
     constants,
     drivers,
     fan,
@@ -147,7 +149,10 @@ def _run(
             if keep > 0:
                 world_ring[steps % keep] = world
             flow(network, drivers, world, car)
+        paced = car[PACED]
         end = drive(road, constants, car, visits, world, action)
+        if world is not None and not keeps_side(sides, road.width, car[X], car[Y], car[COS], car[SIN]):
+            car[PACED] = paced
         steps += 1
         if end == 0:
             if car[DISTANCE] >= target:
@@ -161,6 +166,7 @@ def _run(
 def _rollout(
     road,
     network,
+    sides,
     constants,
     drivers,
     fan,
@@ -201,6 +207,7 @@ def _rollout(
         end = _run(
             road,
             network,
+            sides,
             constants,
             drivers,
             fan,
@@ -285,6 +292,7 @@ def evaluate(
         _rollout(
             scenarios[episode["map"]].road,
             scenarios[episode["map"]].network,
+            scenarios[episode["map"]].sides,
             k,
             others,
             rays,
@@ -331,6 +339,7 @@ def trajectory(
     result, states, worlds = _trajectory(
         scenario.road,
         scenario.network,
+        scenario.sides,
         k,
         drivers(config),
         rays,
@@ -351,7 +360,7 @@ def trajectory(
 
 @njit(nogil=True)
 def _trajectory(
-    road, network, constants, drivers, fan, genome, layers, start, traffic, target, max_steps, rays, closing, eye
+    road, network, sides, constants, drivers, fan, genome, layers, start, traffic, target, max_steps, rays, closing, eye
 ):
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car = np.empty(FIELDS, dtype=np.float32)
@@ -367,6 +376,7 @@ def _trajectory(
     end = _run(
         road,
         network,
+        sides,
         constants,
         drivers,
         fan,

@@ -15,12 +15,13 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 
 @leaf
-def cast_boxes(constants, fan, width, height, x, y, cosine, sine, world, ranges, closing):
+def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, ranges, closing):
     """Shorten ranges (m) to the first box of a world that each ray meets: slab test (Kay and Kajiya 1986).
 
-    Args: fan of `sensors.fan`; sides of the torus, m; the sensor's position (m) and heading; world of `traffic`.
-    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the speed (m/s) over ground at which what a
-    ray has met comes towards the sensor along it, as a radar tells; 0 where that is the road's edge.
+    Args: fan of `sensors.fan`; sides of the torus, m; the sensor's position (m), heading and speed (m/s) along it;
+    world of `world`.
+    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the relative speed (m/s) at which a car that
+    a ray has met and the sensor come closer along it, as a radar tells; 0 where that is the road's edge.
     """
     if closing is not None:
         closing[:] = _ZERO
@@ -59,7 +60,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, world, ranges,
             if enter <= leave and leave > _ZERO and enter < ranges[r]:
                 ranges[r] = max(enter, _ZERO)
                 if closing is not None:
-                    closing[r] = -world[j, SPEED] * ux  # the box moves along its own heading
+                    closing[r] = speed * fan[0, r] - world[j, SPEED] * ux  # the box moves along its own heading
 
 
 @leaf

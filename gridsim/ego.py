@@ -113,7 +113,8 @@ def look(road, constants, fan, car, world, beams, ranges, closing):
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
     if world is not None:
-        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], world, ranges, closing)
+        speed = car[SPEED]
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], speed, world, ranges, closing)
 
 
 @leaf

@@ -17,7 +17,9 @@ _F, _I = np.float32, np.int32
 _ZERO, _HALF = _F(0.0), _F(0.5)
 
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
-_CROSSING_TIME = _F(4.0)  # s, what it takes to leave a junction
+_CROSSING_TIME = _F(3.0)  # s, what it takes to leave a junction
+_NEAR = _F(7.0)  # m around the ego car where nobody enters a junction
+_AHEAD = _F(0.6)  # cosine of the angle from its heading within which it may get to before long
 
 
 @leaf
@@ -45,6 +47,18 @@ def _reaches(network, lane, x, y, within):
             return _F(k - first) * network.steps[lane]
         k += max(_I((apart - within) / network.steps[lane]), _I(1))
     return _F(1e9)
+
+
+@leaf
+def _awaits(network, lane, ego, way):
+    """Whether a lane comes within `way` m of the ego car in front of it, or right beside it."""
+    for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
+        dx = turned(network.points[p, 0] - ego[X], network.width)
+        dy = turned(network.points[p, 1] - ego[Y], network.height)
+        apart = math.sqrt(dx * dx + dy * dy)
+        if apart < _NEAR or (apart < way and dx * ego[COS] + dy * ego[SIN] > _AHEAD * apart):
+            return True
+    return False
 
 
 @leaf
@@ -97,18 +111,18 @@ def may_enter(network, drivers, world, i, ego):
             room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
         elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and is_junction(network, there)):
             needed += place
-    # The ego car goes first, unless it is behind this one.
+    # The ego car goes first, unless it is behind this one. Which way it will turn nobody knows, so all the ground ahead
+    # of it is left to it; but who is in a junction already, as in a roundabout, goes on.
     if ego[COS] != _ZERO or ego[SIN] != _ZERO:
         dx, dy = ego[X] - car[X], ego[Y] - car[Y]
         dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
         forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-        way = _CROSSING_TIME * max(ego[SPEED], _ZERO)
+        same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
+        way = _NEAR + _CROSSING_TIME * max(ego[SPEED], _ZERO)
         far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
-        if dx * dx + dy * dy < far * far and not (forward < _ZERO and abs(aside) < _F(2.5)):
-            for k in range(1 + _I(way / _F(4.0))):
-                x, y = ego[X] + _F(4.0) * _F(k) * ego[COS], ego[Y] + _F(4.0) * _F(k) * ego[SIN]
-                if _reaches(network, lane, x, y, _F(3.0)) < _F(1e8):
-                    return False
+        if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < _F(2.5))):
+            if not is_junction(network, here) and _awaits(network, lane, ego, way):
+                return False
             rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
             room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
     return room >= needed

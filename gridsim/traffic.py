@@ -169,9 +169,8 @@ def follow(network, drivers, car, other, is_ego):
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    same_way = car[COS] * other[COS] + car[SIN] * other[SIN] > _HALF
-    if is_ego and not looked and same_way and other[SPEED] > _ONE:
-        # Where the ego car will be in a second: it may be about to cut in.
+    if is_ego and not looked and other[SPEED] > _ONE:
+        # Where the ego car will be in a second: it may be about to cut in, or to cross.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
         at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])
         if at < car[GAP] and forward > _ZERO:
