@@ -45,7 +45,8 @@ _F = np.float32
 #: its own target (m) and limit (control steps), where these are not 0.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4")])
 
-#: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
+#: What comes back of an episode: new ground (m); new ground at a speed within the interval and, among traffic, on the
+#: own side of the road (m); control steps; End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
 
 
@@ -124,6 +125,8 @@ def _run(
 ):
     """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there is an Eye.
 
+    Returns: (End as a number, m of PACED that were not on the car's own side of the road; 0 without traffic).
+
     ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n.
     world_ring float32 [n, cars, fields] is the same of its world.
     """
@@ -131,6 +134,7 @@ def _run(
     keep = ring.shape[0]
     end = 0
     steps = 0
+    strayed = _F(0.0)
     while end == 0:
         look(road, constants, fan, car, world, beams, ranges, closing)
         if eye is None:
@@ -152,14 +156,14 @@ def _run(
         paced = car[PACED]
         end = drive(road, constants, car, visits, world, action)
         if world is not None and not keeps_side(sides, road.width, car[X], car[Y], car[COS], car[SIN]):
-            car[PACED] = paced
+            strayed += car[PACED] - paced
         steps += 1
         if end == 0:
             if car[DISTANCE] >= target:
                 end = 3
             elif steps >= max_steps:
                 end = 4
-    return end
+    return end, strayed
 
 
 @njit(nogil=True)
@@ -204,7 +208,7 @@ def _rollout(
         packed = _packed(genomes[i], layers, eye)
         if traffic is not None:
             world = traffic.copy()
-        end = _run(
+        end, strayed = _run(
             road,
             network,
             sides,
@@ -229,7 +233,7 @@ def _rollout(
         )
         row = results[i, column]
         row["distance"] = car[DISTANCE]
-        row["paced"] = car[PACED]
+        row["paced"] = car[PACED] - strayed
         row["steps"] = car[STEPS]
         row["end"] = end
         if rewind > 0:
@@ -373,7 +377,7 @@ def _trajectory(
     world = None if traffic is None else traffic.copy()
     cars = 0 if traffic is None else traffic.shape[0]
     world_ring = np.zeros((max_steps + 1, cars, TRAFFIC_FIELDS), dtype=np.float32)
-    end = _run(
+    end, strayed = _run(
         road,
         network,
         sides,
@@ -399,4 +403,4 @@ def _trajectory(
     ring[int(car[STEPS])] = car
     if traffic is not None:
         world_ring[int(car[STEPS])] = world
-    return (car[DISTANCE], car[PACED], car[STEPS], end), ring, world_ring
+    return (car[DISTANCE], car[PACED] - strayed, car[STEPS], end), ring, world_ring

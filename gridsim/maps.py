@@ -42,8 +42,8 @@ from gridsim.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.sides import make_sides
 from gridsim.scenarios import FILE_SPEEDS, START_SPEED, Scenario
+from gridsim.sides import make_sides
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}

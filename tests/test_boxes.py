@@ -17,6 +17,7 @@ from gridsim.network import make_network
 from gridsim.roads import Strips, clearance_nodes, freeze, make_road
 from gridsim.scenarios import Scenario
 from gridsim.sensors import fan
+from gridsim.sides import make_sides
 from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 from gridsim.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, SIN, SPEED, X, Y
@@ -42,7 +43,12 @@ def parked(*poses):
 def _cast(k, rays, side, poses, worlds, ranges):
     for i in range(len(poses)):
         x, y, cosine, sine = poses[i]
-        cast_boxes(k, rays, side, side, x, y, cosine, sine, worlds[i], ranges[i], None)
+        cast_boxes(k, rays, side, side, x, y, cosine, sine, F(0.0), worlds[i], ranges[i], None)
+
+
+@njit
+def _closing(k, rays, side, speed, world, ranges, closing):
+    cast_boxes(k, rays, side, side, F(10.0), F(10.0), F(1.0), F(0.0), speed, world, ranges, closing)
 
 
 def cast(poses, worlds, reach=50.0):
@@ -66,6 +72,30 @@ def check_rays(pose, boxes, ranges):
 
 
 # --- Rays ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("heading", "speed", "expected"),
+    [
+        (math.pi, 7.0, 12.0),  # comes towards us
+        (0.0, 7.0, -2.0),  # drives away
+        (0.0, 0.0, 5.0),  # stands
+        (math.pi / 2, 7.0, 5.0),  # crosses
+    ],
+)
+def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(heading, speed, expected):
+    """Head on, at 5 m/s; along the ray, so that only the middle one has the speeds' plain sum."""
+    world = parked((21.0, 10.0, heading))
+    world[0, SPEED] = speed
+    ranges, closing = np.full(31, 50.0, dtype=F), np.full(31, 99.0, dtype=F)
+    _closing(K, RAYS, F(SIDE), F(5.0), world, ranges, closing)
+    assert closing[15] == pytest.approx(expected, abs=1e-5)
+    velocity = speed * np.array([math.cos(heading), math.sin(heading)])
+    rays = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+    met = ranges < 50.0
+    assert 1 < met.sum() < 10
+    assert closing[met] == pytest.approx(((np.array([5.0, 0.0]) - velocity) @ rays[met].T), abs=1e-4)
+    assert (closing[~met] == 0.0).all(), "the road's edge has no motion"
 
 
 def test_rays_are_the_oracles():
@@ -191,7 +221,7 @@ def cross():
         freeze(array)
     road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 50.0)
     network = make_network(lanes, SIDE, SIDE, 30.0, CONFIG.traffic)
-    return Scenario("cross", 0, road, lanes, strips, network)
+    return Scenario("cross", 0, road, lanes, strips, network, make_sides(lanes, SIDE, SIDE))
 
 
 def on_lane(lane, along, speed, pose):
