@@ -14,7 +14,7 @@ import numpy as np
 
 from evolution import convnet
 from evolution.policy import BLOCK, INPUTS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size
-from gridsim.config import SimConfig, constants
+from gridsim.config import Constants, SimConfig, constants
 from gridsim.ego import (
     COS,
     DISTANCE,
@@ -32,11 +32,12 @@ from gridsim.ego import (
 )
 from gridsim.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.jit import njit
-from gridsim.roads import VISIT_CELL, freeze
+from gridsim.network import Network
+from gridsim.roads import VISIT_CELL, Road, freeze
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan
 from gridsim.sides import keeps_side
-from gridsim.traffic import drivers, flow
+from gridsim.traffic import Drivers, drivers, flow
 from gridsim.world import FIELDS as TRAFFIC_FIELDS
 
 _F = np.float32
@@ -89,6 +90,60 @@ def _closing(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
     return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
 
 
+class Setting(NamedTuple):
+    """What the episodes on a map have in common, as the kernels read it."""
+
+    road: Road
+    network: Network
+    sides: np.ndarray
+    constants: Constants
+    drivers: Drivers
+    fan: np.ndarray
+    rays: int
+
+
+def _on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
+    """The settings of episodes on these maps."""
+    k, others = constants(config), drivers(config)
+    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    return [Setting(map.road, map.network, map.sides, k, others, rays, config.sensors.rays) for map in scenarios]
+
+
+class Bounds(NamedTuple):
+    """Where an episode begins and where it ends if nothing happens."""
+
+    start: np.ndarray  # float32 [5]
+    target: np.float32  # m
+    steps: int
+
+
+class Room(NamedTuple):
+    """What an episode is driven in; it is used again for the next."""
+
+    car: np.ndarray  # float32 [FIELDS]
+    visits: np.ndarray  # float32 [cells]
+    beams: np.ndarray  # float32 [3, LANES]
+    ranges: np.ndarray  # float32 [rays]
+    scratch: np.ndarray  # float32, of the network
+    ring: np.ndarray  # float32 [n, FIELDS], left with the last n states: that of step k in row k % n
+    world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
+
+
+@njit
+def _make_room(setting, layers, rows, cars):
+    """Room that keeps the last `rows` states of a car and of so many others."""
+    road = setting.road
+    return Room(
+        np.empty(FIELDS, dtype=np.float32),
+        np.empty(int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL), dtype=np.float32),
+        np.empty((3, LANES), dtype=np.float32),
+        np.empty(setting.rays, dtype=np.float32),
+        np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32),
+        np.zeros((rows, FIELDS), dtype=np.float32),
+        np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
+    )
+
+
 @njit
 def _packed(genome, layers, eye):
     """A genome as its network reads it."""
@@ -100,46 +155,24 @@ def _packed(genome, layers, eye):
 
 
 @njit
-def _run(
-    road,
-    network,
-    sides,
-    constants,
-    drivers,
-    fan,
-    packed,
-    layers,
-    start,
-    target,
-    max_steps,
-    car,
-    visits,
-    world,
-    beams,
-    ranges,
-    closing,
-    scratch,
-    eye,
-    ring,
-    world_ring,
-):
+def _run(setting, packed, layers, bounds, room, world, closing, eye):
     """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there is an Eye.
 
-    Returns: (End as a number, m of PACED that were not on the car's own side of the road; 0 without traffic).
+    What may be None is an argument of its own: Numba leaves out the branches that it rules out for those alone.
 
-    ring float32 [n, FIELDS] is left with its last n states: that of step k in row k % n.
-    world_ring float32 [n, cars, fields] is the same of its world.
+    Returns: (End as a number, m of PACED that were not on the car's own side of the road; 0 without traffic).
     """
-    place(road, start, car, visits)
-    keep = ring.shape[0]
+    road, constants, car, ranges = setting.road, setting.constants, room.car, room.ranges
+    place(road, bounds.start, car, room.visits)
+    keep = room.ring.shape[0]
     end = 0
     steps = 0
     strayed = _F(0.0)
     while end == 0:
-        look(road, constants, fan, car, world, beams, ranges, closing)
+        look(road, constants, setting.fan, car, world, room.beams, ranges, closing)
         if eye is None:
-            encode(ranges, closing, car[SPEED], scratch)
-            action = decide(packed, layers, scratch)
+            encode(ranges, closing, car[SPEED], room.scratch)
+            action = decide(packed, layers, room.scratch)
         else:
             fill_grid(eye.table, ranges, eye.grid)
             convnet.push(eye.grid, steps == 0, eye.room)
@@ -148,89 +181,36 @@ def _run(
             end = 2
             break
         if keep > 0:
-            ring[steps % keep] = car
+            room.ring[steps % keep] = car
         if world is not None:
             if keep > 0:
-                world_ring[steps % keep] = world
-            flow(network, drivers, world, car)
+                room.world_ring[steps % keep] = world
+            flow(setting.network, setting.drivers, world, car)
         paced = car[PACED]
-        end = drive(road, constants, car, visits, world, action)
-        if world is not None and not keeps_side(sides, road.width, car[X], car[Y], car[COS], car[SIN]):
+        end = drive(road, constants, car, room.visits, world, action)
+        if world is not None and not keeps_side(setting.sides, road.width, car[X], car[Y], car[COS], car[SIN]):
             strayed += car[PACED] - paced
         steps += 1
         if end == 0:
-            if car[DISTANCE] >= target:
+            if car[DISTANCE] >= bounds.target:
                 end = 3
-            elif steps >= max_steps:
+            elif steps >= bounds.steps:
                 end = 4
     return end, strayed
 
 
 @njit(nogil=True)
-def _rollout(
-    road,
-    network,
-    sides,
-    constants,
-    drivers,
-    fan,
-    genomes,
-    layers,
-    start,
-    traffic,
-    target,
-    max_steps,
-    rewind,
-    rays,
-    closing,
-    eye,
-    results,
-    column,
-    rewound,
-    rewound_worlds,
-):
+def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, column, results, rewound, rewound_worlds):
     """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results[:, column].
 
     If rewind > 0 also rewound[:, column] and rewound_worlds[:, column].
     """
-    cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
-    car = np.empty(FIELDS, dtype=np.float32)
-    visits = np.empty(cells, dtype=np.float32)
-    beams = np.empty((3, LANES), dtype=np.float32)
-    ranges = np.empty(rays, dtype=np.float32)
-    scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    ring = np.zeros((rewind, FIELDS), dtype=np.float32)
-    world = None
-    world_ring = np.zeros((0, 0, 0), dtype=np.float32)
-    if traffic is not None:
-        world_ring = np.zeros((rewind, traffic.shape[0], traffic.shape[1]), dtype=np.float32)
+    room = _make_room(setting, layers, rewind, 0 if traffic is None else traffic.shape[0])
+    car = room.car
     for i in range(genomes.shape[0]):
         packed = _packed(genomes[i], layers, eye)
-        if traffic is not None:
-            world = traffic.copy()
-        end, strayed = _run(
-            road,
-            network,
-            sides,
-            constants,
-            drivers,
-            fan,
-            packed,
-            layers,
-            start,
-            target,
-            max_steps,
-            car,
-            visits,
-            world,
-            beams,
-            ranges,
-            closing,
-            scratch,
-            eye,
-            ring,
-            world_ring,
-        )
+        world = None if traffic is None else traffic.copy()
+        end, strayed = _run(setting, packed, layers, bounds, room, world, closing, eye)
         row = results[i, column]
         row["distance"] = car[DISTANCE]
         row["paced"] = car[PACED] - strayed
@@ -238,9 +218,9 @@ def _rollout(
         row["end"] = end
         if rewind > 0:
             row_back = max(int(car[STEPS]) - rewind, 0) % rewind
-            back = ring[row_back]
+            back = room.ring[row_back]
             if traffic is not None:
-                rewound_worlds[i, column] = world_ring[row_back]
+                rewound_worlds[i, column] = room.world_ring[row_back]
             rewound[i, column, 0] = back[X]
             rewound[i, column, 1] = back[Y]
             rewound[i, column, 2] = math.atan2(back[SIN], back[COS])
@@ -285,33 +265,28 @@ def evaluate(
         worlds = no_traffic(len(episodes))
     if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
         raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
-    k, others = constants(config), drivers(config)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     results = np.zeros((len(genomes), len(episodes)), dtype=RESULT)
     rewound = np.zeros((len(genomes), len(episodes), 5 if rewind else 0), dtype=np.float32)
     cars = worlds.shape[1] if rewind else 0
     rewound_worlds = np.zeros((len(genomes), len(episodes), cars, TRAFFIC_FIELDS), dtype=np.float32)
+    settings = _on(scenarios, config)
     for column, episode in enumerate(episodes):
         _rollout(
-            scenarios[episode["map"]].road,
-            scenarios[episode["map"]].network,
-            scenarios[episode["map"]].sides,
-            k,
-            others,
-            rays,
+            settings[episode["map"]],
             genomes,
             spec.layers,
-            freeze(episode["start"].copy()),
+            Bounds(
+                freeze(episode["start"].copy()),
+                _F(episode["target"] or limits.target),
+                int(episode["steps"] or limits.steps),
+            ),
             freeze(worlds[column].copy()) if worlds.shape[1] else None,
-            _F(episode["target"] or limits.target),
-            int(episode["steps"] or limits.steps),
-            rewind,
-            config.sensors.rays,
             _closing(spec, config),
             eye,
-            results,
+            rewind,
             column,
+            results,
             rewound,
             rewound_worlds,
         )
@@ -338,22 +313,12 @@ def trajectory(
     Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
     `gridsim.ego`, and the traffic then, float32 [steps + 1, cars, world.FIELDS]).
     """
-    k = constants(config)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
     result, states, worlds = _trajectory(
-        scenario.road,
-        scenario.network,
-        scenario.sides,
-        k,
-        drivers(config),
-        rays,
+        _on([scenario], config)[0],
         freeze(genome),
         spec.layers,
-        freeze(start),
+        Bounds(freeze(start), _F(limits.target), limits.steps),
         None if world is None or not len(world) else freeze(world.copy()),
-        _F(limits.target),
-        limits.steps,
-        config.sensors.rays,
         _closing(spec, config),
         _eye(spec, config),
     )
@@ -363,44 +328,12 @@ def trajectory(
 
 
 @njit(nogil=True)
-def _trajectory(
-    road, network, sides, constants, drivers, fan, genome, layers, start, traffic, target, max_steps, rays, closing, eye
-):
-    cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
-    car = np.empty(FIELDS, dtype=np.float32)
-    visits = np.empty(cells, dtype=np.float32)
-    beams = np.empty((3, LANES), dtype=np.float32)
-    ranges = np.empty(rays, dtype=np.float32)
-    scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    packed = _packed(genome, layers, eye)
-    ring = np.zeros((max_steps + 1, FIELDS), dtype=np.float32)
+def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
+    room = _make_room(setting, layers, bounds.steps + 1, 0 if traffic is None else traffic.shape[0])
+    car = room.car
     world = None if traffic is None else traffic.copy()
-    cars = 0 if traffic is None else traffic.shape[0]
-    world_ring = np.zeros((max_steps + 1, cars, TRAFFIC_FIELDS), dtype=np.float32)
-    end, strayed = _run(
-        road,
-        network,
-        sides,
-        constants,
-        drivers,
-        fan,
-        packed,
-        layers,
-        start,
-        target,
-        max_steps,
-        car,
-        visits,
-        world,
-        beams,
-        ranges,
-        closing,
-        scratch,
-        eye,
-        ring,
-        world_ring,
-    )
-    ring[int(car[STEPS])] = car
+    end, strayed = _run(setting, _packed(genome, layers, eye), layers, bounds, room, world, closing, eye)
+    room.ring[int(car[STEPS])] = car
     if traffic is not None:
-        world_ring[int(car[STEPS])] = world
-    return (car[DISTANCE], car[PACED] - strayed, car[STEPS], end), ring, world_ring
+        room.world_ring[int(car[STEPS])] = world
+    return (car[DISTANCE], car[PACED] - strayed, car[STEPS], end), room.ring, room.world_ring
