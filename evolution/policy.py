@@ -233,6 +233,15 @@ def packed_size(layers):
 
 
 @njit
+def scratch_size(layers):
+    """Numbers that `forward` needs room for: two layers of the widest."""
+    widest = 0
+    for k in range(layers.shape[0]):
+        widest = max(widest, layers[k])
+    return 2 * (widest + BLOCK)
+
+
+@njit
 def pack(genome, layers, packed):
     """Lay a genome out for `forward`.
 
@@ -307,7 +316,7 @@ def decide(packed, layers, scratch):
 
 @njit
 def _act_on(packed, layers, observations, motion, reach, speed_limit, actions):
-    scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
+    scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     rays = (layers[0] - 1) // 2 if motion else layers[0] - 1
     ranges, closing = np.empty(rays, dtype=np.float32), np.empty(rays, dtype=np.float32)
     for n in range(observations.shape[0]):

@@ -13,7 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution import convnet
-from evolution.policy import BLOCK, INPUTS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size
+from evolution.policy import (
+    INPUTS,
+    CnnSpec,
+    MlpSpec,
+    PolicySpec,
+    decide,
+    encode,
+    pack,
+    packed_size,
+    scratch_size,
+)
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.ego import (
     COS,
@@ -31,7 +41,7 @@ from gridsim.ego import (
     place,
 )
 from gridsim.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.jit import njit
+from gridsim.jit import leaf, njit
 from gridsim.network import Network
 from gridsim.roads import VISIT_CELL, Road, freeze
 from gridsim.scenarios import Scenario
@@ -129,6 +139,21 @@ class Room(NamedTuple):
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
 
 
+@leaf
+def _copy(state, kept):
+    """Copy a car's state [fields]. By numbers: to compile an assignment of slices takes a second longer."""
+    for i in range(state.shape[0]):
+        kept[i] = state[i]
+
+
+@leaf
+def _copy_world(world, kept):
+    """Copy a world [cars, fields]."""
+    for j in range(world.shape[0]):
+        for i in range(world.shape[1]):
+            kept[j, i] = world[j, i]
+
+
 @njit
 def _make_room(setting, layers, rows, cars):
     """Room that keeps the last `rows` states of a car and of so many others."""
@@ -138,7 +163,7 @@ def _make_room(setting, layers, rows, cars):
         np.empty(int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL), dtype=np.float32),
         np.empty((3, LANES), dtype=np.float32),
         np.empty(setting.rays, dtype=np.float32),
-        np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32),
+        np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
     )
@@ -181,10 +206,10 @@ def _run(setting, packed, layers, bounds, room, world, closing, eye):
             end = 2
             break
         if keep > 0:
-            room.ring[steps % keep] = car
+            _copy(car, room.ring[steps % keep])
         if world is not None:
             if keep > 0:
-                room.world_ring[steps % keep] = world
+                _copy_world(world, room.world_ring[steps % keep])
             flow(setting.network, setting.drivers, world, car)
         paced = car[PACED]
         end = drive(road, constants, car, room.visits, world, action)
@@ -220,7 +245,7 @@ def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, co
             row_back = max(int(car[STEPS]) - rewind, 0) % rewind
             back = room.ring[row_back]
             if traffic is not None:
-                rewound_worlds[i, column] = room.world_ring[row_back]
+                _copy_world(room.world_ring[row_back], rewound_worlds[i, column])
             rewound[i, column, 0] = back[X]
             rewound[i, column, 1] = back[Y]
             rewound[i, column, 2] = math.atan2(back[SIN], back[COS])
@@ -333,7 +358,7 @@ def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
     car = room.car
     world = None if traffic is None else traffic.copy()
     end, strayed = _run(setting, _packed(genome, layers, eye), layers, bounds, room, world, closing, eye)
-    room.ring[int(car[STEPS])] = car
+    _copy(car, room.ring[int(car[STEPS])])
     if traffic is not None:
-        room.world_ring[int(car[STEPS])] = world
+        _copy_world(world, room.world_ring[int(car[STEPS])])
     return (car[DISTANCE], car[PACED] - strayed, car[STEPS], end), room.ring, room.world_ring

@@ -231,7 +231,7 @@ def blank(config: SimConfig) -> Scenario:
         lanes=lanes,
         strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
         network=make_network(lanes, side, side, 1.0, config.traffic),
-        sides=make_sides(lanes, side, side),
+        sides=freeze(np.zeros(side * side, dtype=np.uint8)),
     )
 
 
