@@ -77,7 +77,8 @@ def may_enter(network, drivers, world, i, ego):
             continue
         there, past, permit = _I(world[j, LANE]), _I(world[j, PAST]), _I(world[j, PERMIT])
         onward = _I(world[j, NEXT])
-        for c in range(first, last):
+        # Most are nowhere near a junction.
+        for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]
             if permit == other:
                 return False

@@ -44,6 +44,7 @@ _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 _LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
+_LENGTH = _F(5.0)  # m, added to a car's horizon: another car's middle is further away than its rear
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
 
 
@@ -185,25 +186,24 @@ def _see(network, drivers, world, ego):
         speed = world[i, SPEED]
         world[i, HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_F(2.0) * drivers.comfort))
         world[i, GAP], world[i, LEAD] = _F(1e9), _ZERO
+    ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
-        x, y = world[i, X], world[i, Y]
+        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + _LENGTH
         for j in range(i):
             if world[j, LANE] < _ZERO:
                 continue
             dx, dy = wrapped(world[j, X] - x, network.width), wrapped(world[j, Y] - y, network.height)
-            apart = math.sqrt(dx * dx + dy * dy) - _F(5.0)
-            if apart < world[i, HORIZON]:
+            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _LENGTH
+            if squared < far * far:
                 follow(network, drivers, world[i], world[j], False)
-            if apart < world[j, HORIZON]:
+            if squared < other_far * other_far:
                 follow(network, drivers, world[j], world[i], False)
-        dx, dy = wrapped(ego[X] - x, network.width), wrapped(ego[Y] - y, network.height)
-        if (
-            math.sqrt(dx * dx + dy * dy) - _F(5.0) < world[i, HORIZON]
-            and ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
-        ):
-            follow(network, drivers, world[i], ego, True)
+        if ego_is_there:
+            dx, dy = wrapped(ego[X] - x, network.width), wrapped(ego[Y] - y, network.height)
+            if dx * dx + dy * dy < far * far:
+                follow(network, drivers, world[i], ego, True)
 
 
 @leaf
@@ -214,19 +214,24 @@ def _desired(network, car):
     return car[FACTOR] * network.speeds[min(at, _I(network.offsets[lane + 1] - 1))]
 
 
-@njit(_nrt=False)
+@leaf
 def change_lanes(network, drivers, world, i, ego):
-    """MOBIL (Kesting et al. 2007): move car i to a neighbouring lane where that is safe and it gains by it."""
+    """Move car i to a neighbouring lane if it is time to think of that, and if it is safe and the car gains by it."""
     car = world[i]
-    lane = _I(car[LANE])
     if car[CLOCK] > _ZERO:
         car[CLOCK] -= _ONE
         return
     car[CLOCK] = THINKING - _ONE
-    if car[SHIFT] != _ZERO:
-        return
-    if network.left[lane] < 0 and network.right[lane] < 0:
-        return
+    lane = _I(car[LANE])
+    if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
+        _choose_neighbour(network, drivers, world, i, ego)
+
+
+@njit(_nrt=False)
+def _choose_neighbour(network, drivers, world, i, ego):
+    """MOBIL (Kesting et al. 2007). Not inlined: the call is rare, and dear for all the network's arguments."""
+    car = world[i]
+    lane = _I(car[LANE])
     mine = car[PACE]
     best, gain = _I(-1), drivers.threshold
     for side in range(2):

@@ -62,10 +62,13 @@ def set_pose(network, car, sway):
     norm = _ONE / math.sqrt(max(tx * tx + ty * ty, _F(1e-12)))
     tx, ty = tx * norm, ty * norm
     x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
-    car[X] = x - math.floor(x / network.width) * network.width
-    car[Y] = y - math.floor(y / network.height) * network.height
-    norm = _ONE / math.sqrt(_ONE + sway * sway)
-    car[COS], car[SIN] = (tx - sway * ty) * norm, (ty + sway * tx) * norm
+    # NumPy's floor: that of `math` is an int64, whose product with a float32 is a float64.
+    car[X] = x - np.floor(x / network.width) * network.width
+    car[Y] = y - np.floor(y / network.height) * network.height
+    if sway != _ZERO:
+        norm = _ONE / math.sqrt(_ONE + sway * sway)
+        tx, ty = (tx - sway * ty) * norm, (ty + sway * tx) * norm
+    car[COS], car[SIN] = tx, ty
 
 
 @leaf
