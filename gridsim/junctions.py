@@ -55,9 +55,11 @@ def _awaits(network, lane, ego, way):
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
         dx = turned(network.points[p, 0] - ego[X], network.width)
         dy = turned(network.points[p, 1] - ego[Y], network.height)
-        apart = math.sqrt(dx * dx + dy * dy)
-        if apart < _NEAR or (apart < way and dx * ego[COS] + dy * ego[SIN] > _AHEAD * apart):
-            return True
+        squared = dx * dx + dy * dy
+        if squared < way * way:
+            forward = dx * ego[COS] + dy * ego[SIN]
+            if squared < _NEAR * _NEAR or (forward > _ZERO and forward * forward > _AHEAD * _AHEAD * squared):
+                return True
     return False
 
 

@@ -11,8 +11,8 @@ from gridsim.config import TrafficConfig
 from gridsim.jit import leaf, njit
 from gridsim.roads import Lanes, freeze
 
-_F = np.float32
-_HALF = _F(0.5)
+_F, _N = np.float32, np.uint64
+_HALF, _NEXT = _F(0.5), _N(1)
 
 
 class Network(NamedTuple):
@@ -125,18 +125,28 @@ def wrapped(difference, side):
 
 
 @leaf
+def away(difference, side):
+    """How far that is, either way."""
+    size = abs(difference)
+    return min(size, side - size)
+
+
+@leaf
 def turned(difference, side):
     """The same for any difference: lanes' points are not wrapped."""
-    return difference - math.floor(difference / side + _HALF) * side
+    # NumPy's floor is a float32; that of `math` is an int64, whose product with a float32 is a float64.
+    return difference - np.floor(difference / side + _HALF) * side
 
 
 @leaf
 def lane_length(network, lane):
     """Length (m) of a lane."""
-    return _F(network.offsets[lane + 1] - network.offsets[lane] - 1) * network.steps[lane]
+    lane = _N(lane)  # unsigned, here and elsewhere: a signed index might count from the end, which would be looked up
+    return _F(network.offsets[lane + _NEXT] - network.offsets[lane] - 1) * network.steps[lane]
 
 
 @leaf
 def is_junction(network, lane):
     """Whether a lane is a junction's: others cross it."""
-    return network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]
+    lane = _N(lane)
+    return network.crossing_offsets[lane + _NEXT] > network.crossing_offsets[lane]

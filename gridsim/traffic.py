@@ -15,7 +15,7 @@ import numpy as np
 from gridsim.config import SimConfig
 from gridsim.jit import leaf, njit
 from gridsim.junctions import CAUTION, may_enter
-from gridsim.network import is_junction, lane_length, turned, wrapped
+from gridsim.network import away, is_junction, lane_length, turned, wrapped
 from gridsim.world import (
     AFTER,
     ALONG,
@@ -40,7 +40,7 @@ from gridsim.world import (
     set_pose,
 )
 
-_F, _I = np.float32, np.int32
+_F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 _LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
@@ -104,16 +104,15 @@ def idm(drivers, speed, desired, gap, leader):
 
 
 @leaf
-def _ahead(network, car, other_lane, other_along):
-    """Way (m) from a car to a place on its lane or one of the two that come then; 1e9 if it is on none, or behind."""
-    lane, after, third = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
-    if other_lane == lane and other_along > car[ALONG]:
-        return other_along - car[ALONG]
-    rest = lane_length(network, lane) - car[ALONG]
-    if other_lane == after:
-        return rest + other_along
-    if other_lane == third:
-        return rest + lane_length(network, after) + other_along
+def _ahead(network, car, other):
+    """Way (m) from a car to one on its lane or on one of the two that come then; 1e9 if it is on none, or behind."""
+    lane, along = other[LANE], other[ALONG]
+    if lane == car[LANE] and along > car[ALONG]:
+        return along - car[ALONG]
+    if lane == car[NEXT]:
+        return lane_length(network, _I(car[LANE])) - car[ALONG] + along
+    if lane == car[AFTER]:
+        return lane_length(network, _I(car[LANE])) - car[ALONG] + lane_length(network, _I(car[NEXT])) + along
     return _F(1e9)
 
 
@@ -126,23 +125,25 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
     half_length = drivers.half_length + drivers.half_width + CAUTION
     half_width = drivers.half_width + drivers.half_width + CAUTION
     lane = _I(car[LANE])
-    along = car[ALONG]
-    travelled = drivers.half_length
-    along += travelled
+    # The way to begin with is as long as the line straight to the other car, unless the front is further ahead.
+    dx, dy = turned(car[X] - x, network.width), turned(car[Y] - y, network.height)
+    free = max(abs(dx * cosine + dy * sine) - half_length, abs(dy * cosine - dx * sine) - half_width)
+    travelled = max(drivers.half_length, free - abs(car[SHIFT]))
+    along = car[ALONG] + travelled
     for _ in range(3):
         length = lane_length(network, lane)
-        first = network.offsets[lane]
-        step = network.steps[lane]
+        first = _N(network.offsets[_N(lane)])
+        step = network.steps[_N(lane)]
         while along <= length:
             if travelled > horizon:
                 return _F(1e9)
-            k = first + _I(along / step)
+            k = first + _N(_I(along / step))
             dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
             forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
-            away = max(abs(forward) - half_length, abs(aside) - half_width)
-            if away < _ZERO:
+            free = max(abs(forward) - half_length, abs(aside) - half_width)
+            if free < _ZERO:
                 return travelled
-            hop = max(away, _SAMPLE)  # nothing can be in the way any sooner
+            hop = max(free, _SAMPLE)  # nothing can be in the way any sooner
             along += hop
             travelled += hop
         along -= length
@@ -162,8 +163,8 @@ def follow(network, drivers, car, other, is_ego):
     forward = dx * car[COS] + dy * car[SIN]
     looked = forward < _F(-6.0)  # who is behind is not in the way
     if not is_ego:
-        lane = _I(other[LANE])
-        at = _ahead(network, car, lane, other[ALONG]) - drivers.half_length
+        lane = _N(_I(other[LANE]))
+        at = _ahead(network, car, other) - drivers.half_length
         # Neither is who keeps to a lane beside others.
         looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
     if not looked:
@@ -194,14 +195,14 @@ def _see(network, drivers, world, ego):
         for j in range(i):
             if world[j, LANE] < _ZERO:
                 continue
-            dx, dy = wrapped(world[j, X] - x, network.width), wrapped(world[j, Y] - y, network.height)
+            dx, dy = away(world[j, X] - x, network.width), away(world[j, Y] - y, network.height)
             squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _LENGTH
             if squared < far * far:
                 follow(network, drivers, world[i], world[j], False)
             if squared < other_far * other_far:
                 follow(network, drivers, world[j], world[i], False)
         if ego_is_there:
-            dx, dy = wrapped(ego[X] - x, network.width), wrapped(ego[Y] - y, network.height)
+            dx, dy = away(ego[X] - x, network.width), away(ego[Y] - y, network.height)
             if dx * dx + dy * dy < far * far:
                 follow(network, drivers, world[i], ego, True)
 
@@ -209,9 +210,9 @@ def _see(network, drivers, world, ego):
 @leaf
 def _desired(network, car):
     """Speed (m/s) that a car would like to go where it is."""
-    lane = _I(car[LANE])
+    lane = _N(_I(car[LANE]))
     at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-    return car[FACTOR] * network.speeds[min(at, _I(network.offsets[lane + 1] - 1))]
+    return car[FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
 
 
 @leaf
