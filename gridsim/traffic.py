@@ -125,27 +125,35 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
     half_length = drivers.half_length + drivers.half_width + CAUTION
     half_width = drivers.half_width + drivers.half_width + CAUTION
     lane = _I(car[LANE])
-    # The way to begin with is as long as the line straight to the other car, unless the front is further ahead.
-    dx, dy = turned(car[X] - x, network.width), turned(car[Y] - y, network.height)
-    free = max(abs(dx * cosine + dy * sine) - half_length, abs(dy * cosine - dx * sine) - half_width)
-    travelled = max(drivers.half_length, free - abs(car[SHIFT]))
+    travelled = drivers.half_length
     along = car[ALONG] + travelled
+    reach_x = abs(cosine) * half_length + abs(sine) * half_width
+    reach_y = abs(sine) * half_length + abs(cosine) * half_width
     for _ in range(3):
+        if travelled > horizon:
+            return _F(1e9)
         length = lane_length(network, lane)
-        first = _N(network.offsets[_N(lane)])
-        step = network.steps[_N(lane)]
-        while along <= length:
-            if travelled > horizon:
-                return _F(1e9)
-            k = first + _N(_I(along / step))
-            dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
-            forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
-            free = max(abs(forward) - half_length, abs(aside) - half_width)
-            if free < _ZERO:
-                return travelled
-            hop = max(free, _SAMPLE)  # nothing can be in the way any sooner
-            along += hop
-            travelled += hop
+        box = network.boxes[_N(lane)]
+        beside_x = abs(turned(box[0] - x, network.width)) - box[2]
+        beside_y = abs(turned(box[1] - y, network.height)) - box[3]
+        if beside_x > reach_x or beside_y > reach_y:  # all of this lane is out of reach
+            travelled += max(length - along, _ZERO)
+            along = max(along, length)
+        else:
+            first, step = _N(network.offsets[_N(lane)]), network.steps[_N(lane)]
+            while along <= length:
+                if travelled > horizon:
+                    return _F(1e9)
+                k = first + _N(_I(along / step))
+                px, py = network.points[k, 0], network.points[k, 1]
+                dx, dy = turned(px - x, network.width), turned(py - y, network.height)
+                forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+                free = max(abs(forward) - half_length, abs(aside) - half_width)
+                if free < _ZERO:
+                    return travelled
+                hop = max(free, _SAMPLE)  # nothing can be in the way any sooner
+                along += hop
+                travelled += hop
         along -= length
         if lane == _I(car[LANE]):
             lane = _I(car[NEXT])
