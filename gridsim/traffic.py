@@ -347,7 +347,7 @@ def _go(network, drivers, car):
     set_pose(network, car, sway)
 
 
-@njit(nogil=True, _nrt=False)
+@leaf
 def flow(network, drivers, world, ego):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
