@@ -31,17 +31,15 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, 
     # Up to half a turn the field of view is where two half planes meet, by the first and the last ray: no angle is
     # needed for what lies outside of one.
     narrow = fan[0, 0] > _ZERO
-    margin = _F(-1.01) * radius
+    margin, reach = _F(-1.01) * radius, constants.ray_range + radius
     for j in range(world.shape[0]):
         if world[j, LANE] < _ZERO:
             continue
         dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
-        forward = dx * cosine + dy * sine
         squared = dx * dx + dy * dy
-        reach = constants.ray_range + radius
         if squared > reach * reach:
             continue
-        aside = dy * cosine - dx * sine
+        forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
         if (
             narrow
             and min(aside * fan[0, 0] - forward * fan[1, 0], forward * fan[1, last_ray] - aside * fan[0, last_ray])
