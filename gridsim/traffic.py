@@ -176,14 +176,16 @@ def follow(network, drivers, car, other, is_ego):
         # Neither is who keeps to a lane beside others.
         looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
     if not looked:
-        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
+        near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
+        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near)
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    if is_ego and not looked and other[SPEED] > _ONE:
+    if is_ego and not looked and other[SPEED] > _ONE and forward > _ZERO:
         # Where the ego car will be in a second: it may be about to cut in, or to cross.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
-        at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])
-        if at < car[GAP] and forward > _ZERO:
+        near = min(car[HORIZON], car[GAP])
+        at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near)
+        if at < car[GAP]:
             car[GAP], car[LEAD] = at, along
 
 
