@@ -28,20 +28,29 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, 
     length, breadth = constants.half_length, constants.half_width
     radius = math.sqrt(length * length + breadth * breadth)
     last_ray = _I(ranges.shape[0] - 1)
+    # Up to half a turn the field of view is where two half planes meet, by the first and the last ray: no angle is
+    # needed for what lies outside of one.
+    narrow = fan[0, 0] > _ZERO
+    margin, reach = _F(-1.01) * radius, constants.ray_range + radius
     for j in range(world.shape[0]):
         if world[j, LANE] < _ZERO:
             continue
         dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
-        forward = dx * cosine + dy * sine
         squared = dx * dx + dy * dy
-        reach = constants.ray_range + radius
         if squared > reach * reach:
+            continue
+        forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+        if (
+            narrow
+            and min(aside * fan[0, 0] - forward * fan[1, 0], forward * fan[1, last_ray] - aside * fan[0, last_ray])
+            < margin
+        ):
             continue
         first, last = _I(0), last_ray
         if squared > _F(4.0) * radius * radius:
             # Only rays within the angle that the box's circle fills; its arc sine is at most 1.05 times its sine here.
             half = _F(1.06) * radius / math.sqrt(squared)
-            angle = math.atan2(dy * cosine - dx * sine, forward)
+            angle = math.atan2(aside, forward)
             low, high = (angle - half - constants.ray_first), (angle + half - constants.ray_first)
             if high < _ZERO or low > constants.ray_step * _F(last_ray):
                 continue

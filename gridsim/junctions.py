@@ -55,9 +55,11 @@ def _awaits(network, lane, ego, way):
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
         dx = turned(network.points[p, 0] - ego[X], network.width)
         dy = turned(network.points[p, 1] - ego[Y], network.height)
-        apart = math.sqrt(dx * dx + dy * dy)
-        if apart < _NEAR or (apart < way and dx * ego[COS] + dy * ego[SIN] > _AHEAD * apart):
-            return True
+        squared = dx * dx + dy * dy
+        if squared < way * way:
+            forward = dx * ego[COS] + dy * ego[SIN]
+            if squared < _NEAR * _NEAR or (forward > _ZERO and forward * forward > _AHEAD * _AHEAD * squared):
+                return True
     return False
 
 
@@ -77,7 +79,8 @@ def may_enter(network, drivers, world, i, ego):
             continue
         there, past, permit = _I(world[j, LANE]), _I(world[j, PAST]), _I(world[j, PERMIT])
         onward = _I(world[j, NEXT])
-        for c in range(first, last):
+        # Most are nowhere near a junction.
+        for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]
             if permit == other:
                 return False

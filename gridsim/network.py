@@ -11,8 +11,9 @@ from gridsim.config import TrafficConfig
 from gridsim.jit import leaf, njit
 from gridsim.roads import Lanes, freeze
 
-_F = np.float32
-_HALF = _F(0.5)
+_F, _N = np.float32, np.uint64
+_HALF, _NEXT = _F(0.5), _N(1)
+_ROUNDED = 1e-3  # m, which is more than float32 rounds a box's sides by
 
 
 class Network(NamedTuple):
@@ -28,6 +29,7 @@ class Network(NamedTuple):
     crossing_offsets: np.ndarray  # int32 [lanes + 1]
     crossings: np.ndarray  # int32 [c], junction lanes that cross each lane
     clear: np.ndarray  # float32 [c], m along those from which on a car's middle is out of the way
+    boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y of the box around each lane's points and half its sides
     width: np.float32  # m, of the torus
     height: np.float32
 
@@ -79,6 +81,14 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
             clear[c] = last * steps[other]
 
 
+def _boxes(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """The boxes around lanes: float32 [lanes, 4]."""
+    if len(offsets) < 2:
+        return freeze(np.zeros((0, 4), dtype=np.float32))
+    low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
+    return freeze(np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32))
+
+
 def make_network(lanes: Lanes, width: float, height: float, speed_limit: float, config: TrafficConfig) -> Network:
     """Tables of a map's lanes; `speed_limit` (m/s) is the scenario's own."""
     f = np.float32
@@ -108,6 +118,7 @@ def network_of_lanes(lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, width:
         crossing_offsets=lanes.crossing_offsets,
         crossings=lanes.crossings,
         clear=clear,
+        boxes=_boxes(lanes.points, lanes.offsets),
         width=np.float32(width),
         height=np.float32(height),
     )
@@ -125,18 +136,28 @@ def wrapped(difference, side):
 
 
 @leaf
+def away(difference, side):
+    """How far that is, either way."""
+    size = abs(difference)
+    return min(size, side - size)
+
+
+@leaf
 def turned(difference, side):
     """The same for any difference: lanes' points are not wrapped."""
-    return difference - math.floor(difference / side + _HALF) * side
+    # NumPy's floor is a float32; that of `math` is an int64, whose product with a float32 is a float64.
+    return difference - np.floor(difference / side + _HALF) * side
 
 
 @leaf
 def lane_length(network, lane):
     """Length (m) of a lane."""
-    return _F(network.offsets[lane + 1] - network.offsets[lane] - 1) * network.steps[lane]
+    lane = _N(lane)  # unsigned, here and elsewhere: a signed index might count from the end, which would be looked up
+    return _F(network.offsets[lane + _NEXT] - network.offsets[lane] - 1) * network.steps[lane]
 
 
 @leaf
 def is_junction(network, lane):
     """Whether a lane is a junction's: others cross it."""
-    return network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]
+    lane = _N(lane)
+    return network.crossing_offsets[lane + _NEXT] > network.crossing_offsets[lane]

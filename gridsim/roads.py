@@ -282,8 +282,8 @@ def _ray_starts(nodes, columns, rows, ray_range):
 def clearance(road, x, y):
     """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, any tile of the torus."""
     px, py = x * _F(CELLS_PER_M), y * _F(CELLS_PER_M)
-    fx, fy = math.floor(px), math.floor(py)
-    ux, uy = _F(px - fx), _F(py - fy)
+    fx, fy = np.floor(px), np.floor(py)  # float32, unlike those of `math`
+    ux, uy = px - fx, py - fy
     i = np.uint32(np.int32(fx)) & np.uint32(road.columns - np.uint32(1))
     j = np.uint32(np.int32(fy)) & np.uint32(road.rows - np.uint32(1))
     word = road.field[np.uint32(j * road.columns + i)]

@@ -49,7 +49,14 @@ def make_sides(lanes: Lanes, width: float, height: float) -> np.ndarray:
 @leaf
 def keeps_side(sides, width, x, y, cosine, sine):
     """Whether a car at (x, y) on the map, with this heading, is on a lane that runs its way."""
-    octant = _I(math.floor(math.atan2(sine, cosine) * _PER_TURN)) & _I(OCTANTS - 1)
+    # The octant without an arc tangent: turn by halves and quarters into the first two.
+    octant = _I(0)
+    if sine < _F(0.0):
+        octant, cosine, sine = _I(4), -cosine, -sine
+    if cosine <= _F(0.0):
+        octant, cosine, sine = octant + _I(2), sine, -cosine
+    if sine >= cosine:
+        octant += _I(1)
     columns = _I(width)
     cell = min(_I(y) * columns + min(_I(x), columns - _I(1)), _I(sides.shape[0] - 1))
     return (sides[cell] >> octant) & 1 == 1

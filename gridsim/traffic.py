@@ -15,7 +15,7 @@ import numpy as np
 from gridsim.config import SimConfig
 from gridsim.jit import leaf, njit
 from gridsim.junctions import CAUTION, may_enter
-from gridsim.network import is_junction, lane_length, turned, wrapped
+from gridsim.network import away, is_junction, lane_length, turned, wrapped
 from gridsim.world import (
     AFTER,
     ALONG,
@@ -40,10 +40,11 @@ from gridsim.world import (
     set_pose,
 )
 
-_F, _I = np.float32, np.int32
+_F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 _LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
+_LENGTH = _F(5.0)  # m, added to a car's horizon: another car's middle is further away than its rear
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
 
 
@@ -103,16 +104,15 @@ def idm(drivers, speed, desired, gap, leader):
 
 
 @leaf
-def _ahead(network, car, other_lane, other_along):
-    """Way (m) from a car to a place on its lane or one of the two that come then; 1e9 if it is on none, or behind."""
-    lane, after, third = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
-    if other_lane == lane and other_along > car[ALONG]:
-        return other_along - car[ALONG]
-    rest = lane_length(network, lane) - car[ALONG]
-    if other_lane == after:
-        return rest + other_along
-    if other_lane == third:
-        return rest + lane_length(network, after) + other_along
+def _ahead(network, car, other):
+    """Way (m) from a car to one on its lane or on one of the two that come then; 1e9 if it is on none, or behind."""
+    lane, along = other[LANE], other[ALONG]
+    if lane == car[LANE] and along > car[ALONG]:
+        return along - car[ALONG]
+    if lane == car[NEXT]:
+        return lane_length(network, _I(car[LANE])) - car[ALONG] + along
+    if lane == car[AFTER]:
+        return lane_length(network, _I(car[LANE])) - car[ALONG] + lane_length(network, _I(car[NEXT])) + along
     return _F(1e9)
 
 
@@ -125,25 +125,35 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
     half_length = drivers.half_length + drivers.half_width + CAUTION
     half_width = drivers.half_width + drivers.half_width + CAUTION
     lane = _I(car[LANE])
-    along = car[ALONG]
     travelled = drivers.half_length
-    along += travelled
+    along = car[ALONG] + travelled
+    reach_x = abs(cosine) * half_length + abs(sine) * half_width
+    reach_y = abs(sine) * half_length + abs(cosine) * half_width
     for _ in range(3):
+        if travelled > horizon:
+            return _F(1e9)
         length = lane_length(network, lane)
-        first = network.offsets[lane]
-        step = network.steps[lane]
-        while along <= length:
-            if travelled > horizon:
-                return _F(1e9)
-            k = first + _I(along / step)
-            dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
-            forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
-            away = max(abs(forward) - half_length, abs(aside) - half_width)
-            if away < _ZERO:
-                return travelled
-            hop = max(away, _SAMPLE)  # nothing can be in the way any sooner
-            along += hop
-            travelled += hop
+        box = network.boxes[_N(lane)]
+        beside_x = abs(turned(box[0] - x, network.width)) - box[2]
+        beside_y = abs(turned(box[1] - y, network.height)) - box[3]
+        if beside_x > reach_x or beside_y > reach_y:  # all of this lane is out of reach
+            travelled += max(length - along, _ZERO)
+            along = max(along, length)
+        else:
+            first, step = _N(network.offsets[_N(lane)]), network.steps[_N(lane)]
+            while along <= length:
+                if travelled > horizon:
+                    return _F(1e9)
+                k = first + _N(_I(along / step))
+                px, py = network.points[k, 0], network.points[k, 1]
+                dx, dy = turned(px - x, network.width), turned(py - y, network.height)
+                forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+                free = max(abs(forward) - half_length, abs(aside) - half_width)
+                if free < _ZERO:
+                    return travelled
+                hop = max(free, _SAMPLE)  # nothing can be in the way any sooner
+                along += hop
+                travelled += hop
         along -= length
         if lane == _I(car[LANE]):
             lane = _I(car[NEXT])
@@ -161,19 +171,21 @@ def follow(network, drivers, car, other, is_ego):
     forward = dx * car[COS] + dy * car[SIN]
     looked = forward < _F(-6.0)  # who is behind is not in the way
     if not is_ego:
-        lane = _I(other[LANE])
-        at = _ahead(network, car, lane, other[ALONG]) - drivers.half_length
+        lane = _N(_I(other[LANE]))
+        at = _ahead(network, car, other) - drivers.half_length
         # Neither is who keeps to a lane beside others.
         looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
     if not looked:
-        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], car[HORIZON])
+        near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
+        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near)
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    if is_ego and not looked and other[SPEED] > _ONE:
+    if is_ego and not looked and other[SPEED] > _ONE and forward > _ZERO:
         # Where the ego car will be in a second: it may be about to cut in, or to cross.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
-        at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], car[HORIZON])
-        if at < car[GAP] and forward > _ZERO:
+        near = min(car[HORIZON], car[GAP])
+        at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near)
+        if at < car[GAP]:
             car[GAP], car[LEAD] = at, along
 
 
@@ -185,48 +197,52 @@ def _see(network, drivers, world, ego):
         speed = world[i, SPEED]
         world[i, HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_F(2.0) * drivers.comfort))
         world[i, GAP], world[i, LEAD] = _F(1e9), _ZERO
+    ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
-        x, y = world[i, X], world[i, Y]
+        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + _LENGTH
         for j in range(i):
             if world[j, LANE] < _ZERO:
                 continue
-            dx, dy = wrapped(world[j, X] - x, network.width), wrapped(world[j, Y] - y, network.height)
-            apart = math.sqrt(dx * dx + dy * dy) - _F(5.0)
-            if apart < world[i, HORIZON]:
+            dx, dy = away(world[j, X] - x, network.width), away(world[j, Y] - y, network.height)
+            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _LENGTH
+            if squared < far * far:
                 follow(network, drivers, world[i], world[j], False)
-            if apart < world[j, HORIZON]:
+            if squared < other_far * other_far:
                 follow(network, drivers, world[j], world[i], False)
-        dx, dy = wrapped(ego[X] - x, network.width), wrapped(ego[Y] - y, network.height)
-        if (
-            math.sqrt(dx * dx + dy * dy) - _F(5.0) < world[i, HORIZON]
-            and ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
-        ):
-            follow(network, drivers, world[i], ego, True)
+        if ego_is_there:
+            dx, dy = away(ego[X] - x, network.width), away(ego[Y] - y, network.height)
+            if dx * dx + dy * dy < far * far:
+                follow(network, drivers, world[i], ego, True)
 
 
 @leaf
 def _desired(network, car):
     """Speed (m/s) that a car would like to go where it is."""
-    lane = _I(car[LANE])
+    lane = _N(_I(car[LANE]))
     at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-    return car[FACTOR] * network.speeds[min(at, _I(network.offsets[lane + 1] - 1))]
+    return car[FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
 
 
-@njit(_nrt=False)
+@leaf
 def change_lanes(network, drivers, world, i, ego):
-    """MOBIL (Kesting et al. 2007): move car i to a neighbouring lane where that is safe and it gains by it."""
+    """Move car i to a neighbouring lane if it is time to think of that, and if it is safe and the car gains by it."""
     car = world[i]
-    lane = _I(car[LANE])
     if car[CLOCK] > _ZERO:
         car[CLOCK] -= _ONE
         return
     car[CLOCK] = THINKING - _ONE
-    if car[SHIFT] != _ZERO:
-        return
-    if network.left[lane] < 0 and network.right[lane] < 0:
-        return
+    lane = _I(car[LANE])
+    if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
+        _choose_neighbour(network, drivers, world, i, ego)
+
+
+@njit(_nrt=False)
+def _choose_neighbour(network, drivers, world, i, ego):
+    """MOBIL (Kesting et al. 2007). Not inlined: the call is rare, and dear for all the network's arguments."""
+    car = world[i]
+    lane = _I(car[LANE])
     mine = car[PACE]
     best, gain = _I(-1), drivers.threshold
     for side in range(2):
@@ -333,7 +349,7 @@ def _go(network, drivers, car):
     set_pose(network, car, sway)
 
 
-@njit(nogil=True, _nrt=False)
+@leaf
 def flow(network, drivers, world, ego):
     """One control period of a world's traffic around the ego car as it was before its own move.
 

@@ -46,26 +46,30 @@ THINKING = _F(10.0)  # control steps from one thought of another lane to the nex
 @leaf
 def set_pose(network, car, sway):
     """Put a car where its lane, its metres along it and its shift say; `sway` is the shift's speed over the car's."""
-    lane = _I(car[LANE])
-    first = network.offsets[lane]
-    last = network.offsets[lane + 1] - first - 2
+    one, two = _U(1), _U(2)
+    lane = _U(_I(car[LANE]))
+    first = _U(network.offsets[lane])
+    last = _U(network.offsets[lane + one]) - first - two
     at = car[ALONG] / network.steps[lane]
-    k = min(max(_I(at), _I(0)), _I(last))
-    part = at - _F(k)
+    k = min(_U(max(_I(at), _I(0))), last)
+    part = at - _F(_I(k))
     x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
-    dx, dy = network.points[first + k + 1, 0] - x0, network.points[first + k + 1, 1] - y0
+    dx, dy = network.points[first + k + one, 0] - x0, network.points[first + k + one, 1] - y0
     # The heading turns from the last piece's to the next one's, so that the car does not jerk at every point.
-    before, after = max(k - 1, 0), min(k + 2, last + 1)
+    before, after = max(k, one) - one, min(k + two, last + one)
     ax, ay = x0 + dx - network.points[first + before, 0], y0 + dy - network.points[first + before, 1]
     bx, by = network.points[first + after, 0] - x0, network.points[first + after, 1] - y0
     tx, ty = ax + part * (bx - ax), ay + part * (by - ay)
     norm = _ONE / math.sqrt(max(tx * tx + ty * ty, _F(1e-12)))
     tx, ty = tx * norm, ty * norm
     x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
-    car[X] = x - math.floor(x / network.width) * network.width
-    car[Y] = y - math.floor(y / network.height) * network.height
-    norm = _ONE / math.sqrt(_ONE + sway * sway)
-    car[COS], car[SIN] = (tx - sway * ty) * norm, (ty + sway * tx) * norm
+    # NumPy's floor: that of `math` is an int64, whose product with a float32 is a float64.
+    car[X] = x - np.floor(x / network.width) * network.width
+    car[Y] = y - np.floor(y / network.height) * network.height
+    if sway != _ZERO:
+        norm = _ONE / math.sqrt(_ONE + sway * sway)
+        tx, ty = (tx - sway * ty) * norm, (ty + sway * tx) * norm
+    car[COS], car[SIN] = tx, ty
 
 
 @leaf

@@ -454,3 +454,14 @@ def test_neighbouring_junctions_do_not_wait_for_each_other(seed):
         history = watch(network, world, 120)
         assert history[:, :, SPEED].max(axis=0).min() > 1.0  # everybody moves within each two minutes
         world = history[-1]
+
+
+@pytest.mark.parametrize("name", sorted(REGISTRY))
+def test_boxes_are_as_large_as_their_lanes(name):
+    """What is nowhere near a lane's box is not looked for on the lane."""
+    network = build(name, HELD_OUT_SEED).network
+    for first, stop, (x, y, half_x, half_y) in zip(network.offsets, network.offsets[1:], network.boxes, strict=False):
+        points = network.points[first:stop].astype(float)
+        reach = np.abs(points - [x, y]).max(axis=0)
+        assert (reach <= [half_x, half_y]).all()
+        assert [half_x, half_y] == pytest.approx(reach, abs=2e-3)
