@@ -53,7 +53,7 @@ class Scenario:
         lanes: directed polylines, for starts, traffic and drivers.
         strips: exact geometry of the drivable area, for pictures and tests.
         network: the lanes as traffic reads them.
-        sides: uint8 [m2], which way lanes run on each square metre, `gridsim.sides`.
+        sides: uint8 [cells], which way one may drive in each cell, `gridsim.sides`.
         torus: whether leaving on one side means entering on the other.
         starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
     """
@@ -231,7 +231,7 @@ def blank(config: SimConfig) -> Scenario:
         lanes=lanes,
         strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
         network=make_network(lanes, side, side, 1.0, config.traffic),
-        sides=freeze(np.zeros(side * side, dtype=np.uint8)),
+        sides=freeze(np.zeros((side * CELLS_PER_M) ** 2, dtype=np.uint8)),
     )
 
 

@@ -12,7 +12,7 @@ from gridsim.config import SimConfig
 from gridsim.jit import njit
 from gridsim.lanes import Path, lay_lanes
 from gridsim.scenarios import REGISTRY, build, sample_starts
-from gridsim.sides import REACH, keeps_side, make_sides
+from gridsim.sides import keeps_side, make_sides
 from gridsim.world import FIELDS, LANE
 
 F = np.float32
@@ -51,9 +51,18 @@ def test_a_lane_is_for_who_goes_its_way(two_way, x):
         assert not keeps(two_way, WIDTH, [[x, 10.5, turn]]).any()
 
 
-def test_beside_the_lanes_nobody_is_on_his_side(two_way):
-    for y in (10.5 - REACH - 0.8, 14.5 + REACH + 0.8, 30.0):
-        assert not keeps(two_way, WIDTH, [[20.0, y, 0.0], [20.0, y, math.pi]]).any()
+def test_the_middle_of_the_road_and_the_ground_beside_it_are_nobodys(two_way):
+    """Half of APART from the middle, 12.5, and REACH from a lane's middle; cells are half a metre."""
+    for y, east, west in [
+        (5.9, 0, 0),
+        (8.3, 1, 0),
+        (11.6, 1, 0),
+        (12.4, 0, 0),
+        (12.6, 0, 0),
+        (13.4, 0, 1),
+        (19.0, 0, 0),
+    ]:
+        assert keeps(two_way, WIDTH, [[20.0, y, 0.0], [20.0, y, math.pi]]).tolist() == [east, west]
 
 
 @pytest.mark.parametrize("scenario", REGISTRY)
