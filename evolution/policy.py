@@ -94,7 +94,7 @@ class PolicySpec(ABC):
 class MlpSpec(PolicySpec):
     """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts.
 
-    With `motion` it also sees how fast what each ray meets comes closer (`boxes.cast_boxes`).
+    With `motion` it also sees how fast the cars that rays meet come closer (`boxes.cast_boxes`).
     """
 
     observation = "rays"

@@ -4,7 +4,7 @@ Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and
 for `gymnasium.make("gridsim.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
 
 Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s, and with
-`motion` between them how fast what each ray meets comes closer over ground, float32 [rays], as a share of 30 m/s; or
+`motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s; or
 `grid`, uint8 [80, 80], the occupancy grid of `gridsim.grid`, and with `frames` above 1 [frames, 80, 80], the newest
 last. Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of
 `vehicle.act_continuous`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
