@@ -46,7 +46,6 @@ from gridsim.network import Network
 from gridsim.roads import VISIT_CELL, Road, freeze
 from gridsim.scenarios import Scenario
 from gridsim.sensors import LANES, fan
-from gridsim.sides import keeps_side
 from gridsim.traffic import Drivers, drivers, flow
 from gridsim.world import FIELDS as TRAFFIC_FIELDS
 
@@ -56,8 +55,7 @@ _F = np.float32
 #: its own target (m) and limit (control steps), where these are not 0.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4")])
 
-#: What comes back of an episode: new ground (m); new ground at a speed within the interval and, among traffic, on the
-#: own side of the road (m); control steps; End.
+#: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
 
 
@@ -105,7 +103,6 @@ class Setting(NamedTuple):
 
     road: Road
     network: Network
-    sides: np.ndarray
     constants: Constants
     drivers: Drivers
     fan: np.ndarray
@@ -116,7 +113,7 @@ def _on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
     """The settings of episodes on these maps."""
     k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return [Setting(map.road, map.network, map.sides, k, others, rays, config.sensors.rays) for map in scenarios]
+    return [Setting(map.road, map.network, k, others, rays, config.sensors.rays) for map in scenarios]
 
 
 class Bounds(NamedTuple):
@@ -185,14 +182,13 @@ def _run(setting, packed, layers, bounds, room, world, closing, eye):
 
     What may be None is an argument of its own: Numba leaves out the branches that it rules out for those alone.
 
-    Returns: (End as a number, m of PACED that were not on the car's own side of the road; 0 without traffic).
+    Returns: End as a number.
     """
     road, constants, car, ranges = setting.road, setting.constants, room.car, room.ranges
     place(road, bounds.start, car, room.visits)
     keep = room.ring.shape[0]
     end = 0
     steps = 0
-    strayed = _F(0.0)
     while end == 0:
         look(road, constants, setting.fan, car, world, room.beams, ranges, closing)
         if eye is None:
@@ -211,17 +207,14 @@ def _run(setting, packed, layers, bounds, room, world, closing, eye):
             if keep > 0:
                 _copy_world(world, room.world_ring[steps % keep])
             flow(setting.network, setting.drivers, world, car)
-        paced = car[PACED]
         end = drive(road, constants, car, room.visits, world, action)
-        if world is not None and not keeps_side(setting.sides, road.width, car[X], car[Y], car[COS], car[SIN]):
-            strayed += car[PACED] - paced
         steps += 1
         if end == 0:
             if car[DISTANCE] >= bounds.target:
                 end = 3
             elif steps >= bounds.steps:
                 end = 4
-    return end, strayed
+    return end
 
 
 @njit(nogil=True)
@@ -235,10 +228,10 @@ def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, co
     for i in range(genomes.shape[0]):
         packed = _packed(genomes[i], layers, eye)
         world = None if traffic is None else traffic.copy()
-        end, strayed = _run(setting, packed, layers, bounds, room, world, closing, eye)
+        end = _run(setting, packed, layers, bounds, room, world, closing, eye)
         row = results[i, column]
         row["distance"] = car[DISTANCE]
-        row["paced"] = car[PACED] - strayed
+        row["paced"] = car[PACED]
         row["steps"] = car[STEPS]
         row["end"] = end
         if rewind > 0:
@@ -357,8 +350,8 @@ def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
     room = _make_room(setting, layers, bounds.steps + 1, 0 if traffic is None else traffic.shape[0])
     car = room.car
     world = None if traffic is None else traffic.copy()
-    end, strayed = _run(setting, _packed(genome, layers, eye), layers, bounds, room, world, closing, eye)
+    end = _run(setting, _packed(genome, layers, eye), layers, bounds, room, world, closing, eye)
     _copy(car, room.ring[int(car[STEPS])])
     if traffic is not None:
         _copy_world(world, room.world_ring[int(car[STEPS])])
-    return (car[DISTANCE], car[PACED] - strayed, car[STEPS], end), room.ring, room.world_ring
+    return (car[DISTANCE], car[PACED], car[STEPS], end), room.ring, room.world_ring

@@ -43,7 +43,6 @@ from gridsim.roads import (
     power_of_two,
 )
 from gridsim.scenarios import FILE_SPEEDS, START_SPEED, Scenario
-from gridsim.sides import make_sides
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -374,7 +373,6 @@ def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Scenar
         lanes=lanes,
         strips=Strips(freeze(np.zeros((0, 5))), freeze(np.zeros((0, 6))), freeze(np.zeros((0, 5)))),
         network=make_network(lanes, columns / CELLS_PER_M, rows / CELLS_PER_M, 0.0, config.traffic),
-        sides=make_sides(lanes, columns / CELLS_PER_M, rows / CELLS_PER_M),
         torus=file.torus,
         starts=freeze(starts),
     )

@@ -31,7 +31,6 @@ from gridsim.roads import (
     make_road,
 )
 from gridsim.seamless import roundabout_layout, seamless_layout
-from gridsim.sides import make_sides
 
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
@@ -53,7 +52,6 @@ class Scenario:
         lanes: directed polylines, for starts, traffic and drivers.
         strips: exact geometry of the drivable area, for pictures and tests.
         network: the lanes as traffic reads them.
-        sides: uint8 [cells], which way one may drive in each cell, `gridsim.sides`.
         torus: whether leaving on one side means entering on the other.
         starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
     """
@@ -64,7 +62,6 @@ class Scenario:
     lanes: Lanes
     strips: Strips
     network: Network
-    sides: np.ndarray
     torus: bool = True
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
 
@@ -89,7 +86,6 @@ class Scenario:
             **vars(self.strips),
             "speeds": self.network.speeds,
             "clear": self.network.clear,
-            "sides": self.sides,
             "starts": self.starts,
         }
 
@@ -118,7 +114,6 @@ class Scenario:
             lanes=lanes,
             strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
             network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], width, height),
-            sides=frozen["sides"],
             torus=bool(torus),
             starts=frozen["starts"],
         )
@@ -205,7 +200,6 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
         lanes=lanes,
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
         network=make_network(lanes, width, height, TRAFFIC_PACE * sum(spec.speed_interval), config.traffic),
-        sides=make_sides(lanes, width, height),
     )
 
 
@@ -231,7 +225,6 @@ def blank(config: SimConfig) -> Scenario:
         lanes=lanes,
         strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
         network=make_network(lanes, side, side, 1.0, config.traffic),
-        sides=freeze(np.zeros((side * CELLS_PER_M) ** 2, dtype=np.uint8)),
     )
 
 

@@ -17,7 +17,6 @@ from gridsim.network import make_network
 from gridsim.roads import Strips, clearance_nodes, freeze, make_road
 from gridsim.scenarios import Scenario
 from gridsim.sensors import fan
-from gridsim.sides import make_sides
 from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 from gridsim.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, SIN, SPEED, X, Y
@@ -221,7 +220,7 @@ def cross():
         freeze(array)
     road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 50.0)
     network = make_network(lanes, SIDE, SIDE, 30.0, CONFIG.traffic)
-    return Scenario("cross", 0, road, lanes, strips, network, make_sides(lanes, SIDE, SIDE))
+    return Scenario("cross", 0, road, lanes, strips, network)
 
 
 def on_lane(lane, along, speed, pose):

@@ -15,7 +15,6 @@ from gridsim.reference import ReferenceDriver
 from gridsim.roads import Lanes, clearance_nodes, freeze, make_road
 from gridsim.routes import ReferenceConfig, locate, plan, profile, top_speed, unwrapped
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build, sample_starts
-from gridsim.sides import make_sides
 from gridsim.simulator import Simulator
 from gridsim.vehicle import Action
 from gridsim.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT
@@ -42,7 +41,6 @@ def on_path(path: Path, width: float, height: float) -> Scenario:
         lanes=lanes,
         strips=strips,
         network=make_network(lanes, width, height, 8.0, TrafficConfig()),
-        sides=make_sides(lanes, width, height),
     )
 
 
