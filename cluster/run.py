@@ -138,10 +138,20 @@ def open_run(folder: Path) -> RunFolder:
         run.saved = checkpoint.load(folder / CHECKPOINT)
     except CheckpointError as error:
         raise RunError(str(error)) from error
-    run.init_sha256 = str(run.saved[1].get("init_sha256", ""))
-    run.tracking_key = str(run.saved[1].get("tracking", {}).get("key", run.tracking_key))
-    if run.saved[1].get("digest") != run.digest():
+    meta = run.saved[1]
+    run.init_sha256 = str(meta.get("init_sha256", ""))
+    if meta.get("digest") != run.digest():
         raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
+    tracking = meta["tracking"] if isinstance(meta.get("tracking"), dict) else {}
+    fits = (
+        all(type(meta.get(name)) is int for name in ("generation", "car_steps"))
+        and type(meta.get("solved")) is bool
+        and all(isinstance(tracking.get(name), str) for name in ("uri", "key"))
+        and isinstance(tracking.get("run_id"), str | None)
+    )
+    if not fits:
+        raise RunError(f"{folder / CHECKPOINT}: its parts are not those of a run")
+    run.tracking_key = tracking["key"]
     return run
 
 
