@@ -227,6 +227,8 @@ class Session:
         evolution = self.evolution
         for step, past in enumerate(evolution.history):
             self._log(step, past)  # what MLflow has is skipped
+        if evolution.history:
+            self._write_history()  # it may lack the last row: it is written after the checkpoint
         evolution.meanwhile = self._save_last
         try:
             while not evolution.done():
@@ -236,12 +238,12 @@ class Session:
                 self._unsaved = True
                 if self.on_row:
                     self.on_row(evolution.generation, row)
+            self._save_last()
         except CheckpointError:
             raise
         except BaseException:
             self._save_last()  # the state is whole until the next generation's results are there
             raise
-        self._save_last()
 
     def _save_last(self) -> None:
         """Save and log the last generation, if that was not done."""
@@ -263,6 +265,9 @@ class Session:
             "tracking": {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key},
         }
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
+        self._write_history()
+
+    def _write_history(self) -> None:
         checkpoint.write_atomic(self.run.path / HISTORY, self.evolution.history_csv(), durable=False)
 
     def finish(self, workers: int) -> dict[str, Any]:

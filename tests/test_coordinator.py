@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import re
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from cluster import cli
 from cluster.checkpoint import CheckpointError, load, save
 from cluster.coordinator import Evolution, Maps
 from cluster.pool import SerialPool
-from cluster.run import RunError, RunFolder, open_run
+from cluster.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
 from cluster.settings import EvolveSettings
 from evolution.curriculum import CrashError
 from gridsim.config import SimConfig
@@ -198,3 +199,44 @@ def test_a_checkpoint_with_other_parts_is_refused_in_one_line(halfway, tmp_path,
     with pytest.raises(RunError, match="not those of a run") as error:
         open_run(path)
     assert "\n" not in str(error.value)
+
+
+class InterruptedOnce(Session):
+    """Ctrl-C comes while its first save is on its way."""
+
+    interrupted = False
+
+    def save(self) -> None:
+        if not self.interrupted:
+            self.interrupted = True
+            raise KeyboardInterrupt
+        super().save()
+
+
+def go_on_in(path, maps, session=Session):
+    """A stopped run, to be continued from its folder, with a short validation."""
+    run = open_run(path)
+    tracker = make_tracker(run, f"sqlite:///{path}/m.db", "test")
+    resumed = session(run, SerialPool(maps.build), maps, tracker, time.perf_counter())
+    curriculum = resumed.evolution.curriculum
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4, contenders=2)
+    return resumed
+
+
+def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, halfway, tmp_path):
+    resumed = go_on_in(run_folder(halfway, tmp_path), maps, InterruptedOnce)
+    with pytest.raises(KeyboardInterrupt):
+        resumed.evolve()
+    assert resumed.interrupted
+    assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 2
+    assert len(read_history(tmp_path / "history.csv")) == 2
+
+
+def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
+    """As a kill between the last checkpoint and its history leaves it, when nothing is left to evolve."""
+    resumed = go_on_in(run_folder(halfway, tmp_path), maps)
+    resumed.evolve()
+    whole = (tmp_path / "history.csv").read_bytes()
+    (tmp_path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
+    go_on_in(tmp_path, maps).evolve()
+    assert (tmp_path / "history.csv").read_bytes() == whole
