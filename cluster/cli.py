@@ -233,8 +233,10 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
                 raise UsageError(
                     f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
                 )
-        if flags.generations < run.settings.generations and flags.generations < int(run.saved[1]["generation"]):  # type: ignore[index]
-            raise UsageError(f"--generations {flags.generations} is less than the run has already done")
+        done = run.saved[1]["generation"]  # type: ignore[index]
+        if flags.generations < run.settings.generations and flags.generations <= done:
+            # Champions are looked for while a generation is the last; nothing can be made of one that was not.
+            raise UsageError(f"--generations {flags.generations}: the run has done {done} already; give more")
         run.settings = flags.settings()
         run.settings.check()
         return flags, run

@@ -413,11 +413,13 @@ class Evolution:
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         """Take up a state. Raises CheckpointError with one line where it does not fit this run."""
-        genes = self.spec.size
+        s, genes = self.settings, self.spec.size
         try:
             history, parents, elites = arrays["history"], arrays["parents"], arrays["elites"]
             generation, crashes, worlds = int(meta["generation"]), arrays["crashes"], arrays["crash_worlds"]
             first, last, tried = arrays["trials_first"], arrays["trials_last"], arrays["trials_tried"]
+            champion, elite_rows = arrays["champion"], int(meta["elite_rows"])
+            least = min(self.curriculum.config.first_target, self.curriculum.goal)
             fits = (
                 meta["columns"] == list(COLUMNS)
                 and history.shape == (generation, len(COLUMNS))
@@ -426,24 +428,33 @@ class Evolution:
                 and parents.ndim == 2
                 and parents.shape[1] == genes
                 and parents.dtype == np.float32
+                and len(parents) <= s.elites + s.parents
+                and 0 <= elite_rows <= min(s.elites, max(len(parents) - 1, 0))
                 and crashes.ndim == 2
                 and crashes.shape[1] == 6
                 and worlds.shape == (len(crashes), *self.curriculum.crash_worlds.shape[1:])
                 and worlds.dtype == np.float32
-                and 0 <= int(meta["elite_rows"]) <= len(parents)
-                and arrays["champion"].size in (0, genes)
+                and champion.shape == (genes if meta["champion"] else 0,)
+                and champion.dtype == np.float32
+                and np.isfinite(meta["champion"]).all()
                 and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
+                and len(first) <= self.curriculum.config.contenders
                 and len(last) <= 1
                 and tried.ndim == 1
+                and len(tried) <= TRIED_KEPT
                 and tried.dtype == np.uint64
             )
-            if not fits or not np.isfinite(history).all() or not 0.0 < float(meta["target_m"]) <= self.curriculum.goal:
+            if (
+                not fits
+                or not np.isfinite(history).all()
+                or not least <= float(meta["target_m"]) <= self.curriculum.goal
+            ):
                 raise ValueError("its parts do not fit each other")
             maps = np.arange(len(self.curriculum.map_seeds))
             if not np.isfinite(crashes).all() or not np.isin(crashes[:, 0], maps).all():
                 raise ValueError("a crash is nowhere on its maps")
             check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
-            self.genetic.generation, self.genetic.elites = generation, int(meta["elite_rows"])
+            self.genetic.generation, self.genetic.elites = generation, elite_rows
             self.genetic.parents = parents
             self.curriculum.target = float(meta["target_m"])
             self.curriculum.crashes, self.curriculum.crash_worlds = _crashes(crashes), worlds
@@ -454,9 +465,11 @@ class Evolution:
             self.trials = Trials(first, last, first_generation, last_generation, tried)
             if meta["champion"]:
                 score, rate, distance, found = meta["champion"]
-                self.champion = Champion(arrays["champion"], float(score), float(rate), float(distance), int(found))
+                self.champion = Champion(champion, float(score), float(rate), float(distance), int(found))
+            if self.done() and self.champion is None:
+                raise ValueError("it is done, and has no champion; go on with more --generations")
             self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
 
     def history_csv(self) -> bytes:

@@ -138,10 +138,20 @@ def open_run(folder: Path) -> RunFolder:
         run.saved = checkpoint.load(folder / CHECKPOINT)
     except CheckpointError as error:
         raise RunError(str(error)) from error
-    run.init_sha256 = str(run.saved[1].get("init_sha256", ""))
-    run.tracking_key = str(run.saved[1].get("tracking", {}).get("key", run.tracking_key))
-    if run.saved[1].get("digest") != run.digest():
+    meta = run.saved[1]
+    run.init_sha256 = str(meta.get("init_sha256", ""))
+    if meta.get("digest") != run.digest():
         raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
+    tracking = meta["tracking"] if isinstance(meta.get("tracking"), dict) else {}
+    fits = (
+        all(type(meta.get(name)) is int for name in ("generation", "car_steps"))
+        and type(meta.get("solved")) is bool
+        and all(isinstance(tracking.get(name), str) for name in ("uri", "key"))
+        and isinstance(tracking.get("run_id"), str | None)
+    )
+    if not fits:
+        raise RunError(f"{folder / CHECKPOINT}: its parts are not those of a run")
+    run.tracking_key = tracking["key"]
     return run
 
 
@@ -217,6 +227,8 @@ class Session:
         evolution = self.evolution
         for step, past in enumerate(evolution.history):
             self._log(step, past)  # what MLflow has is skipped
+        if evolution.history:
+            self._write_history()  # it may lack the last row: it is written after the checkpoint
         evolution.meanwhile = self._save_last
         try:
             while not evolution.done():
@@ -226,12 +238,12 @@ class Session:
                 self._unsaved = True
                 if self.on_row:
                     self.on_row(evolution.generation, row)
+            self._save_last()
         except CheckpointError:
             raise
         except BaseException:
             self._save_last()  # the state is whole until the next generation's results are there
             raise
-        self._save_last()
 
     def _save_last(self) -> None:
         """Save and log the last generation, if that was not done."""
@@ -253,6 +265,9 @@ class Session:
             "tracking": {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key},
         }
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
+        self._write_history()
+
+    def _write_history(self) -> None:
         checkpoint.write_atomic(self.run.path / HISTORY, self.evolution.history_csv(), durable=False)
 
     def finish(self, workers: int) -> dict[str, Any]:

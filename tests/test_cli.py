@@ -353,7 +353,7 @@ def test_resume_refuses_damaged_checkpoints(reference, tmp_path):
 
 
 @pytest.mark.e2e
-def test_extending_a_run_equals_a_longer_one(reference, tmp_path):
+def test_a_finished_run_can_be_extended(reference, tmp_path):
     short = [*SMALL]
     short[short.index("6")] = "3"
     done = evolve("--workers", "0", "--name", "s", *short, cwd=tmp_path)

@@ -1,13 +1,18 @@
 """The generation loop among traffic: what it remembers of crashes survives a checkpoint, and changes nothing."""
 
 import dataclasses
+import math
+import re
+import time
 
 import numpy as np
 import pytest
 
+from cluster import cli
 from cluster.checkpoint import CheckpointError, load, save
 from cluster.coordinator import Evolution, Maps
 from cluster.pool import SerialPool
+from cluster.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
 from cluster.settings import EvolveSettings
 from evolution.curriculum import CrashError
 from gridsim.config import SimConfig
@@ -130,3 +135,108 @@ def test_a_crash_that_does_not_fit_its_map_is_refused_when_it_is_to_be_driven(ma
 def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):
     with pytest.raises(CheckpointError, match="does not belong to this run"):
         begin(maps, dataclasses.replace(SETTINGS, traffic=4)).restore(*load(halfway))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("trials_first", lambda a: np.zeros((3, 311), np.float32)),  # contenders are two
+        ("trials_first", lambda a: np.zeros(311, np.float32)),
+        ("trials_last", lambda a: np.zeros((2, 311), np.float32)),
+        ("trials_tried", lambda a: np.zeros(257, np.uint64)),
+        ("trials_tried", lambda a: np.zeros(2, np.int64)),
+        ("parents", lambda a: np.zeros((11, 311), np.float32)),  # 2 elites and 8
+        ("parents", lambda a: a[:2]),  # elites alone
+        ("champion", lambda a: np.zeros(311, np.float32)),  # of which nothing is known
+        ("trials", lambda m: [math.inf, 1]),
+        ("trials", lambda m: [1]),
+        ("generation", lambda m: math.inf),
+        ("car_steps", lambda m: math.inf),
+        ("elite_rows", lambda m: 3),
+        ("target_m", lambda m: 5e-324),
+        ("champion", lambda m: [0.5, 0.5, 100.0, 0]),  # of which there are no genes
+        ("solved", lambda m: True),  # without a champion
+    ],
+)
+def test_states_that_no_run_has_are_refused(maps, halfway, name, change):
+    arrays, meta = load(halfway)
+    part = meta if name in meta and (name != "champion" or isinstance(change(arrays[name]), list)) else arrays
+    part[name] = change(part[name])
+    with pytest.raises(CheckpointError, match="does not belong to this run") as error:
+        begin(maps).restore(arrays, meta)
+    assert "\n" not in str(error.value)
+
+
+def run_folder(halfway, path, **changed):
+    """A run that was stopped after the first of two generations."""
+    run = RunFolder(path, SETTINGS)
+    run.write_config()
+    arrays, meta = load(halfway)
+    meta |= {"digest": run.digest(), "tracking": {"uri": "sqlite:///m.db", "run_id": None, "key": "k"}, **changed}
+    save(path / "checkpoint.npz", arrays, meta)
+    return path
+
+
+def test_a_stopped_run_cannot_be_cut_short_where_no_champion_was_looked_for(halfway, tmp_path):
+    path = run_folder(halfway, tmp_path)
+    assert cli._prepare(["--resume", str(path), "--generations", "3"])[1].settings.generations == 3
+    with pytest.raises(cli.UsageError, match=re.escape("--generations 1: the run has done 1 already; give more")):
+        cli._prepare(["--resume", str(path), "--generations", "1"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("generation", math.inf),
+        ("car_steps", None),
+        ("solved", "no"),
+        ("tracking", []),
+        ("tracking", {"uri": 1, "run_id": None, "key": "k"}),
+    ],
+)
+def test_a_checkpoint_with_other_parts_is_refused_in_one_line(halfway, tmp_path, name, value):
+    path = run_folder(halfway, tmp_path, **{name: value})
+    with pytest.raises(RunError, match="not those of a run") as error:
+        open_run(path)
+    assert "\n" not in str(error.value)
+
+
+class InterruptedOnce(Session):
+    """Ctrl-C comes while its first save is on its way."""
+
+    interrupted = False
+
+    def save(self) -> None:
+        if not self.interrupted:
+            self.interrupted = True
+            raise KeyboardInterrupt
+        super().save()
+
+
+def go_on_in(path, maps, session=Session):
+    """A stopped run, to be continued from its folder, with a short validation."""
+    run = open_run(path)
+    tracker = make_tracker(run, f"sqlite:///{path}/m.db", "test")
+    resumed = session(run, SerialPool(maps.build), maps, tracker, time.perf_counter())
+    curriculum = resumed.evolution.curriculum
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4, contenders=2)
+    return resumed
+
+
+def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, halfway, tmp_path):
+    resumed = go_on_in(run_folder(halfway, tmp_path), maps, InterruptedOnce)
+    with pytest.raises(KeyboardInterrupt):
+        resumed.evolve()
+    assert resumed.interrupted
+    assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 2
+    assert len(read_history(tmp_path / "history.csv")) == 2
+
+
+def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
+    """As a kill between the last checkpoint and its history leaves it, when nothing is left to evolve."""
+    resumed = go_on_in(run_folder(halfway, tmp_path), maps)
+    resumed.evolve()
+    whole = (tmp_path / "history.csv").read_bytes()
+    (tmp_path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
+    go_on_in(tmp_path, maps).evolve()
+    assert (tmp_path / "history.csv").read_bytes() == whole
