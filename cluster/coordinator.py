@@ -7,7 +7,6 @@ the workers return; nothing follows from the clock or from who returned it.
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
 import threading
 import time
@@ -24,7 +23,15 @@ from cluster.settings import EvolveSettings
 from cluster.worker import Task
 from evolution import fitness
 from evolution.breeding import RECIPE, Mutation
-from evolution.curriculum import HELD_OUT_EPISODES, HELD_OUT_MAPS, Curriculum, spread_starts, success_rate
+from evolution.curriculum import (
+    HELD_OUT_EPISODES,
+    HELD_OUT_MAPS,
+    TRIED_KEPT,
+    Curriculum,
+    Trials,
+    spread_starts,
+    success_rate,
+)
 from evolution.episodes import Episodes
 from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
@@ -41,7 +48,6 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of history.csv after `generation`; the names that MLflow has them under."""
 
-TRIED_KEPT = 256  # members that are not validated again
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 
 
@@ -99,39 +105,6 @@ class Champion:
     success_rate: float = 0.0
     distance_m: float = 0.0
     generation: int = -1
-
-
-@dataclass
-class Trials:
-    """Members that are being validated, beside the evaluation of the generation that comes next.
-
-    Those of `first` are on validation's first stage; the best of them is then `last`, and is judged by the episodes of
-    the second stage alone, since it was chosen on the first.
-
-    Attributes:
-        first: genomes float32 [k, genes].
-        first_generation: the one that they come from.
-        last: genomes float32 [0 or 1, genes].
-        last_generation: the one that it comes from.
-        tried: uint64 [n], digests of whom the first stage has seen lately.
-    """
-
-    first: np.ndarray
-    last: np.ndarray
-    first_generation: int = -1
-    last_generation: int = -1
-    tried: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
-
-    def __len__(self) -> int:
-        return len(self.first) + len(self.last)
-
-    def enter(self, genomes: np.ndarray, generation: int) -> None:
-        """Let those of [k, genes] try who did not lately."""
-        digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
-        new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]
-        self.first, self.first_generation = genomes[new], generation
-        entered = np.array([digests[k] for k in new], dtype=np.uint64)
-        self.tried = np.concatenate([self.tried, entered])[-TRIED_KEPT:]
 
 
 @dataclass

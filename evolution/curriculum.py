@@ -10,9 +10,10 @@ State is arrays and numbers only; all randomness comes from (seed, generation).
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from gridsim.world import check_worlds
 HELD_OUT_MAPS = 16
 HELD_OUT_EPISODES = 64
 VALIDATION_MAPS = 48
+TRIED_KEPT = 256  # members that are not validated again
 
 
 class CrashError(ValueError):
@@ -196,6 +198,39 @@ class Curriculum:
         metres = results["distance"].astype(np.float64).sum(axis=1)
         speed = metres / np.maximum(results["steps"].sum(axis=1) * self.period, 1e-9)
         return success_rate(results) * np.minimum(speed / self.config.champion_pace, 1.0)
+
+
+@dataclass
+class Trials:
+    """Members that are being validated, beside the evaluation of the generation that comes next.
+
+    Those of `first` are on validation's first stage; the best of them is then `last`, and is judged by the episodes of
+    the second stage alone, since it was chosen on the first.
+
+    Attributes:
+        first: genomes float32 [k, genes].
+        first_generation: the one that they come from.
+        last: genomes float32 [0 or 1, genes].
+        last_generation: the one that it comes from.
+        tried: uint64 [n], digests of whom the first stage has seen lately.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    first_generation: int = -1
+    last_generation: int = -1
+    tried: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
+
+    def __len__(self) -> int:
+        return len(self.first) + len(self.last)
+
+    def enter(self, genomes: np.ndarray, generation: int) -> None:
+        """Let those of [k, genes] try who did not lately."""
+        digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
+        new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]
+        self.first, self.first_generation = genomes[new], generation
+        entered = np.array([digests[k] for k in new], dtype=np.uint64)
+        self.tried = np.concatenate([self.tried, entered])[-TRIED_KEPT:]
 
 
 def success_rate(results: np.ndarray) -> np.ndarray:
