@@ -122,8 +122,10 @@ def _sample(starts, pieces, piece_offsets, steps, offsets):
                 x, y, heading = _on(x, y, heading, pieces[piece, 0], pieces[piece, 1])
                 passed += pieces[piece, 0]
                 piece += 1
-            ends[lane] = _on(x, y, heading, s - passed, pieces[piece, 1])
-            points[offsets[lane] + i] = ends[lane, :2]
+            # One by one: an assignment of slices takes two seconds to compile.
+            end_x, end_y, end_heading = _on(x, y, heading, s - passed, pieces[piece, 1])
+            ends[lane, 0], ends[lane, 1], ends[lane, 2] = end_x, end_y, end_heading
+            points[offsets[lane] + i, 0], points[offsets[lane] + i, 1] = end_x, end_y
     return points, ends
 
 
@@ -165,10 +167,10 @@ def _crossings(points, offsets, successors, abreast, width, height):
     cross = np.zeros((n, n), dtype=np.bool_)
     middle, radius = np.empty((n, 2)), np.zeros(n)
     for i in range(n):
-        lane = points[offsets[i] : offsets[i + 1]]
-        middle[i] = lane[len(lane) // 2]
-        for point in lane:
-            radius[i] = max(radius[i], math.hypot(point[0] - middle[i, 0], point[1] - middle[i, 1]))
+        centre = (offsets[i] + offsets[i + 1]) // 2
+        middle[i, 0], middle[i, 1] = points[centre, 0], points[centre, 1]
+        for k in range(offsets[i], offsets[i + 1]):
+            radius[i] = max(radius[i], math.hypot(points[k, 0] - middle[i, 0], points[k, 1] - middle[i, 1]))
     for i in range(n):
         first = points[offsets[i]]
         for j in range(i + 1, n):
