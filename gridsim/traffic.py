@@ -180,8 +180,9 @@ def follow(network, drivers, car, other, is_ego):
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near)
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    if is_ego and not looked and other[SPEED] > _ONE and forward > _ZERO:
-        # Where the ego car will be in a second: it may be about to cut in, or to cross.
+    same_way = car[COS] * other[COS] + car[SIN] * other[SIN] > _HALF
+    if is_ego and not looked and same_way and other[SPEED] > _ONE and forward > _ZERO:
+        # Where the ego car will be in a second: it may be about to cut in.
         x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
         near = min(car[HORIZON], car[GAP])
         at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near)
