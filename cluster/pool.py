@@ -92,7 +92,7 @@ class WorkerPool(Protocol):
         """Breed recipes RECIPE [n] and drive them through the task's episodes.
 
         Args:
-            asked: who is to drive what, the most promising first; None is all members on all episodes.
+            asked: who is to drive what, the longest episodes first; None is all members on all episodes.
             meanwhile: called once, when the workers are busy.
 
         Raises: PoolError where that cannot be done.

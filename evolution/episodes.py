@@ -20,10 +20,6 @@ class Episodes(NamedTuple):
     rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
     worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
 
-    def part(self, first: int, stop: int | None = None) -> Episodes:
-        """Some of them."""
-        return Episodes(self.maps, self.rows[first:stop], self.worlds[first:stop])
-
     def within(self, limits: Limits) -> Episodes:
         """The same, each with its own target and limit: these where it had none."""
         rows = self.rows.copy()

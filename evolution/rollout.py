@@ -113,7 +113,7 @@ def _on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
     """The settings of episodes on these maps."""
     k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return [Setting(map.road, map.network, k, others, rays, config.sensors.rays) for map in scenarios]
+    return [Setting(s.road, s.network, k, others, rays, config.sensors.rays) for s in scenarios]
 
 
 class Bounds(NamedTuple):
