@@ -41,12 +41,13 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
     for lane in range(lanes):
         first, last = offsets[lane], offsets[lane + 1] - 1
         for p in range(first, last + 1):
-            a, b, c = max(p - 2, first), min(max(p, first + 2), last - 2), min(p + 2, last)
+            b = min(max(p, first + 2), last - 2)
+            a, c = b - 2, b + 2
             if last - first < 4:
                 a, b, c = first, (first + last) // 2, last
             ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             vx, vy = points[c, 0] - points[b, 0], points[c, 1] - points[b, 1]
-            turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy))
+            turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy)) if a < b else 0.0
             length = 0.5 * (math.hypot(ux, uy) + math.hypot(vx, vy))
             speeds[p] = min(top, math.sqrt(lateral * length / max(turn, 1e-6))) if length > 1e-6 else top
     for _ in range(4):  # a bend is felt through the lanes before it

@@ -194,6 +194,23 @@ def test_the_ego_car_beside_the_lane_is_passed(ring):
     assert history[:, 0, SPEED].min() > 11.9
 
 
+@pytest.mark.parametrize("heading", np.arange(8) * math.pi / 4)
+@pytest.mark.parametrize("radius", [math.inf, 16.0, -16.0])
+def test_lanes_are_as_fast_as_their_bends_allow(heading, radius):
+    """All along the lanes of a loop, their ends included, whichever way they point: the limit, or sqrt(a R)."""
+    if math.isinf(radius):  # round the torus
+        piece = (128.0 if heading % (math.pi / 2) == 0.0 else 128.0 * math.sqrt(2.0), 0.0)
+        dx, dy = piece[0] * math.cos(heading), piece[0] * math.sin(heading)
+        paths = [Path(k * dx, k * dy, heading, (piece,)) for k in range(2)]
+    else:
+        piece = (math.pi / 2 * abs(radius), 1.0 / radius)
+        at = [(heading + k * math.copysign(math.pi / 2, radius)) for k in range(4)]
+        paths = [Path(100.0 + radius * math.sin(h), 100.0 - radius * math.cos(h), h, (piece,)) for h in at]
+    network = network_of(paths, 256.0, 256.0)
+    fastest = min(12.0, math.sqrt(CONFIG.traffic.lateral * abs(radius)))
+    assert network.speeds == pytest.approx(fastest, rel=2e-3)
+
+
 # --- Junctions -------------------------------------------------------------------------------------------------------
 
 
