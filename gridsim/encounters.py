@@ -1,0 +1,87 @@
+"""How traffic meets the ego car: it keeps to the right of its lane, and sees coming where both would be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.boxes import boxes_touch
+from gridsim.jit import leaf, njit
+from gridsim.network import lane_length, turned, wrapped
+from gridsim.world import AFTER, ALONG, COS, LANE, NEXT, SHIFT, SIN, SPEED, X, Y
+
+_F, _I, _N = np.float32, np.int32, np.uint64
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+_FAR = _F(35.0)  # m from which on it keeps to the right
+_PAST = _F(-4.0)  # m ahead: then both have passed each other
+_TOWARDS = _F(0.3)  # cosine of the angle between the headings of who goes the same way, or turns into it
+_TICK = _F(0.25)  # s between the moments that are foreseen
+_TICKS = 8  # of them
+_NEAR = _F(6.0)  # m between their middles within which two cars may touch
+
+
+@leaf
+def meets(network, car, ego):
+    """Whether the ego car, not far ahead, comes towards a car or crosses its way."""
+    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > _TOWARDS:
+        return False
+    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
+    return dx * dx + dy * dy < _FAR * _FAR and dx * car[COS] + dy * car[SIN] > _PAST
+
+
+@leaf
+def room_beside(network, car):
+    """M to the right that a car can move over where it is."""
+    lane = _N(_I(car[LANE]))
+    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
+    return network.room[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
+
+
+@leaf
+def moved_over(network, k, other, right):
+    """Point k of a lane (m), moved to the right; other is a neighbour of k, before or after it on the lane."""
+    one, two = max(k, other), min(k, other)
+    x, y = network.points[k, 0], network.points[k, 1]
+    ux, uy = network.points[one, 0] - network.points[two, 0], network.points[one, 1] - network.points[two, 1]
+    by = right / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+    return x + by * uy, y - by * ux
+
+
+@njit(_nrt=False)
+def runs_into(network, drivers, car, ego):
+    """M from a car's middle along its path to where it must not get if it is not to run into the ego car.
+
+    Both are taken to go on as fast as they are, the car along its lanes and keeping to the right, the ego car straight
+    ahead. 1e9 if they do not touch within two seconds, or if it is the ego car that runs into this one's side or rear:
+    then it had better go on. Not inlined: the call is rare, and dear for all the network's arguments.
+    """
+    lane = _I(car[LANE])
+    length, begin = lane_length(network, lane), -car[ALONG]  # m of the lane, and of way to its beginning
+    for tick in range(1, _TICKS + 1):
+        t = _F(tick) * _TICK
+        way = car[SPEED] * t
+        while way - begin >= length:
+            begin += length
+            if lane == _I(car[LANE]):
+                lane = _I(car[NEXT])
+            elif lane == _I(car[NEXT]):
+                lane = _I(car[AFTER])
+            else:
+                return _F(1e9)
+            length = lane_length(network, lane)
+        k = _N(network.offsets[_N(lane)]) + _N(_I((way - begin) / network.steps[_N(lane)]))
+        k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
+        right = min(network.room[k], drivers.shift * t - car[SHIFT])
+        px, py = moved_over(network, k, k + _N(1), right)
+        dx = turned(ego[X] + ego[SPEED] * t * ego[COS] - px, network.width)
+        dy = turned(ego[Y] + ego[SPEED] * t * ego[SIN] - py, network.height)
+        if dx * dx + dy * dy > _NEAR * _NEAR:
+            continue
+        ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]
+        ux, uy = ux - network.points[k, 0], uy - network.points[k, 1]
+        norm = _ONE / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+        if boxes_touch(drivers, dx, dy, ux * norm, uy * norm, ego[COS], ego[SIN]):
+            return way + drivers.half_length if dx * ux + dy * uy >= _ZERO else _F(1e9)
+    return _F(1e9)
