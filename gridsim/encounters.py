@@ -7,8 +7,10 @@ import math
 import numpy as np
 
 from gridsim.boxes import boxes_touch
+from gridsim.ego import STEERING
 from gridsim.jit import leaf, njit
 from gridsim.network import lane_length, turned, wrapped
+from gridsim.vehicle import advance, path_curvature
 from gridsim.world import AFTER, ALONG, COS, LANE, NEXT, SHIFT, SIN, SPEED, X, Y
 
 _F, _I, _N = np.float32, np.int32, np.uint64
@@ -18,7 +20,8 @@ _FAR = _F(35.0)  # m from which on it keeps to the right
 _PAST = _F(-4.0)  # m ahead: then both have passed each other
 _TOWARDS = _F(0.3)  # cosine of the angle between the headings of who goes the same way, or turns into it
 _TICK = _F(0.25)  # s between the moments that are foreseen
-_TICKS = 8  # of them
+_TICKS = 12  # of them
+_BRAKING = _F(6.0)  # m/s2 with which it would stop before it is run into
 _NEAR = _F(6.0)  # m between their middles within which two cars may touch
 
 
@@ -53,12 +56,15 @@ def moved_over(network, k, other, right):
 def runs_into(network, drivers, car, ego):
     """M from a car's middle along its path to where it must not get if it is not to run into the ego car.
 
-    Both are taken to go on as fast as they are, the car along its lanes and keeping to the right, the ego car straight
-    ahead. 1e9 if they do not touch within two seconds, or if it is the ego car that runs into this one's side or rear:
-    then it had better go on. Not inlined: the call is rare, and dear for all the network's arguments.
+    Both are taken to go on as they do: the car along its lanes at its speed, keeping to the right, the ego car at its
+    own on the arc that it steers. 1e9 if they do not touch within three seconds; or if the ego car runs into this one's
+    side or rear and it cannot well stop before that: then it had better go on.
+    Not inlined: the call is rare, and dear for all the network's arguments.
     """
     lane = _I(car[LANE])
     length, begin = lane_length(network, lane), -car[ALONG]  # m of the lane, and of way to its beginning
+    x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
+    curvature = path_curvature(drivers.ego, speed, ego[STEERING])
     for tick in range(1, _TICKS + 1):
         t = _F(tick) * _TICK
         way = car[SPEED] * t
@@ -75,13 +81,17 @@ def runs_into(network, drivers, car, ego):
         k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
         right = min(network.room[k], drivers.shift * t - car[SHIFT])
         px, py = moved_over(network, k, k + _N(1), right)
-        dx = turned(ego[X] + ego[SPEED] * t * ego[COS] - px, network.width)
-        dy = turned(ego[Y] + ego[SPEED] * t * ego[SIN] - py, network.height)
+        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, _TICK)
+        dx, dy = turned(x - px, network.width), turned(y - py, network.height)
         if dx * dx + dy * dy > _NEAR * _NEAR:
             continue
         ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]
         ux, uy = ux - network.points[k, 0], uy - network.points[k, 1]
-        norm = _ONE / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-        if boxes_touch(drivers, dx, dy, ux * norm, uy * norm, ego[COS], ego[SIN]):
-            return way + drivers.half_length if dx * ux + dy * uy >= _ZERO else _F(1e9)
+        norm = _ONE / math.sqrt(max(ux * ux + uy * uy, _F(1e-12)))
+        ux, uy = ux * norm, uy * norm
+        if boxes_touch(drivers, dx, dy, ux, uy, cosine, sine):
+            ahead = dx * ux + dy * uy
+            at = way + ahead - drivers.half_width
+            stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (_F(2.0) * _BRAKING)
+            return max(at, _ZERO) if ahead >= _ZERO or stops else _F(1e9)
     return _F(1e9)

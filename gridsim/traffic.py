@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import SimConfig
+from gridsim.config import Constants, SimConfig, constants
 from gridsim.encounters import meets, moved_over, room_beside, runs_into
 from gridsim.jit import leaf, njit
 from gridsim.junctions import CAUTION, may_enter
@@ -66,6 +66,7 @@ class Drivers(NamedTuple):
     half_length: np.float32  # m
     half_width: np.float32  # m
     dt: np.float32  # s
+    ego: Constants  # of the ego car, by which its way is foreseen
 
 
 def drivers(sim: SimConfig) -> Drivers:
@@ -84,6 +85,7 @@ def drivers(sim: SimConfig) -> Drivers:
         half_length=f(sim.vehicle.length / 2),
         half_width=f(sim.vehicle.width / 2),
         dt=f(sim.episode.control_period),
+        ego=constants(sim),
     )
 
 
@@ -367,8 +369,8 @@ def _go(network, drivers, car, ego):
 def flow(network, drivers, world, ego):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
-    Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it
-    is not there).
+    Args: world [cars, FIELDS], changed; ego, a car of which X to STEERING are read (without a heading, COS and SIN 0,
+    it is not there).
     """
     cars = world.shape[0]
     _see(network, drivers, world, ego)

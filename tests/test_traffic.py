@@ -11,12 +11,14 @@ from scipy import stats
 
 from gridsim.boxes import boxes_touch
 from gridsim.config import SimConfig, constants
+from gridsim.ego import STEERING
 from gridsim.jit import njit
 from gridsim.lanes import Path, lay_lanes
 from gridsim.network import make_network, wrapped
 from gridsim.roads import clearances, freeze
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.traffic import drivers, flow, idm
+from gridsim.vehicle import path_curvature
 from gridsim.world import AFTER, ALONG, COS, FACTOR, FIELDS, LANE, NEXT, PAST, PERMIT, SHIFT, SIN, SPEED, X, Y, spawn
 
 F = np.float32
@@ -267,15 +269,32 @@ def test_nobody_keeps_further_right_than_there_is_room():
             assert gap <= traffic.taper * network.steps[lane] + 1e-4
 
 
-def test_a_car_foresees_the_ego_car_that_turns_across_its_way(crossing):
-    """Both are on their way over the junction, 3 s from each other: the car brakes before its way is blocked."""
-    world = cars_on(crossing, (1, 2.0, 7.0, 1.0))
-    car = ego(134.0, 128.0 - 9.0, math.pi / 2, 6.0)
-    for _ in range(40):
-        flow(crossing, D, world, car)
-        car[Y] += 6.0 * DT
-        dx, dy = car[X] - world[0, X], car[Y] - world[0, Y]
-        assert not boxes_touch(K, dx, dy, world[0, COS], world[0, SIN], car[COS], car[SIN])
+@pytest.mark.parametrize("turn", [0.0, 0.25])
+@pytest.mark.parametrize("late", np.arange(-1.5, 0.1, 0.5))
+def test_a_car_in_a_junction_foresees_the_ego_car(crossing, turn, late):
+    """The ego car comes northwards, up to 1.5 s before a car on the eastern way is where these cross, straight on or
+    on the arc that it steers; they never touch, and they do where nobody looks ahead."""
+    radius = 1.0 / float(path_curvature(K, F(6.0), F(turn))) if turn else math.inf
+
+    def drive(foresees):
+        world = cars_on(crossing, (1, 0.0, 7.0, 1.0))
+        touched = False
+        for step in range(60):
+            way = 6.0 * (step * DT - 8.0 / 7.0 - late)  # m of the ego car's to where it crosses the car's lane
+            x, y, heading = (128.0, 128.0 + way, math.pi / 2)
+            if turn:
+                angle = way / radius
+                x, y = 128.0 - radius * (1.0 - math.cos(angle)), 128.0 + radius * math.sin(angle)
+                heading += angle
+            car = ego(x, y, heading, 6.0)
+            car[STEERING] = turn
+            flow(crossing, D, world, car if foresees else NOBODY)
+            dx, dy = car[X] - world[0, X], car[Y] - world[0, Y]
+            touched |= boxes_touch(K, dx, dy, world[0, COS], world[0, SIN], car[COS], car[SIN])
+        return touched
+
+    assert not drive(True)
+    assert drive(False) == (late > -1.25)
 
 
 # --- Junctions -------------------------------------------------------------------------------------------------------
