@@ -19,8 +19,8 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 _FAR = _F(35.0)  # m from which on it keeps to the right
 _PAST = _F(-4.0)  # m ahead: then both have passed each other
 _TOWARDS = _F(0.3)  # cosine of the angle between the headings of who goes the same way, or turns into it
-_TICK = _F(0.25)  # s between the moments that are foreseen
-_TICKS = 12  # of them
+_FORESEEN = _F(3.0)  # s
+_TICK = _F(0.25)  # s between the moments that are looked at
 _BRAKING = _F(6.0)  # m/s2 with which it would stop before it is run into
 _NEAR = _F(6.0)  # m between their middles within which two cars may touch
 
@@ -65,8 +65,14 @@ def runs_into(network, drivers, car, ego):
     length, begin = lane_length(network, lane), -car[ALONG]  # m of the lane, and of way to its beginning
     x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
     curvature = path_curvature(drivers.ego, speed, ego[STEERING])
-    for tick in range(1, _TICKS + 1):
-        t = _F(tick) * _TICK
+    dx, dy = wrapped(x - car[X], network.width), wrapped(y - car[Y], network.height)
+    t = _ZERO
+    while True:
+        # Nothing can touch any sooner.
+        hop = max((math.sqrt(dx * dx + dy * dy) - _NEAR) / (car[SPEED] + abs(speed)), _TICK)
+        t += hop
+        if t > _FORESEEN:
+            return _F(1e9)
         way = car[SPEED] * t
         while way - begin >= length:
             begin += length
@@ -81,7 +87,7 @@ def runs_into(network, drivers, car, ego):
         k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
         right = min(network.room[k], drivers.shift * t - car[SHIFT])
         px, py = moved_over(network, k, k + _N(1), right)
-        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, _TICK)
+        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
         dx, dy = turned(x - px, network.width), turned(y - py, network.height)
         if dx * dx + dy * dy > _NEAR * _NEAR:
             continue
@@ -94,4 +100,3 @@ def runs_into(network, drivers, car, ego):
             at = way + ahead - drivers.half_width
             stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (_F(2.0) * _BRAKING)
             return max(at, _ZERO) if ahead >= _ZERO or stops else _F(1e9)
-    return _F(1e9)
