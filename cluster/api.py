@@ -10,7 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from cluster.champion import Champion, evaluate, load_champion
-from cluster.coordinator import Evolution, Maps
+from cluster.coordinator import Evolution
+from cluster.learning import Maps
 from cluster.pool import SerialPool, WorkerPool
 from cluster.settings import EvolveSettings
 from gridsim.config import SimConfig

@@ -17,7 +17,7 @@ import numpy as np
 
 from cluster import checkpoint
 from cluster.checkpoint import CheckpointError
-from cluster.coordinator import Maps, summarise
+from cluster.learning import Maps, summarise
 from cluster.settings import MAX_TRAFFIC
 from evolution import convnet
 from evolution.curriculum import HELD_OUT_MAPS, spread_starts

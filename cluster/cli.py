@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, NoReturn, TypeVar
 import tyro
 from rich.console import Console
 
-from cluster.settings import EvolveSettings, SettingsError
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError
 from gridsim.scenarios import is_map_file
 
 if TYPE_CHECKING:
-    from cluster.coordinator import Maps
+    from cluster.learning import Maps
     from cluster.pool import WorkerPool
     from cluster.run import RunFolder
     from cluster.tracking import Tracker
@@ -43,12 +43,8 @@ def cores() -> int:
 
 
 @dataclass(frozen=True)
-class EvolveFlags(EvolveSettings):
-    """Evolve a driver: a genetic algorithm over neural networks, its population evaluated in parallel.
-
-    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
-    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
-    """
+class RunFlags:
+    """Where a learner's run is computed, kept and logged."""
 
     workers: int = field(default_factory=cores)
     """Worker processes; 0 evaluates in this process."""
@@ -69,9 +65,27 @@ class EvolveFlags(EvolveSettings):
     experiment: str = "gridsim"
     """MLflow's experiment."""
 
-    def settings(self) -> EvolveSettings:
-        """What decides the champion."""
-        return EvolveSettings(**{f.name: getattr(self, f.name) for f in dataclasses.fields(EvolveSettings)})
+
+@dataclass(frozen=True)
+class EvolveFlags(RunFlags, EvolveSettings):
+    """Evolve a driver: a genetic algorithm over neural networks, its population evaluated in parallel.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
+    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+
+@dataclass(frozen=True)
+class DqnFlags(RunFlags, DqnSettings):
+    """Train a driver by deep Q-learning: the workers collect experience while the learner trains on what they brought.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
+    curves, on the same axes as those of gridsim-evolve. The champion is the network that did best on validation. It
+    depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+
+Flags = EvolveFlags | DqnFlags
 
 
 @dataclass(frozen=True)
@@ -162,17 +176,26 @@ def _undisturbed() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------------------------------------------------------------ evolve
+# ------------------------------------------------------------------------------------------------------------- learn
 
 
 def evolve_main() -> None:
     """Entry point of `gridsim-evolve`."""
+    _learn_main(EvolveFlags)
+
+
+def dqn_main() -> None:
+    """Entry point of `gridsim-dqn`."""
+    _learn_main(DqnFlags)
+
+
+def _learn_main(kind: type[Flags]) -> None:
     started = time.perf_counter() - process_age_s()
     try:
         with _stoppable():
-            sys.exit(_evolve(sys.argv[1:], started))
+            sys.exit(_learn(kind, sys.argv[1:], started))
     except KeyboardInterrupt:  # before there was anything to save
-        print("gridsim-evolve: stopped", file=sys.stderr)
+        print(f"{kind.command}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Stopped:
         sys.exit(143)
@@ -189,17 +212,17 @@ def _given(arguments: Sequence[str], flag: str) -> str:
     return value
 
 
-def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
+def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     """Flags and the run's folder, checked; nothing is written yet. Raises UsageError."""
     from cluster import run as runs
     from cluster.champion import load_champion
     from cluster.checkpoint import CheckpointError
     from evolution.policy import PolicySpec
 
-    prog = "gridsim-evolve"
+    prog = kind.command
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
     if {"-h", "--help"} & set(arguments) or not (resume or config):
-        flags = parse(EvolveFlags, prog, arguments)
+        flags = parse(kind, prog, arguments)
     elif resume and config:
         raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
     else:
@@ -211,10 +234,12 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
                 settings, init = runs.read_config(Path(config))
         except runs.RunError as error:
             raise UsageError(str(error)) from error
-        base = EvolveFlags(**dataclasses.asdict(settings), init=init)
+        if settings.command != prog:
+            raise UsageError(f"{resume or config} is a run of {settings.command}; give it to that command")
+        base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
-        flags = parse(EvolveFlags, prog, arguments, base)
+        flags = parse(kind, prog, arguments, base)
     if flags.traffic and is_map_file(flags.scenario):
         print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
         flags = dataclasses.replace(flags, traffic=0)
@@ -223,8 +248,8 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
     if flags.workers == 0 and flags.address:
         raise UsageError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
     if resume:
-        for f in dataclasses.fields(EvolveFlags):
-            if f.name in ("workers", "address", "tracking_uri", "experiment", "generations"):
+        for f in dataclasses.fields(kind):
+            if f.name in ("workers", "address", "tracking_uri", "experiment", *kind.unbound):
                 continue
             now, then = getattr(flags, f.name), getattr(base, f.name)
             if f.name == "output":
@@ -233,14 +258,15 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
                 raise UsageError(
                     f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
                 )
-        done = run.saved[1]["generation"]  # type: ignore[index]
-        if flags.generations < run.settings.generations and flags.generations <= done:
-            # Champions are looked for while a generation is the last; nothing can be made of one that was not.
-            raise UsageError(f"--generations {flags.generations}: the run has done {done} already; give more")
-        run.settings = flags.settings()
+        if isinstance(flags, EvolveFlags) and isinstance(run.settings, EvolveSettings):
+            done = run.saved[1]["generation"]  # type: ignore[index]
+            if flags.generations < run.settings.generations and flags.generations <= done:
+                # Champions are looked for while a generation is the last; nothing can be made of one that was not.
+                raise UsageError(f"--generations {flags.generations}: the run has done {done} already; give more")
+        run.settings = settings_of(flags)
         run.settings.check()
         return flags, run
-    settings = flags.settings()
+    settings = settings_of(flags)
     settings.check()
     digest = ""
     if flags.init:
@@ -257,21 +283,28 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
         raise UsageError(str(error)) from error
 
 
-def _evolve(arguments: Sequence[str], started: float) -> int:
+def settings_of(flags: Flags) -> RunSettings:
+    """What decides the champion."""
+    kind = EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings
+    return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})
+
+
+def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
     from cluster import tracking
 
-    prog = "gridsim-evolve"
+    prog = kind.command
     console = Console()
     try:
-        flags, run = _prepare(arguments)
+        flags, run = _prepare(kind, arguments)
         from cluster import warm
-        from cluster.coordinator import Maps
+        from cluster.learning import Maps
         from cluster.pool import PoolError, SerialPool
         from cluster.run import is_finished, make_tracker
         from gridsim.config import SimConfig
 
         if is_finished(run):
-            console.print(f"{run.path} is finished: {run.saved[1]['generation']} generations; nothing to do.")  # type: ignore[index]
+            first = kind.counts[0]
+            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; nothing to do.")  # type: ignore[index]
             return 0
         saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
         uri = tracking.check_uri(flags.tracking_uri or saved or None)
@@ -329,7 +362,9 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
         print(f"{prog}: warning: {lost}", file=sys.stderr)
     resumable = (run.path / "checkpoint.npz").is_file()
     if status == "KILLED":
-        where = f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "no generation was done yet"
+        where = (
+            f"continue with: {prog} --resume {_shown(run.path)}" if resumable else f"no {kind.counts[0]} was done yet"
+        )
         print(f"{prog}: stopped; {where}", file=sys.stderr)
         if not resumable:
             _discard(made)
@@ -343,10 +378,10 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
 
 
 def _run(
-    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: EvolveFlags,
+    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: Flags,
     started: float, warming: Warming,
 ) -> str:  # fmt: skip
-    """Evolve and finish. Returns the closing words."""
+    """Learn and finish. Returns the closing words."""
     from cluster import progress, report, warm
     from cluster.champion import load_champion
     from cluster.run import Session
@@ -357,13 +392,13 @@ def _run(
     if warming.processes:
         with console.status("compiling the simulator for this machine, once (some 10 s)"):
             warming.wait()
-    maps.ahead(session.evolution.curriculum.map_seeds[:3])
+    maps.ahead(session.learning.curriculum.map_seeds[:3])
     warm.compile_kernels(run.settings.policy, run.settings.traffic)  # before workers need them: never twice
     run.write_config()
     with progress.Progress(console, session, _shown(run.path)) as shown:
         session.on_row = shown.row
-        session.evolution.on_progress = shown.members
-        session.evolve()
+        session.learning.on_progress = shown.members
+        session.learn()
         shown.note("measuring and filming the champion on held-out roads")
         summary = session.finish(flags.workers)
         shown.note("logging to MLflow")
@@ -373,11 +408,12 @@ def _run(
         session.write_summary(summary)
         tracker.log_artifacts(run.path)
     if session.lost:
-        print(f"gridsim-evolve: warning: {session.lost}", file=sys.stderr)
+        print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
     console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))
     found = "solved" if summary["solved"] else "the best so far"
+    name = session.learning.step_name
     return (
-        f"{found} after {summary['generations']} generations, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
+        f"{found} after {summary[name + 's']} {name}s, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
         f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
         f"watch it: gridsim-watch {_shown(run.path)}\ncompare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
     )

@@ -14,6 +14,7 @@ from gridsim.ego import X, Y
 from gridsim.roads import FIELD_FLOOR, FIELD_UNITS
 from gridsim.scenarios import Scenario
 
+_BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
 
 
@@ -27,31 +28,37 @@ def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
-def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str]) -> None:
-    """Draw fitness, distance, speed and success over the generations to a PNG."""
+def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
+    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
     figure, axes = _figure(15, 3.8, 4)
-    generation = np.arange(len(history))
+    step = np.arange(len(history))
 
-    def column(name: str) -> np.ndarray:
-        return np.array([row[name] for row in history])
+    def plot(axis: Any, name: str, color: str, label: str, **style: Any) -> np.ndarray:
+        values = np.array([row[name] for row in history])
+        axis.plot(step, values, color=color, label=label, **style)
+        return values
 
-    mean, std = column("fitness/mean"), column("fitness/std")
-    axes[0].plot(generation, column("fitness/best"), color="#0b7285", label="best")
-    axes[0].plot(generation, mean, color="#868e96", label="mean")
-    axes[0].fill_between(generation, mean - std, mean + std, color="#868e96", alpha=0.2, linewidth=0)
-    axes[0].set(title="fitness", ylim=(0, 1.05))
-    axes[1].plot(generation, column("distance_m/best"), color="#0b7285", label="best")
-    axes[1].plot(generation, column("distance_m/mean"), color="#868e96", label="mean")
-    axes[1].step(generation, column("target_m"), color="#f08c00", linestyle=":", where="mid", label="episode length")
-    axes[1].set(title="distance, m")
-    axes[2].plot(generation, column("speed_mps/best"), color="#0b7285", label="best")
-    axes[2].plot(generation, column("speed_mps/mean"), color="#868e96", label="mean")
-    axes[2].set(title="speed, m/s")
-    axes[3].plot(generation, column("validation/success_rate"), color="#0b7285", label="champion, validation")
-    axes[3].plot(generation, column("race/success_rate"), color="#f08c00", alpha=0.5, label="leaders, training")
+    if history and "fitness/best" in history[0]:
+        plot(axes[0], "fitness/best", _BEST, "best")
+        mean, std = plot(axes[0], "fitness/mean", _MEAN, "mean"), np.array([row["fitness/std"] for row in history])
+        axes[0].fill_between(step, mean - std, mean + std, color=_MEAN, alpha=0.2, linewidth=0)
+        axes[0].set(title="fitness", ylim=(0, 1.05))
+        best, mean_of, success = "best", "mean", ("race/success_rate", "leaders, training")
+        plot(axes[1], "target_m", _OTHER, "episode length", linestyle=":", drawstyle="steps-mid")
+    else:
+        plot(axes[0], "q/mean", _BEST, "Q, mean")
+        plot(axes[0], "loss", _OTHER, "loss")
+        axes[0].set(title="Q values, loss")
+        best, mean_of, success = "network, validation", "training", ("network/success_rate", "network, validation")
+    for axis, name, title in ((axes[1], "distance_m", "distance, m"), (axes[2], "speed_mps", "speed, m/s")):
+        plot(axis, f"{name}/best", _BEST, best)
+        plot(axis, f"{name}/mean", _MEAN, mean_of)
+        axis.set(title=title)
+    plot(axes[3], "validation/success_rate", _BEST, "champion, validation")
+    plot(axes[3], success[0], _OTHER, success[1], alpha=0.5)
     axes[3].set(title="success rate", ylim=(-0.02, 1.05))
     for axis in axes:
-        axis.set_xlabel("generation")
+        axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
         axis.legend(frameon=False, fontsize=8)
     figure.savefig(Path(path), dpi=100)

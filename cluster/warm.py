@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.settings import EvolveSettings
+from cluster.settings import RunSettings
 from cluster.worker import Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.policy import PolicySpec
@@ -58,7 +58,7 @@ class Warming:
         self.processes.clear()
 
 
-def begin(settings: EvolveSettings) -> Warming:
+def begin(settings: RunSettings) -> Warming:
     """Begin to compile what such a run needs, if it is not in the cache."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario

@@ -10,7 +10,8 @@ import pytest
 
 from cluster import cli
 from cluster.checkpoint import CheckpointError, load, save
-from cluster.coordinator import Evolution, Maps
+from cluster.coordinator import Evolution
+from cluster.learning import Maps
 from cluster.pool import SerialPool
 from cluster.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
 from cluster.settings import EvolveSettings
@@ -179,9 +180,9 @@ def run_folder(halfway, path, **changed):
 
 def test_a_stopped_run_cannot_be_cut_short_where_no_champion_was_looked_for(halfway, tmp_path):
     path = run_folder(halfway, tmp_path)
-    assert cli._prepare(["--resume", str(path), "--generations", "3"])[1].settings.generations == 3
+    assert cli._prepare(cli.EvolveFlags, ["--resume", str(path), "--generations", "3"])[1].settings.generations == 3  # type: ignore[attr-defined]
     with pytest.raises(cli.UsageError, match=re.escape("--generations 1: the run has done 1 already; give more")):
-        cli._prepare(["--resume", str(path), "--generations", "1"])
+        cli._prepare(cli.EvolveFlags, ["--resume", str(path), "--generations", "1"])
 
 
 @pytest.mark.parametrize(
@@ -218,7 +219,7 @@ def go_on_in(path, maps, session=Session):
     run = open_run(path)
     tracker = make_tracker(run, f"sqlite:///{path}/m.db", "test")
     resumed = session(run, SerialPool(maps.build), maps, tracker, time.perf_counter())
-    curriculum = resumed.evolution.curriculum
+    curriculum = resumed.learning.curriculum
     curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4, contenders=2)
     return resumed
 
@@ -226,7 +227,7 @@ def go_on_in(path, maps, session=Session):
 def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, halfway, tmp_path):
     resumed = go_on_in(run_folder(halfway, tmp_path), maps, InterruptedOnce)
     with pytest.raises(KeyboardInterrupt):
-        resumed.evolve()
+        resumed.learn()
     assert resumed.interrupted
     assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 2
     assert len(read_history(tmp_path / "history.csv")) == 2
@@ -235,8 +236,8 @@ def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, 
 def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
     """As a kill between the last checkpoint and its history leaves it, when nothing is left to evolve."""
     resumed = go_on_in(run_folder(halfway, tmp_path), maps)
-    resumed.evolve()
+    resumed.learn()
     whole = (tmp_path / "history.csv").read_bytes()
     (tmp_path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
-    go_on_in(tmp_path, maps).evolve()
+    go_on_in(tmp_path, maps).learn()
     assert (tmp_path / "history.csv").read_bytes() == whole
