@@ -62,7 +62,7 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dic
     pool = RayPool(2, maps.build)
     states: deque[tuple[dict[str, np.ndarray], dict[str, Any]]] = deque(maxlen=LAST + 1)
     this = session(folder, "whole", settings, pool, maps)
-    compile_kernels(settings.policy, settings.traffic)
+    compile_kernels(settings.policy, settings.traffic, settings.command)
 
     def keep(generation: int, row: dict[str, float]) -> None:
         arrays, meta = this.learning.state()
@@ -90,7 +90,7 @@ def last_generations(
     pool = RayPool(workers, maps.build)
     this = session(folder, f"last-{workers}", settings, pool, maps)
     this.learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
-    compile_kernels(settings.policy, settings.traffic)
+    compile_kernels(settings.policy, settings.traffic, settings.command)
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
     begun = 0.0
 

@@ -268,6 +268,13 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         return flags, run
     settings = settings_of(flags)
     settings.check()
+    if isinstance(flags, DqnFlags) and flags.device == "cuda":
+        from evolution.dqn import device_of
+
+        try:
+            device_of(flags.device)
+        except ValueError as error:
+            raise UsageError(f"--device {flags.device}: {error}") from error
     digest = ""
     if flags.init:
         try:
@@ -393,7 +400,7 @@ def _run(
         with console.status("compiling the simulator for this machine, once (some 10 s)"):
             warming.wait()
     maps.ahead(session.learning.curriculum.map_seeds[:3])
-    warm.compile_kernels(run.settings.policy, run.settings.traffic)  # before workers need them: never twice
+    warm.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)  # before workers need them: never twice
     run.write_config()
     with progress.Progress(console, session, _shown(run.path)) as shown:
         session.on_row = shown.row

@@ -19,6 +19,11 @@ def evolve_main() -> None:
     _enter("evolve_main")
 
 
+def dqn_main() -> None:
+    """Run `gridsim-dqn`."""
+    _enter("dqn_main")
+
+
 def evaluate_main() -> None:
     """Run `gridsim-evaluate`."""
     _enter("evaluate_main")
