@@ -7,9 +7,7 @@ Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and 
 `motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s; or
 `grid`, uint8 [80, 80], the occupancy grid of `gridsim.grid`, and with `frames` above 1 [frames, 80, 80], the newest
 last. Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of
-`vehicle.act_continuous`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
-collision. f(distance) is this step's new ground and f(speed) the forward speed, as shares of what the scenario's upper
-speed gives and no more than 1; min(S) is the shortest of the rays.
+`vehicle.act_continuous`. Reward: the paper's, within [-1, 1], see `gridsim.reward`.
 
 An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
 a single environment meets after `reset(seed=s + i)`, whatever the other cars do.
@@ -32,6 +30,7 @@ from gridsim.counter import GOLDEN, mix
 from gridsim.ego import DISTANCE, SPEED, End
 from gridsim.grid import CELLS, grid_table, grids, push_frames
 from gridsim.jit import njit
+from gridsim.reward import reward
 from gridsim.roads import clearance
 from gridsim.scenarios import (
     REGISTRY,
@@ -51,8 +50,6 @@ from gridsim.world import LANE
 if TYPE_CHECKING:
     from gridsim.render import Renderer, Window
 
-DISTANCE_SHARE, SPEED_SHARE, CLEARANCE_SHARE = 0.15, 0.15, 0.7
-CRASH_REWARD = -1.0
 RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture a control period: true speed
 
 _F, _U = np.float32, np.uint64
@@ -76,9 +73,6 @@ def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slo
     """Observations [n, rays + 1], if not None, and rewards [n]; `fastest` m/s: upper speed of each car's scenario."""
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
-        shortest = reach
-        for r in range(rays):
-            shortest = min(shortest, ranges[i, r])
         speed = speeds[i]
         if observations is not None:
             for r in range(rays):
@@ -89,14 +83,8 @@ def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slo
             observations[i, observations.shape[1] - 1] = min(max(speed / limit, slowest), _F(1.0))
         if begun[i]:
             rewards[i] = _F(0.0)
-        elif ends[i] == 1:
-            rewards[i] = _F(CRASH_REWARD)
         else:
-            rewards[i] = (
-                _F(DISTANCE_SHARE) * min(progress[i] / (fastest[i] * dt), _F(1.0))
-                + _F(SPEED_SHARE) * min(max(speed / fastest[i], _F(0.0)), _F(1.0))
-                + _F(CLEARANCE_SHARE) * (shortest / reach)
-            )
+            rewards[i] = reward(ranges[i], reach, speed, progress[i], ends[i], fastest[i], dt)
 
 
 class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
