@@ -65,10 +65,10 @@ class Dqn(Learning):
             discount=s.discount, n_step=s.n_step, capacity=s.replay, batch=s.batch, learning_rate=s.learning_rate,
             final_learning_rate=LAST_SHARE, learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1),
             target_period=s.target_period, double=s.double,
-            prioritised=PriorityConfig() if s.prioritised else None,
+            priorities=PriorityConfig() if s.prioritised else None,
         )  # fmt: skip
         self.learner = DqnLearner(self.spec, config, s.seed, s.device)
-        self.replay = Replay(self.spec, s.replay, s.n_step, s.discount, config.priority)
+        self.replay = Replay(self.spec, s.replay, s.n_step, s.discount, config.priorities)
         if self.initial is not None:
             self.learner.load_weights(self.initial)
         self.probe = np.zeros((0, self.spec.inputs), dtype=np.float32)
@@ -102,7 +102,7 @@ class Dqn(Learning):
         row["q/mean"] = sum(n * q for n, _, q in self._losses) / max(updates, 1)
         row["q/change"] = self._watch()
         row["exploration"] = float(self._epsilons(EPISODES[0]).mean())
-        row["learning_rate"] = self.learner.learning_rate
+        row["learning_rate"] = self.learner.config.learning_rate_at(self.learner.updates)
         row |= {"episodes": float(self.episodes), "updates": float(self.learner.updates)}
         row["car_steps"] = float(self.car_steps)
         self.history.append(row)

@@ -20,7 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.checkpoint import CheckpointError
-from cluster.pool import Chunk, Outcome, WorkerPool
+from cluster.pool import Chunk, Meanwhile, Outcome, WorkerPool
 from cluster.settings import RunSettings
 from cluster.worker import Task
 from evolution.breeding import RECIPE, Mutation
@@ -180,7 +180,7 @@ class Learning(ABC):
 
     def _evaluate(
         self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, episodes: Episodes, limits: Limits,
-        rewind: int = 0, asked: Sequence[Chunk] | None = None, meanwhile: Callable[[], None] | None = None,
+        rewind: int = 0, asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
     ) -> np.ndarray:  # fmt: skip
         task = Task(
             policy=self.settings.policy,

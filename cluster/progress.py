@@ -57,8 +57,8 @@ class Progress:
         of = f"/{total:g}" if total else ""
         return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{unit} {done:.0f}{of}"
 
-    def row(self, _: int, row: dict[str, float]) -> None:
-        """A step is done."""
+    def row(self, step: int, row: dict[str, float]) -> None:
+        """So many steps are done."""
         now = time.perf_counter()
         way, total, _ = self._learning.way()
         self._ends.append((now, way))

@@ -29,7 +29,7 @@ from cluster.checkpoint import CheckpointError
 from cluster.coordinator import Evolution
 from cluster.learning import Learning, Maps, held_out_episodes, now
 from cluster.pool import WorkerPool
-from cluster.settings import SETTINGS, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
+from cluster.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
 from cluster.tracking import Tracker, git_commit
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
@@ -193,6 +193,7 @@ def new_learning(
     """The learner that such settings ask for."""
     if isinstance(settings, EvolveSettings):
         return Evolution(settings, pool, maps, initial, on_progress=on_progress)
+    assert isinstance(settings, DqnSettings)
     from cluster.dqn_loop import Dqn  # and PyTorch, which evolution does not need
 
     return Dqn(settings, pool, maps, initial, on_progress=on_progress)
