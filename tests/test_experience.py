@@ -76,7 +76,7 @@ def test_what_a_row_is(spec: PolicySpec, dtype: str, width: int) -> None:
 def test_fixed_point_is_the_nearest_and_clipped(value: float) -> None:
     code = int(_fixed(F(value)))
     assert -32768 <= code <= 32767
-    assert abs(code / UNITS - min(max(value, -8.0), 32767 / UNITS)) <= 0.5 / UNITS + 1e-6
+    assert abs(code / 4096 - min(max(value, -8.0), 32767 / 4096)) <= 0.5 / 4096 + 1e-6
 
 
 def test_rays_come_back_as_the_network_saw_them() -> None:
