@@ -185,8 +185,8 @@ class Dqn(Learning):
     def _watch(self) -> float:
         """How far the Q values of fixed observations moved since the last evaluation, as a share of their spread."""
         if not len(self.probe):
-            rng = np.random.default_rng(np.random.SeedSequence([self.settings.seed, 15]))
-            self.probe = self.replay.sample(rng, PROBE[self.spec.observation]).observations
+            key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
+            self.probe = self.replay.sample(key, PROBE[self.spec.observation]).observations
         q = self.learner.q_values(self.probe)
         before, self.probe_q = self.probe_q, q
         change = 1.0

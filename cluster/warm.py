@@ -62,7 +62,8 @@ def begin(settings: RunSettings) -> Warming:
     """Begin to compile what such a run needs, if it is not in the cache."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
-    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{'traffic' if settings.traffic else 'alone'}-{settings.command}")
+    traffic = "traffic" if settings.traffic else "alone"
+    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}")
     if warming.done.exists():
         return warming
     what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
