@@ -161,9 +161,7 @@ def evaluate(
         maps.close()
 
 
-def held_out(
-    champion: Champion, maps: Maps, name: str, episodes: int, seed: int, traffic: int | None
-) -> Episodes:
+def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int, traffic: int | None) -> Episodes:
     """The episodes that `evaluate` drives. Raises: ValueError as it does."""
     check_name(name)
     if episodes < 1:

@@ -30,8 +30,8 @@ def errors(
     """Velocity and steering errors of a champion, as one over all that it drives.
 
     Args: as `champion.evaluate`'s; or a recorded drive, which brings its own map, start and traffic.
-    Raises: ValueError with one line as `champion.evaluate`, or if nothing can be compared; DriveError (a ValueError) for
-    a file that is no recorded drive, or of another map.
+    Raises: ValueError with one line as `champion.evaluate`, or if nothing can be compared; DriveError (a ValueError)
+    for a file that is no recorded drive, or of another map.
     """
     found = series(champion, scenario, episodes, seed, traffic, reference)
     return combine([part.errors(champion.sim.vehicle) for part in found])

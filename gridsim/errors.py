@@ -174,7 +174,7 @@ def driven(poses: np.ndarray, scenario: Scenario) -> Driven:
     """A drive's path from its poses [n, 5] at the control steps, as `poses_of` gives them.
 
     What was reversed, and as many metres after it, is left out: a reference only drives forward. So is standing, where
-    the wheels may be turned anyhow; the path of a start from rest begins after the first control step that moves the car.
+    the wheels may be turned anyhow; a path from rest begins after the first control step that moves the car.
 
     Raises: ValueError if the car never came forward.
     """
@@ -200,23 +200,27 @@ def error_series(
     """A drive beside the reference driver's profile along its path.
 
     The reference begins with the agent's speed, speeds up as fast as the car does, and is alone on the road: of a drive
-    in traffic, the error holds what the traffic costs. It takes its bends from the driven path, over 10 m of it. The
-    path's end, from where on it could not have stopped, is left out: what bend it would have braked for is not known.
+    in traffic, the error holds what the traffic costs. It takes its bends from the driven path, over 10 m of it.
+
+    Left out is where the profile does not know the road: the path's first 5 m, half of those 10, and its end, from
+    where on the reference could not have stopped, since what it would have braked for there was not driven.
     """
     config = config or ReferenceConfig()
     interval = float(scenario.road.speed_low), float(scenario.road.speed_high)
     found = profile(path.points, interval, float(path.speed[0]), config, sim)
     speed, steering = found.speed_at(path.arc), found.steering_at(path.arc)
-    known = path.arc + speed**2 / (2.0 * config.braking) <= path.arc[-1]
-    n = len(known) if known.all() else int(known.argmin())
-    return Series(path.arc[:n], path.speed[:n], speed[:n], path.steering[:n], steering[:n])
+    unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * config.braking) > path.arc[-1])
+    part = slice(int(np.searchsorted(path.arc, config.driven_window / 2)), int(unknown[0]))
+    return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
 
 
-def error_series_beside(path: Driven, recorded: Driven, scenario: Scenario, row: int = 0) -> tuple[Series | None, float]:
+def error_series_beside(
+    path: Driven, recorded: Driven, scenario: Scenario, row: int = 0
+) -> tuple[Series | None, float]:
     """A drive beside a recorded one of which it began at point `row`, as far as it follows it.
 
     Each of the agent's places is compared with the recorded path's nearest further on. They part where the agent is
-    more than APART beside that path, or TURNED; the TURN before it is left out, as are places after the recording's end.
+    more than APART beside that path, or TURNED; the TURN before it is left out, and what is after the recording's end.
     Returns: (None if nothing is left; m along the recording that the agent came).
     """
     sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
