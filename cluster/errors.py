@@ -107,7 +107,7 @@ def _beside(
         reached = float(recorded.arc[k])
         if path is not None:
             part, reached = error_series_beside(path, recorded, road, k)
-            if part is not None:
+            if len(part.arc) > 1:
                 found.append(part)
         arc = reached + TURN
     return found

@@ -200,7 +200,8 @@ def error_series(
     """A drive beside the reference driver's profile along its path.
 
     The reference begins with the agent's speed, speeds up as fast as the car does, and is alone on the road: of a drive
-    in traffic, the error holds what the traffic costs. It takes its bends from the driven path, over 10 m of it.
+    in traffic, the error holds what the traffic costs. It takes its bends from the driven path, over 10 m of it: who
+    weaves in longer waves than that gives the reference bends to slow down for, so look at both errors.
 
     Left out is where the profile does not know the road: the path's first 5 m, half of those 10, and its end, from
     where on the reference could not have stopped, since what it would have braked for there was not driven.
@@ -214,14 +215,12 @@ def error_series(
     return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
 
 
-def error_series_beside(
-    path: Driven, recorded: Driven, scenario: Scenario, row: int = 0
-) -> tuple[Series | None, float]:
+def error_series_beside(path: Driven, recorded: Driven, scenario: Scenario, row: int = 0) -> tuple[Series, float]:
     """A drive beside a recorded one of which it began at point `row`, as far as it follows it.
 
     Each of the agent's places is compared with the recorded path's nearest further on. They part where the agent is
     more than APART beside that path, or TURNED; the TURN before it is left out, and what is after the recording's end.
-    Returns: (None if nothing is left; m along the recording that the agent came).
+    Returns: (the series, empty if nothing is left; m along the recording that the agent came).
     """
     sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
     points = path.points - np.round((path.points[0] - recorded.points[row]) / sides) * sides
@@ -251,9 +250,7 @@ def error_series_beside(
     count = len(at)
     if parted:
         count = int(np.searchsorted(path.arc[:count], path.arc[count - 1] - TURN, side="right")) if count else 0
-    if count < 2:
-        return None, reached
-    places = np.array(at[:count])
+    places = np.array(at[:count], dtype=np.float64)
     return (
         Series(
             path.arc[:count],
