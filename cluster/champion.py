@@ -21,6 +21,7 @@ from cluster.learning import Maps, summarise
 from cluster.settings import MAX_TRAFFIC
 from evolution import convnet
 from evolution.curriculum import HELD_OUT_MAPS, spread_starts
+from evolution.episodes import Episodes
 from evolution.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
@@ -140,28 +141,33 @@ def evaluate(
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
     name = scenario or champion.scenario
-    check_name(name)
-    if episodes < 1:
-        raise ValueError(f"episodes must be 1 or more, not {episodes}")
-    if traffic is not None and not 0 <= traffic <= MAX_TRAFFIC:
-        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     maps = Maps(name, champion.sim)
     try:
-        if traffic is None:
-            traffic = champion.traffic if name == champion.scenario else default_traffic(name)
-        held_out = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)
+        chosen = held_out(champion, maps, name, episodes, seed, traffic)
         episode = champion.sim.episode
         limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
-        scenarios = [maps.get(s) for s in held_out.maps]
+        scenarios = [maps.get(s) for s in chosen.maps]
         results = roll_out(
             PolicySpec.parse(champion.policy),
             champion.genome[None],
             scenarios,
-            held_out.rows,
+            chosen.rows,
             limits,
             champion.sim,
-            worlds=held_out.worlds,
+            worlds=chosen.worlds,
         )[0]
         return summarise(results[0], episode.control_period)
     finally:
         maps.close()
+
+
+def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int, traffic: int | None) -> Episodes:
+    """The episodes that `evaluate` drives. Raises: ValueError as it does."""
+    check_name(name)
+    if episodes < 1:
+        raise ValueError(f"episodes must be 1 or more, not {episodes}")
+    if traffic is None:
+        traffic = champion.traffic if name == champion.scenario else default_traffic(name)
+    if not 0 <= traffic <= MAX_TRAFFIC:
+        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
+    return spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)

@@ -102,6 +102,10 @@ class EvaluateFlags:
     """How many; the default 64 are the held-out episodes of every run."""
     seed: int = 2_000_000
     """Seed of the first map; those of held-out maps begin at 2,000,000."""
+    errors: bool = False
+    """Also its velocity and steering errors against the reference driver."""
+    reference: str = ""
+    """A drive.csv of gridsim-drive: errors against that drive, on its map and in its traffic, in place of --errors."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -465,23 +469,30 @@ def evaluate_main() -> None:
         flags = parse(EvaluateFlags, prog, sys.argv[1:])
         from cluster.champion import evaluate, load_champion
         from cluster.checkpoint import CheckpointError
+        from cluster.errors import errors
 
         path = Path(flags.champion)
         try:
             champion = load_champion(path / "champion.npz" if path.is_dir() else path)
             traffic = None if flags.traffic == -1 else flags.traffic
-            figures = evaluate(champion, flags.scenario or None, flags.episodes, flags.seed, traffic)
+            chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
+            missed = None
+            if flags.errors or flags.reference:  # first: a wrong --reference is told at once
+                missed = errors(champion, *chosen, flags.reference or None).figures()
+            figures = evaluate(champion, *chosen)
         except (CheckpointError, ValueError) as error:
             fail(prog, str(error))
         if flags.json:
             import json
 
-            print(json.dumps(figures))
+            print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         else:
-            from cluster.report import held_out_table
+            from cluster.report import errors_table, held_out_table
 
             title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
             Console().print(held_out_table(title, figures))
+            if missed is not None:
+                Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)

@@ -110,3 +110,20 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
     table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
     table.add_row("collisions", f"{figures['collision_rate']:.1%}")
     return table
+
+
+def errors_table(title: str, figures: Mapping[str, float]) -> Table:
+    """Velocity and steering errors, `gridsim.errors.Errors.figures`."""
+    table = Table("", "mean", "max", title=title, title_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, unit, digits in (("velocity", "mps", 2), ("steering", "deg", 1)):
+        shown = "m/s" if unit == "mps" else "degrees"
+        table.add_row(
+            f"{name} error, {shown}",
+            *(f"{figures[f'{name}_{kind}_{unit}']:.{digits}f}" for kind in ("mean", "max")),
+        )
+        of = "the reference's mean speed" if unit == "mps" else "the steering limit"
+        table.add_row(f"  % of {of}", *(f"{figures[f'{name}_{kind}_percent']:.1f}" for kind in ("mean", "max")))
+    table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
+    return table
