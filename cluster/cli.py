@@ -404,9 +404,7 @@ def _run(
         with console.status("compiling the simulator for this machine, once (some 10 s)"):
             warming.wait()
     maps.ahead(session.learning.curriculum.map_seeds[:3])
-    warm.compile_kernels(
-        run.settings.policy, run.settings.traffic, run.settings.command
-    )  # before workers need them: never twice
+    warm.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
     run.write_config()
     with progress.Progress(console, session, _shown(run.path)) as shown:
         session.on_row = shown.row

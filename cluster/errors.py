@@ -8,7 +8,7 @@ import os
 import numpy as np
 
 from cluster.champion import Champion, held_out
-from cluster.coordinator import Maps
+from cluster.learning import Maps
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
 from gridsim.drive import Drive, DriveError, read_drive, replay

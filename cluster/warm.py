@@ -3,8 +3,8 @@
 Numba compiles one function at a time in a process. So processes of their own compile what a run needs while this one
 starts Ray, and all others then load it from the cache on disk (`gridsim.jit`).
 
-Run as `python -m cluster.warm kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it prints a line when what
-a run needs first is there, and goes on with what is needed at the run's end.
+Run as `python -m cluster.warm kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it prints a line
+when what a run needs first is there, and goes on with what is needed at the run's end.
 """
 
 from __future__ import annotations
