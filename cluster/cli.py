@@ -315,7 +315,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
 
         if is_finished(run):
             first = kind.counts[0]
-            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; nothing to do.")  # type: ignore[index]
+            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; nothing to do.", soft_wrap=True)  # type: ignore[index]
             return 0
         saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
         uri = tracking.check_uri(flags.tracking_uri or saved or None)
