@@ -265,12 +265,11 @@ class Replay:
             leaves = self._tree[len(self._tree) // 2 + rows]
             weights = ((leaves.min() / leaves) ** beta).astype(np.float32)
         to = (rows + self._ahead[rows]) % self.capacity
-        stacked = self._frames > 1
         return Batch(
-            unpack(self.spec, self._observations, rows, self._ages[rows] if stacked else None),
+            unpack(self.spec, self._observations, rows, self._ages[rows]),
             self._actions[rows].astype(np.int64),
             self._returns[rows],
-            unpack(self.spec, self._observations, to, self._ages[to] if stacked else None),
+            unpack(self.spec, self._observations, to, self._ages[to]),
             self._bootstraps[rows],
             rows,
             weights,
