@@ -211,7 +211,7 @@ class DqnLearner:
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):
         config.check()
-        # Sums over several threads depend on their number, and the other cores belong to the workers.
+        # For the whole process: sums over several threads depend on their number, and the other cores are the workers'.
         torch.set_num_threads(1)
         self.spec, self.config, self.seed = spec, config, seed
         self.device = device_of(device)
@@ -219,11 +219,9 @@ class DqnLearner:
         self.online, self.target = QNetwork(spec, self.device), QNetwork(spec, self.device)
         self._leaves = self.online.leaves()
         self._gradient = torch.zeros(spec.size, device=self.device)
-        self._mean, self._variance = (
-            torch.zeros_like(self._gradient),
-            torch.zeros_like(self._gradient),
-        )  # Adam's moments
-        self._steps = torch.zeros((), device=self.device)  # Adam's
+        # Adam's moments and steps.
+        self._mean, self._variance = torch.zeros_like(self._gradient), torch.zeros_like(self._gradient)
+        self._steps = torch.zeros((), device=self.device)
         self._key = int(np.random.SeedSequence([seed, _SAMPLES]).generate_state(1, np.uint64)[0])
         self.load_weights(new_weights(spec, seed))
 

@@ -265,19 +265,18 @@ class Replay:
             leaves = self._tree[len(self._tree) // 2 + rows]
             weights = ((leaves.min() / leaves) ** beta).astype(np.float32)
         to = (rows + self._ahead[rows]) % self.capacity
-        stacked = self._frames > 1
         return Batch(
-            unpack(self.spec, self._observations, rows, self._ages[rows] if stacked else None),
+            unpack(self.spec, self._observations, rows, self._ages[rows]),
             self._actions[rows].astype(np.int64),
             self._returns[rows],
-            unpack(self.spec, self._observations, to, self._ages[to] if stacked else None),
+            unpack(self.spec, self._observations, to, self._ages[to]),
             self._bootstraps[rows],
             rows,
             weights,
         )
 
     def update_priorities(self, rows: np.ndarray, errors: np.ndarray) -> None:
-        """Take the temporal-difference errors [n] of the rows int64 [n] that `sample` drew.
+        """Take the temporal-difference errors [n] of the rows int64 [n] that `sample` drew, as sizes up to 1e30.
 
         Raises: ValueError where they are no numbers, or rows cannot be drawn; RuntimeError if nothing is prioritised.
         """
@@ -285,12 +284,13 @@ class Replay:
             raise RuntimeError("this replay draws all rows alike; it has no priorities")
         sizes = np.abs(np.asarray(errors, dtype=np.float64)) + self.prioritised.epsilon
         rows = np.ascontiguousarray(rows, dtype=np.int64)
-        if rows.ndim != 1 or sizes.shape != rows.shape or not (sizes <= MAX_PRIORITY).all():
-            raise ValueError(f"errors are one number for each of {rows.size} rows, at most {MAX_PRIORITY:g} in size")
+        if rows.ndim != 1 or sizes.shape != rows.shape or not np.isfinite(sizes).all():
+            raise ValueError(f"errors are finite numbers, one for each of {rows.size} rows")
         if not len(rows):
             return
         if rows.min() < 0 or rows.max() >= len(self) or not self._ahead[rows].all():
             raise ValueError("priorities are of rows that can be drawn")
+        sizes = np.minimum(sizes, MAX_PRIORITY)
         self.max_priority = max(self.max_priority, float(sizes.max()))
         _set_leaves(self._tree, rows, (sizes**self.prioritised.alpha).astype(np.float32))
 

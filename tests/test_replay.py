@@ -14,7 +14,7 @@ from evolution.policy import PolicySpec
 from evolution.replay import Batch, PriorityConfig, Replay
 from gridsim.ego import End
 
-RAYS, GRID = PolicySpec.parse("mlp:3"), PolicySpec.parse("cnn:8,8,8@4")
+RAYS, GRID, FRAME = (PolicySpec.parse(text) for text in ("mlp:3", "cnn:8,8,8@4", "cnn:8,8,8@1"))
 TERMINAL = (End.COLLISION, End.IDLE, End.SUCCESS)
 
 
@@ -106,7 +106,7 @@ def expected(parts, capacity, n_step, discount, frames):
     adds=st.lists(EPISODES, min_size=1, max_size=6),
     capacity=st.integers(2, 40),
     n_step=st.integers(1, 5),
-    spec=st.sampled_from([RAYS, GRID]),
+    spec=st.sampled_from([RAYS, GRID, FRAME]),
     prioritised=st.booleans(),
 )
 def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, n_step, spec, prioritised):
@@ -119,7 +119,7 @@ def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, n_step
             first += len(rewards) + 1
         replay.add(join(new))
         parts += new
-        known = expected(parts, capacity, n_step, 0.9, 4 if spec is GRID else 1)
+        known = expected(parts, capacity, n_step, 0.9, getattr(spec, "frames", 1))
         assert len(replay) == min(first, capacity)
         assert replay.transitions == len(known)
         if not known:
@@ -133,15 +133,15 @@ def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, n_step
         assert batch.returns == pytest.approx([one[0] for one in oracle], abs=1e-5)
         assert numbers(batch.next_observations, spec).tolist() == [one[1] for one in oracle]
         assert batch.bootstraps == pytest.approx([one[2] for one in oracle])
-        if spec is GRID:
+        if spec is not RAYS:
             starts = np.cumsum([0] + [len(part.actions) for part in parts])
             for observations, rows in ((batch.observations, where), (batch.next_observations, [o[1] for o in oracle])):
                 for inputs, row in zip(observations, rows, strict=True):
                     start = starts[np.searchsorted(starts, row, side="right") - 1]
-                    seen = [max(row - back, start) for back in (3, 2, 1, 0)]
+                    seen = [max(row - back, start) for back in range(spec.frames)[::-1]]
                     codes = np.array([0, 127, 255]) / 255
-                    assert inputs[:-1].reshape(4, 6400)[:, 0] == pytest.approx(codes[np.array(seen) % 3])
-                    assert inputs[:-1].reshape(4, 6400)[:, 4] == pytest.approx(codes[np.array(seen) // 3 % 3])
+                    assert inputs[:-1].reshape(-1, 6400)[:, 0] == pytest.approx(codes[np.array(seen) % 3])
+                    assert inputs[:-1].reshape(-1, 6400)[:, 4] == pytest.approx(codes[np.array(seen) // 3 % 3])
         # What is restored is the same to the bit, and draws the same.
         again = Replay(spec, capacity, n_step, 0.9, PriorityConfig() if prioritised else None)
         again.restore(*replay.state())
