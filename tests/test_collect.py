@@ -147,7 +147,7 @@ class Slow:
                 self.greedy += 1
             ranges, speeds, progress, ends = simulator.step(np.array([action]))
             end = int(ends[0])
-            self.actions.append(action)
+            self.actions.append(int(action))
             self.rewards.append(self.reward(ranges[0], speeds[0], progress[0], end))
         self.end = end
 
