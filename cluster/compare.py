@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 import re
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -357,13 +358,17 @@ def _existing(console: Console, flags: CompareFlags) -> int:
     runs = experiment.read_runs([Path(name) for name in flags.runs])
     path = experiment.new_folder(Path(flags.output), _stamped(flags.name))
     path.mkdir(parents=True)
-    results = Results(path, reference=flags.reference)
-    with console.status("measuring errors") as shown:
-        for k, run in enumerate(runs):
-            shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
-            results.take([run])
-        shown.update("writing tables and pictures")
-        results.write()
+    try:
+        results = Results(path, reference=flags.reference)
+        with console.status("measuring errors") as shown:
+            for k, run in enumerate(runs):
+                shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
+                results.take([run])
+            shown.update("writing tables and pictures")
+            results.write()
+    except BaseException:
+        shutil.rmtree(path, ignore_errors=True)  # it was made just now
+        raise
     console.print(results.closing())
     return 0
 

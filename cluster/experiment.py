@@ -28,7 +28,7 @@ from cluster.settings import MAX_TRAFFIC
 from evolution.curriculum import HELD_OUT_EPISODES
 from evolution.policy import Observation
 from gridsim.drive import DriveError, read_drive
-from gridsim.scenarios import check_name, default_traffic, is_map_file, label
+from gridsim.scenarios import build, check_name, default_traffic, is_map_file, label
 
 if TYPE_CHECKING:
     from gridsim.errors import Series
@@ -152,6 +152,8 @@ class Plan:
         try:
             for name in self.scenarios:
                 check_name(name)
+                if is_map_file(name):
+                    build(name, 0)  # whether it is one
         except ValueError as error:
             raise ExperimentError(f"--scenarios: {error}") from error
         for learner in self.learners:

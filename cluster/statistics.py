@@ -38,7 +38,7 @@ def spread(values: Iterable[float]) -> Spread:
 
     What is not finite was not measured and is left out. One value is its own interval, which says nothing.
     """
-    found = np.array([value for value in values if math.isfinite(value)], dtype=np.float64)
+    found = np.array(sorted(value for value in values if math.isfinite(value)), dtype=np.float64)
     if not len(found):
         return Spread(0, *[math.nan] * 5)
     lower, median, upper = (float(value) for value in np.quantile(found, [0.25, 0.5, 0.75]))

@@ -254,8 +254,8 @@ def _claim(groups: Sequence[Group]) -> Iterator[str]:
             text += f" It is {word} on " + _list(f"{a.road} ({_two(a, b, figure, '%', 1)})" for a, b in some) + "."
     apart = [(a, b) for a, b in smaller if _apart(a, b, figure)] + [(a, b) for a, b in larger if _apart(b, a, figure)]
     if max(len(a.runs) + len(b.runs) for a, b in pairs) > 2:
-        roads = _list(a.road for a, _ in apart)
-        text += f" No seed of one learner is among the other's on {roads}." if apart else ""
+        if apart:
+            text += f" No seed of one learner is among the other's on {_list([a.road for a, _ in apart])}."
         mixed = [a.road for a, b in pairs if (a, b) not in apart]
         text += f" Seeds overlap on {_list(mixed)}." if mixed else ""
     yield text
