@@ -87,7 +87,7 @@ class Budget:
             )
         number, unit = float(match[1]), match[2] or ""
         if unit in ("s", "min", "h"):
-            seconds = number * {"s": 1.0, "min": 60.0, "h": 3600.0}[unit]
+            seconds = round(number * {"s": 1.0, "min": 60.0, "h": 3600.0}[unit], 3)
             if not 1.0 <= seconds <= MAX_WALL_S:
                 raise ExperimentError(f"--budget {text[:40]}: wall time must be 1 s to 30 days")
             return cls(wall_s=seconds)
@@ -98,10 +98,10 @@ class Budget:
 
     def __str__(self) -> str:
         if self.wall_s:
-            return f"{self.wall_s:g}s"
+            return f"{self.wall_s:.3f}".rstrip("0").rstrip(".") + "s"
         for unit, size in (("G", 10**9), ("M", 10**6), ("k", 10**3)):
-            if self.car_steps % (size // 10 or 1) == 0 and self.car_steps >= size:
-                return f"{self.car_steps / size:g}{unit}"
+            if self.car_steps % size == 0:
+                return f"{self.car_steps // size}{unit}"
         return str(self.car_steps)
 
     def words(self) -> str:
