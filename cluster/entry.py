@@ -37,3 +37,8 @@ def watch_main() -> None:
 def drive_main() -> None:
     """Run `gridsim-drive`."""
     _enter("drive_main", "cluster.watch")
+
+
+def compare_main() -> None:
+    """Run `gridsim-compare`."""
+    _enter("compare_main", "cluster.compare")

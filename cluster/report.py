@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
@@ -14,18 +14,23 @@ from gridsim.ego import X, Y
 from gridsim.roads import FIELD_FLOOR, FIELD_UNITS
 from gridsim.scenarios import Scenario
 
+if TYPE_CHECKING:
+    from cluster.tables import Group
+    from gridsim.errors import Series
+
 _BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
+_LEARNERS = {"evolution": "#0b7285", "dqn": "#f08c00", "random": "#868e96"}
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
-    """A figure that needs no display and no global state."""
+def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Any, Any]:
+    """A figure that needs no display and no global state, and the axes of its columns, or of its rows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, columns, squeeze=False)[0]
+    return figure, figure.subplots(rows, columns, squeeze=False, sharex=rows > 1).ravel()
 
 
 def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
@@ -96,6 +101,90 @@ def trajectory(scenario: Scenario, states: np.ndarray, path: str | os.PathLike[s
     axis.legend(loc="upper right")
     axis.set_title(title)
     figure.colorbar(lines, ax=axis, shrink=0.8, label="speed, m/s")
+    figure.savefig(Path(path), dpi=100)
+
+
+def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
+    """Draw velocity error and training time of each road and learner to a PNG.
+
+    Bars are medians over seeds, whiskers quartiles, dots the seeds.
+    """
+    roads = list(dict.fromkeys(group.road for group in groups))
+    names = list(dict.fromkeys((group.name, group.learner, group.observation) for group in groups))
+    width = 0.8 / len(names)
+    figure, axes = _figure(max(9.0, 3.0 + 2.2 * len(roads)), 4.6, 2)
+    panels = (
+        ("velocity_error_percent", "velocity error, % of the reference's speed"),
+        ("training_s", "training time, s"),
+    )
+    for axis, (name, title) in zip(axes, panels, strict=True):
+        for group in groups:
+            which = [other[0] for other in names].index(group.name)
+            place = roads.index(group.road) + (which - (len(names) - 1) / 2) * width
+            found = group.spread(name)
+            if not found.n:
+                axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
+                continue
+            whiskers = [[found.median - found.lower], [found.upper - found.median]] if found.n > 1 else None
+            hatch = "//" if group.observation == "grid" and len({view for _, _, view in names}) > 1 else None
+            axis.bar(
+                place, found.median, 0.92 * width, color=_LEARNERS[group.learner], alpha=0.75, yerr=whiskers, capsize=3,
+                hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2,
+            )  # fmt: skip
+            seeds = [value for value in group.values(name) if np.isfinite(value)]
+            beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
+            axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
+                      markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
+        axis.set_title(title)
+        axis.set_xticks(range(len(roads)), roads)
+        axis.set_xlim(-0.5, len(roads) - 0.5)
+        axis.set_ylim(bottom=0.0)
+        axis.grid(axis="y", alpha=0.25, zorder=0)
+        axis.spines[["top", "right"]].set_visible(False)
+    from matplotlib.patches import Patch
+
+    patches = [Patch(color=_LEARNERS[learner], alpha=0.75, label=name) for name, learner, _ in names]
+    figure.legend(
+        handles=patches, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
+        title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
+    )  # fmt: skip
+    figure.savefig(Path(path), dpi=100)
+
+
+def along_route(
+    drives: Mapping[str, Sequence[Series]], names: Mapping[str, str], metres: float, path: str | os.PathLike[str],
+    title: str,
+) -> None:  # fmt: skip
+    """Draw velocity and steering error along a route to a PNG.
+
+    Args: for each learner its seeds' drives from the same start, the one to be drawn as a line first, the others as
+    the band from the smallest to the largest error; what learners are called; how far along the route.
+    """
+    figure, axes = _figure(12.0, 6.2, rows=2)
+    for axis, name, unit in zip(axes, ("velocity_error", "steering_error"), ("m/s", "degrees"), strict=True):
+        axis.axhline(0.0, color="#212529", linewidth=1.2, label="reference", zorder=3)
+        for learner, found in drives.items():
+            colour = _LEARNERS[learner]
+            arc = np.arange(0.0, min(metres, max(float(series.arc[-1]) for series in found)), 0.5)
+            errors = np.array(
+                [np.interp(arc, series.arc, getattr(series, name), right=np.nan) for series in found]
+            )  # fmt: skip
+            there = np.isfinite(errors).any(axis=0)
+            if len(found) > 1:
+                low, high = np.nanmin(errors[:, there], axis=0), np.nanmax(errors[:, there], axis=0)
+                axis.fill_between(arc[there], low, high, color=colour, alpha=0.16, linewidth=0, zorder=1)
+            axis.plot(arc, errors[0], color=colour, linewidth=1.4, label=names[learner], zorder=4)
+            if found[0].arc[-1] < metres:
+                axis.plot(found[0].arc[-1], getattr(found[0], name)[-1], marker="X", color=colour, markersize=9,
+                          markeredgecolor="white", linestyle="", zorder=5)  # fmt: skip
+        axis.set_ylabel(f"{name.replace('_', ' ')}, {unit}")
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].set_title(title)
+    axes[0].set_xlim(0.0, metres)
+    axes[-1].set_xlabel("distance along the route, m")
+    lines, words = axes[0].get_legend_handles_labels()
+    figure.legend(lines, words, loc="outside lower center", ncols=len(words), frameon=False)
     figure.savefig(Path(path), dpi=100)
 
 
