@@ -58,6 +58,7 @@ def evolve(
             row = evolution.step()
             if on_generation:
                 on_generation(evolution.generation, row)
+        evolution.conclude()
         assert evolution.champion is not None
         champion = Champion(
             evolution.champion.genome, settings.policy, settings.scenario, evolution.sim, settings.traffic

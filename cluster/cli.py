@@ -262,11 +262,6 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
                 raise UsageError(
                     f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
                 )
-        if isinstance(flags, EvolveFlags) and isinstance(run.settings, EvolveSettings):
-            done = run.saved[1]["generation"]  # type: ignore[index]
-            if flags.generations < run.settings.generations and flags.generations <= done:
-                # Champions are looked for while a generation is the last; nothing can be made of one that was not.
-                raise UsageError(f"--generations {flags.generations}: the run has done {done} already; give more")
         run.settings = settings_of(flags)
         run.settings.check()
         return flags, run

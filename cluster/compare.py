@@ -181,7 +181,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 
 def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str) -> int:
     """Train what is not finished, and write what can be said of what is."""
-    from cluster.cells import Commands
+    from cluster.cells import Cells
     from cluster.tracking import TrackingError
 
     left = [cell for cell in cells if not cell.finished()]
@@ -204,7 +204,7 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
                     parent = tracker.wait_ready(30.0)
                 except TrackingError as error:
                     shown.line(f"{PROG}: warning: its runs are not nested in MLflow: {error}")
-            execute = Commands(flags.workers, flags.address, uri, flags.experiment, parent, shown.note)
+            execute = Cells(flags.workers, flags.address, uri, flags.experiment, parent, shown.note)
 
             def done(cell: Cell, error: CellError | None) -> None:
                 if error:
@@ -216,7 +216,10 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
                 tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
                 shown.done(cell, run)
 
-            failed = experiment.train(cells, execute, done, shown.begin)
+            try:
+                failed = experiment.train(cells, execute, done, shown.begin)
+            finally:
+                execute.close()
         status = "FINISHED"
     except KeyboardInterrupt:
         status = "KILLED"

@@ -69,10 +69,6 @@ class Evolution(Learning):
         """Generations that are done."""
         return self.genetic.generation
 
-    def _is_last(self, generation: int) -> bool:
-        """Whether an unsolved run ends with this generation."""
-        return self.settings.ended({"solved": False, "generation": generation + 1, "car_steps": self.car_steps})
-
     def step(self) -> dict[str, float]:
         """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
         s, curriculum = self.settings, self.curriculum
@@ -102,11 +98,8 @@ class Evolution(Learning):
         if self.champion is not None:
             self.genetic.readmit(self.champion.genome)
 
-        last = self._is_last(generation)
-        if limits.target >= curriculum.config.validation_target or last:
+        if limits.target >= curriculum.config.validation_target:
             self.trials.enter(racers[order[: curriculum.config.contenders]], generation)
-        while last and len(self.trials):
-            self._validate()
         self.elites.append(racers[order[0]])
         top = order[0]
         seconds = results["steps"] * self.sim.episode.control_period

@@ -106,8 +106,6 @@ class Dqn(Learning):
         row |= {"episodes": float(self.episodes), "updates": float(self.learner.updates)}
         row["car_steps"] = float(self.car_steps)
         self.history.append(row)
-        while self.done() and len(self.trials):
-            self._validate()
         row["validation/success_rate"] = self.champion.success_rate if self.champion else 0.0
         return row
 

@@ -172,6 +172,16 @@ class Learning(ABC):
         """Whether there is nothing left to learn."""
         return self.settings.ended({"solved": self.solved, **self.counts()})
 
+    def conclude(self) -> None:
+        """Find out about who is still on trial when a run ends, and about the last leader where there is no champion.
+
+        What a checkpoint holds is from before: a run that is extended goes on as if it had never ended.
+        """
+        if self.champion is None and not len(self.trials):
+            self.trials.enter(self.elites[-1][None], self.steps - 1)
+        while len(self.trials) and not self.solved:
+            self._validate()
+
     def _mutation(self) -> Mutation:
         """How bred members differ from their parents."""
         return Mutation()
@@ -291,8 +301,8 @@ class Learning(ABC):
         """Take up a state. Raises CheckpointError with one line where it does not fit this run."""
         try:
             self._restore(arrays, meta)
-            if self.done() and self.champion is None:
-                raise ValueError("it is done, and has no champion; let it go on for longer")
+            if self.solved and self.champion is None:
+                raise ValueError("it is solved, and has no champion")
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
 

@@ -11,6 +11,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import re
 import time
@@ -210,6 +211,8 @@ class Session:
         tracker: who logs to MLflow.
         process_started: time.perf_counter() of the process's start.
         on_row: told how many steps are done, and the last one's row.
+        film: whether the champion is filmed.
+        wall_limit_s: seconds of learning, those before a resumption included, after which no further step is begun.
         lost: one line about what could not be written, beside what matters.
     """
 
@@ -221,6 +224,8 @@ class Session:
     initial: np.ndarray | None = None
     on_row: Callable[[int, dict[str, float]], None] | None = None
     on_progress: Callable[[str, int, int], None] | None = None
+    film: bool = True
+    wall_limit_s: float = math.inf
     lost: str = ""
     learning: Learning = field(init=False)
     _unsaved: bool = False  # whether the last step is in memory alone
@@ -240,10 +245,9 @@ class Session:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
         learning.meanwhile = self._save_last
         try:
-            while not learning.done():
+            while not learning.done() and self._wall_s() < self.wall_limit_s:
                 row = learning.step()
-                wall = learning.wall_before_s + now() - self.process_started
-                learning.timed(row, wall, learning.history[-2] if len(learning.history) > 1 else None)
+                learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
                 self._unsaved = True
                 if self.on_row:
                     self.on_row(learning.steps, row)
@@ -253,6 +257,10 @@ class Session:
         except BaseException:
             self._save_last()  # the state is whole until the next step changes it
             raise
+
+    def _wall_s(self) -> float:
+        """Seconds that the run has taken, in this process and before."""
+        return self.learning.wall_before_s + now() - self.process_started
 
     def _save_last(self) -> None:
         """Save and log the last step, if that was not done."""
@@ -287,6 +295,7 @@ class Session:
         from cluster import report
 
         learning, path = self.learning, self.run.path
+        learning.conclude()
         assert learning.champion is not None
         settings = self.run.settings
         champion = Champion(
@@ -306,8 +315,9 @@ class Session:
             scenario, states, path / "trajectory.png",
             f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
-        self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
-        wall = learning.wall_before_s + now() - self.process_started
+        if self.film:
+            self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
+        wall = self._wall_s()
         summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracker.run_id or "",
@@ -346,8 +356,8 @@ class Session:
         checkpoint.write_atomic(self.run.path / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
 
 
-def make_tracker(run: RunFolder, uri: str, experiment: str) -> Tracker:
-    """The run's tracker, not yet started."""
+def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "") -> Tracker:
+    """The run's tracker, not yet started; `parent_id` is MLflow's run that it belongs to."""
     settings = run.settings
     known = run.saved[1]["tracking"] if run.saved else {}
     params = {name: str(value) for name, value in to_dict(settings).items()}
@@ -360,7 +370,7 @@ def make_tracker(run: RunFolder, uri: str, experiment: str) -> Tracker:
         "scenario": settings.scenario,
         "seed": str(settings.seed),
         "git_commit": git_commit(),
-    }
+    } | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(
         uri, experiment, run.name, params, tags,
         run_id=known.get("run_id") if known.get("uri") == uri else None,
