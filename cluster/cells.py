@@ -47,11 +47,10 @@ class Cells:
     _maps: Maps | None = field(default=None, init=False)
 
     def __call__(self, cell: Cell) -> dict[str, Any]:
-        started = time.perf_counter()
         try:
             run = self._folder(cell)
             run.settings.check()
-            return self._train(cell, run, started)
+            return self._train(cell, run)
         except PoolError as error:
             self.close()  # the next run has workers of its own
             raise CellError(str(error)) from error
@@ -72,7 +71,7 @@ class Cells:
             shutil.rmtree(cell.folder)
         return new_run(cell.folder.parent, cell.name, settings_of(cell))
 
-    def _train(self, cell: Cell, run: RunFolder, started: float) -> dict[str, Any]:
+    def _train(self, cell: Cell, run: RunFolder) -> dict[str, Any]:
         settings = run.settings
         self._maps = maps = Maps(settings.scenario, SimConfig())
         warming = warm.begin(settings)
@@ -81,7 +80,7 @@ class Cells:
         try:
             pool = self._workers()
             session = Session(
-                run, pool, maps, tracker, started, film=False, wall_limit_s=cell.plan.budget.wall_s or np.inf,
+                run, pool, maps, tracker, time.perf_counter(), film=False, wall_limit_s=cell.plan.budget.wall_s or np.inf,
                 on_row=lambda _, row: self.note(session.learning.describe(row)),
             )  # fmt: skip
             maps.ahead(session.learning.curriculum.map_seeds[:3])
@@ -91,6 +90,7 @@ class Cells:
             warm.compile_kernels(settings.policy, settings.traffic, settings.command)
             run.path.mkdir(parents=True, exist_ok=True)
             run.write_config()
+            session.process_started = time.perf_counter()  # a budget is of learning, not of what is loaded for it
             session.learn()
             self.note("measuring the champion on held-out roads")
             summary = session.finish(self.workers)

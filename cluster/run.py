@@ -212,7 +212,7 @@ class Session:
         process_started: time.perf_counter() of the process's start.
         on_row: told how many steps are done, and the last one's row.
         film: whether the champion is filmed.
-        wall_limit_s: seconds of learning, those before a resumption included, after which no further step is begun.
+        wall_limit_s: seconds of learning, those before a resumption included, after which no step but the first is begun.
         lost: one line about what could not be written, beside what matters.
     """
 
@@ -245,7 +245,7 @@ class Session:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
         learning.meanwhile = self._save_last
         try:
-            while not learning.done() and self._wall_s() < self.wall_limit_s:
+            while not learning.done() and (not learning.steps or self._wall_s() < self.wall_limit_s):
                 row = learning.step()
                 learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
                 self._unsaved = True

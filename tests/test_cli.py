@@ -293,3 +293,4 @@ def test_a_finished_run_can_be_extended(reference, tmp_path):
     done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(rows(tmp_path / "runs/s")) == 6
+    assert summary(tmp_path / "runs/s")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
