@@ -80,7 +80,8 @@ class Cells:
         try:
             pool = self._workers()
             session = Session(
-                run, pool, maps, tracker, time.perf_counter(), film=False, wall_limit_s=cell.plan.budget.wall_s or np.inf,
+                run, pool, maps, tracker, time.perf_counter(), film=False,
+                wall_limit_s=cell.plan.budget.wall_s or np.inf,
                 on_row=lambda _, row: self.note(session.learning.describe(row)),
             )  # fmt: skip
             maps.ahead(session.learning.curriculum.map_seeds[:3])

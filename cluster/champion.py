@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 from dataclasses import dataclass
 from typing import Any
@@ -60,8 +61,8 @@ class Champion:
     def act(self, observation: np.ndarray, speed: float | np.ndarray | None = None) -> int | np.ndarray:
         """The action for an observation, or actions [n] for n of them.
 
-        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed. Of the grid, what
-        `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which a grid does not show:
+        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed, and what else it may see
+        (`make_env` gives it). Of the grid, what `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which a grid does not show:
         the environment's `info["speed_mps"]`.
         Raises: ValueError with one line for an observation that this champion does not see.
         """
@@ -76,6 +77,7 @@ class Champion:
             observation,
             self.sim.sensors.range,
             self.sim.vehicle.speed_limit,
+            math.radians(self.sim.vehicle.steering_limit),
         )
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:
@@ -87,7 +89,7 @@ class Champion:
         if isinstance(spec, CnnSpec):
             sees["frames"] = spec.frames
         elif isinstance(spec, MlpSpec):
-            sees["motion"] = spec.motion
+            sees |= {"motion": spec.motion, "steering": spec.steering}
         if scenario in (None, self.scenario):
             sees["traffic"] = self.traffic
         return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **{**sees, **options})

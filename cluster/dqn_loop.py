@@ -40,7 +40,7 @@ WARM_UP = 20_000  # rows of replay before the first update
 SLICE = 8  # updates between two looks at the workers
 RANDOM_SHARE = 0.02  # of --anneal, in which exploration falls from random driving
 SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
-LAST_SHARE = 0.05  # of the learning rate, and of exploration, that is left after --anneal
+LAST_SHARE = 0.05  # of the learning rate that is left after --anneal
 PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are watched
 CALM = 3  # evaluations in a row in which they have to stand still
 
@@ -143,7 +143,7 @@ class Dqn(Learning):
         """Shares of random actions of a batch's episodes: float32 [n]."""
         s = self.settings
         come = min(self.car_steps / s.anneal, 1.0)
-        usual = s.epsilon ** (1.0 + SPREAD * np.arange(n) / max(n - 1, 1)) * (1.0 - (1.0 - LAST_SHARE) * come)
+        usual = s.epsilon ** (1.0 + SPREAD * np.arange(n) / max(n - 1, 1))
         first = max(1.0 - come / RANDOM_SHARE, 0.0)
         return (usual + (1.0 - usual) * first).astype(np.float32)
 

@@ -212,7 +212,8 @@ class Session:
         process_started: time.perf_counter() of the process's start.
         on_row: told how many steps are done, and the last one's row.
         film: whether the champion is filmed.
-        wall_limit_s: seconds of learning, those before a resumption included, after which no step but the first is begun.
+        wall_limit_s: seconds of learning, those before a resumption included, after which no step but the first is
+            begun.
         lost: one line about what could not be written, beside what matters.
     """
 

@@ -165,14 +165,14 @@ class DqnSettings(RunSettings):
     """What a run of the DQN depends on."""
 
     command: ClassVar[str] = "gridsim-dqn"
-    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64", "grid": "cnn:16,32,256@4"}
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
     unbound: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
     counts: ClassVar[tuple[str, ...]] = ("evaluation", "car_steps", "episodes", "updates", "converged")
 
     policy: str = ""
-    """Network of the Q function: mlp: and the sizes of its hidden layers, by default mlp:64,64; on the grid cnn: with
-    the channels of two convolutions, the units of a dense layer and the number of frames, by default
-    cnn:16,32,256@4."""
+    """Network of the Q function: mlp: and the sizes of its hidden layers, with +steering if it sees how its own wheels
+    stand, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
+    layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 60_000_000
     """Car-steps at most, checked after each evaluation; 0: any number."""
     episodes: int = 0
@@ -198,13 +198,13 @@ class DqnSettings(RunSettings):
     """Discount factor of a step."""
     learning_rate: float = 5e-4
     """Of Adam, at the start; it falls to a twentieth over --anneal."""
-    anneal: int = 50_000_000
-    """Car-steps over which the learning rate and exploration fall."""
-    target_period: int = 1000
+    anneal: int = 20_000_000
+    """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth."""
+    target_period: int = 500
     """Updates from one copy of the target network to the next."""
     epsilon: float = 0.4
-    """Share of random actions of the episode that explores most, in the end; others of a batch explore less (Horgan et
-    al. 2018)."""
+    """Share of random actions of the episode that explores most; others of a batch explore less (Horgan et al.
+    2018)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the learner computes: auto, cpu or cuda."""
 

@@ -182,7 +182,7 @@ def see(setting, car, world, room, closing, eye):
     """What a car senses: its ranges, and then the network's inputs in `room.scratch`, or the grid in an Eye."""
     look(setting.road, setting.constants, setting.fan, car, world, room.beams, room.ranges, closing)
     if eye is None:
-        encode(room.ranges, closing, car[SPEED], room.scratch)
+        encode(room.ranges, closing, car[SPEED], car[STEERING], room.scratch)
     else:
         fill_grid(eye.table, room.ranges, eye.grid)
 

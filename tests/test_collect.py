@@ -18,7 +18,7 @@ from evolution.experience import NO_ACTION, Experience, ages, join, to_bytes, un
 from evolution.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
 from evolution.rollout import Limits, evaluate, no_traffic
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.ego import End
+from gridsim.ego import STEERING, End
 from gridsim.env import GridSimVectorEnv
 from gridsim.grid import CELLS, grid_table, grids, push_frames
 from gridsim.jit import njit
@@ -29,7 +29,7 @@ F = np.float32
 CONFIG = SimConfig()
 CARS = 8
 LIMITS = Limits(120.0, 150)
-POLICIES = ["mlp:6,7", "mlp:9+motion", "cnn:8,8,16@3"]
+POLICIES = ["mlp:6,7", "mlp:9+motion", "mlp:5+steering", "mlp:5+motion+steering", "cnn:8,8,16@3"]
 
 
 class Asked(NamedTuple):
@@ -101,8 +101,8 @@ def draw(key: int, place: int) -> int:
 
 
 @njit
-def _greedy(packed, layers, ranges, closing, speed, scratch):
-    encode(ranges, closing, speed, scratch)
+def _greedy(packed, layers, ranges, closing, speed, steering, scratch):
+    encode(ranges, closing, speed, steering, scratch)
     return decide(packed, layers, scratch)
 
 
@@ -136,8 +136,10 @@ class Slow:
                 near = 2.0 * ranges[0].astype(float) / (ranges[0] + 8.0) - 1.0
                 closing = simulator.closing[0].copy() if motion else None
                 fast = closing.astype(float) / 10.0 if closing is not None else []
-                self.inputs.append(np.concatenate([near, fast, speeds / 10.0 - 1.0]))
-                action = _greedy(packed, spec.layers, ranges[0], closing, speeds[0], scratch)
+                wheels = simulator.state.cars[0, STEERING]
+                turned = [wheels / 0.5] if isinstance(spec, MlpSpec) and spec.steering else []
+                self.inputs.append(np.concatenate([near, fast, speeds / 10.0 - 1.0, turned]))
+                action = _greedy(packed, spec.layers, ranges[0], closing, speeds[0], wheels, scratch)
             if end:
                 break
             bits = draw(base, len(self.actions))

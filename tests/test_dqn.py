@@ -18,7 +18,7 @@ from gridsim.roads import freeze
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:5")
-MLPS = ["mlp:6,7", "mlp:64,64", "mlp:3+motion", "mlp:9,8,7"]
+MLPS = ["mlp:6,7", "mlp:64,64", "mlp:3+motion+steering", "mlp:9,8,7"]
 CNNS = ["cnn:8,8,8@1", "cnn:16,24,40@2"]
 
 

@@ -28,7 +28,7 @@ from gridsim.jit import njit
 
 F = np.float32
 AREA = CELLS * CELLS
-SPECS = [MlpSpec((5,)), MlpSpec((5,), motion=True), CnnSpec((8, 8, 8), frames=3)]
+SPECS = [MlpSpec((5,)), MlpSpec((5,), motion=True), MlpSpec((5,), steering=True), CnnSpec((8, 8, 8), frames=3)]
 
 
 @njit
