@@ -62,8 +62,8 @@ class Champion:
         """The action for an observation, or actions [n] for n of them.
 
         Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed, and what else it may see
-        (`make_env` gives it). Of the grid, what `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which a grid does not show:
-        the environment's `info["speed_mps"]`.
+        (`make_env` gives it). Of the grid, what `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the
+        speed in m/s, which a grid does not show: the environment's `info["speed_mps"]`.
         Raises: ValueError with one line for an observation that this champion does not see.
         """
         spec = PolicySpec.parse(self.policy)

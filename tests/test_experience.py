@@ -63,7 +63,8 @@ def made(spec: PolicySpec, lengths: list[int], seed: int = 0) -> Experience:
 
 
 @pytest.mark.parametrize(
-    ("spec", "dtype", "width"), [(SPECS[0], "<i2", 32), (SPECS[1], "<i2", 63), (SPECS[2], "u1", 1602)]
+    ("spec", "dtype", "width"),
+    [(SPECS[0], "<i2", 32), (SPECS[1], "<i2", 63), (SPECS[2], "<i2", 33), (SPECS[3], "u1", 1602)],
 )
 def test_what_a_row_is(spec: PolicySpec, dtype: str, width: int) -> None:
     assert observation_dtype_and_width(spec) == (np.dtype(dtype), width)
@@ -183,12 +184,12 @@ def test_parts_are_joined_in_their_order() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    x, grids = made(SPECS[0], [3]), made(SPECS[2], [3])
+    x, grids = made(SPECS[0], [3]), made(SPECS[3], [3])
     with pytest.raises(ValueError, match="70 bytes a row; 71 bytes are not whole rows"):
         from_bytes(SPECS[0], bytes(71))
     with pytest.raises(ValueError, match=r"kept as int16 \[rows, 32\], not uint8 \(4, 1602\)"):
         unpack(SPECS[0], grids.observations, np.array([0]))
     with pytest.raises(ValueError, match="give as many as rows"):
-        unpack(SPECS[2], grids.observations, np.array([0]))
+        unpack(SPECS[3], grids.observations, np.array([0]))
     with pytest.raises(ValueError, match=r"written to float32 \[1, 32\], not float64"):
         unpack(SPECS[0], x.observations, np.array([0]), out=np.empty((1, 32)))
