@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
 import time
@@ -10,21 +11,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from cluster import warm
 from cluster.checkpoint import CheckpointError
-from cluster.experiment import Cell, CellError
+from cluster.experiment import COMPARISON, Cell, CellError
 from cluster.learning import Maps
 from cluster.pool import PoolError, SerialPool, WorkerPool
-from cluster.run import CHECKPOINT, RunError, RunFolder, Session, make_tracker, new_run, open_run
-from cluster.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError
-from cluster.tracking import TrackingError
+from cluster.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_tracker, new_run, open_run
+from cluster.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
+from cluster.tracking import Status, TrackingError
 from evolution.curriculum import CrashError
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario
 
-UNBOUND = 1_000_000_000_000_000  # generations or car-steps, where a budget is what ends a run
+UNBOUND = MAX_STEPS  # generations or car-steps, where a budget is what ends a run
+EVALUATIONS = 10  # of the DQN at least, since a budget of car-steps is looked at after each
 
 
 @dataclass
@@ -66,7 +66,12 @@ class Cells:
     def _folder(self, cell: Cell) -> RunFolder:
         """A new run's folder, or that of one that goes on."""
         if (cell.folder / CHECKPOINT).is_file():
-            return open_run(cell.folder)
+            run = open_run(cell.folder)
+            if run.settings != settings_of(cell):
+                raise CellError(
+                    f"{cell.folder}: its {CONFIG} is not what {COMPARISON} asks for; one of them was edited"
+                )
+            return run
         if cell.folder.exists():  # it was killed before its first step; `Cell.check` has looked at what is in it
             shutil.rmtree(cell.folder)
         return new_run(cell.folder.parent, cell.name, settings_of(cell))
@@ -76,12 +81,12 @@ class Cells:
         self._maps = maps = Maps(settings.scenario, SimConfig())
         warming = warm.begin(settings)
         tracker = make_tracker(run, self.tracking_uri, self.experiment, self.parent_id)
-        finished = False
+        status: Status = "KILLED"
         try:
             pool = self._workers()
             session = Session(
                 run, pool, maps, tracker, time.perf_counter(), film=False,
-                wall_limit_s=cell.plan.budget.wall_s or np.inf,
+                wall_limit_s=cell.plan.budget.wall_s or math.inf,
                 on_row=lambda _, row: self.note(session.learning.describe(row)),
             )  # fmt: skip
             maps.ahead(session.learning.curriculum.map_seeds[:3])
@@ -100,12 +105,15 @@ class Cells:
                     summary["mlflow_run_id"] = tracker.wait_ready(30.0)
             tracker.log_artifacts(run.path)
             session.write_summary(summary)
-            finished = True
+            status = "FINISHED"
             return summary
+        except Exception:
+            status = "FAILED"
+            raise
         finally:
             warming.stop()
             maps.close()
-            tracker.close("FINISHED" if finished else "KILLED", timeout_s=60.0 if finished else 15.0)
+            tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
 
     def _workers(self) -> WorkerPool:
         """The pool of all runs."""
@@ -127,8 +135,9 @@ def settings_of(cell: Cell) -> RunSettings:
     plan = cell.plan
     common: dict[str, Any] = {"scenario": cell.scenario, "traffic": cell.traffic, "seed": cell.seed}
     if cell.learner == "dqn":
-        steps = plan.budget.car_steps
-        return DqnSettings(**common, observation=plan.observation, car_steps=steps or UNBOUND)
+        steps = plan.budget.car_steps or UNBOUND
+        every = min(DqnSettings.evaluate_every, max(steps // EVALUATIONS, 1))
+        return DqnSettings(**common, observation=plan.observation, car_steps=steps, evaluate_every=every)
     if plan.population:
         common["population"] = plan.population
     return EvolveSettings(

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
+import numpy as np
 import tyro
 from rich.console import Console
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from cluster.warm import Warming
 
 T = TypeVar("T")
-FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
+FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 MAX_WORKERS = 10_000
 
 
@@ -156,7 +157,7 @@ class Stopped(BaseException):
 
 
 @contextlib.contextmanager
-def _stoppable() -> Iterator[None]:
+def stoppable() -> Iterator[None]:
     """SIGTERM raises Stopped in the main thread, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(*_: object) -> None:
@@ -196,13 +197,13 @@ def dqn_main() -> None:
 def _learn_main(kind: type[Flags]) -> None:
     started = time.perf_counter() - process_age_s()
     try:
-        with _stoppable():
+        with stoppable():
             sys.exit(_learn(kind, sys.argv[1:], started))
     except KeyboardInterrupt:  # before there was anything to save
         print(f"{kind.command}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Stopped:
-        sys.exit(143)
+        sys.exit(TERMINATED)
 
 
 def _given(arguments: Sequence[str], flag: str) -> str:
@@ -264,16 +265,11 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
                 )
         run.settings = settings_of(flags)
         run.settings.check()
+        _check_device(flags)
         return flags, run
     settings = settings_of(flags)
     settings.check()
-    if isinstance(flags, DqnFlags) and flags.device == "cuda":
-        from evolution.dqn import device_of
-
-        try:
-            device_of(flags.device)
-        except ValueError as error:
-            raise UsageError(f"--device {flags.device}: {error}") from error
+    _check_device(flags)
     digest = ""
     if flags.init:
         try:
@@ -282,11 +278,28 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
             raise UsageError(f"--init {error}") from error
         if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
             raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
+        if not np.isfinite(champion.genome).all():
+            raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
         digest = champion.sha256
     try:
         return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
     except runs.RunError as error:
         raise UsageError(str(error)) from error
+
+
+def _check_device(flags: Flags) -> None:
+    """Raises UsageError for a device that is not there."""
+    if isinstance(flags, DqnFlags) and flags.device == "cuda":
+        from evolution.dqn import device_of
+
+        try:
+            device_of(flags.device)
+        except ValueError as error:
+            if flags.resume:
+                raise UsageError(
+                    f"{flags.resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
+                ) from error
+            raise UsageError(f"--device {flags.device}: {error}") from error
 
 
 def settings_of(flags: Flags) -> RunSettings:
@@ -342,20 +355,23 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
     status: tracking.Status = "FAILED"
     code = FAILED
     message = ""
+    again = f"continue with: {prog} --resume {_shown(run.path)}"
     try:
         message = _run(console, run, pool, maps, tracker, flags, started, warming)
         status, code = "FINISHED", 0
     except KeyboardInterrupt:
         status, code = "KILLED", INTERRUPTED
     except Stopped:
-        status, code = "KILLED", 143
+        status, code = "KILLED", TERMINATED
     except Exception as error:
         from cluster.checkpoint import CheckpointError
         from evolution.curriculum import CrashError
 
-        if not isinstance(error, PoolError | CheckpointError | CrashError | MemoryError | OSError):
+        if not isinstance(error, PoolError | CheckpointError | CrashError | FloatingPointError | MemoryError | OSError):
             raise
         message = str(error) or type(error).__name__
+        if isinstance(error, FloatingPointError):  # to go on would be to come to the same
+            again = f"repeat it with: {prog} --config {_shown(run.path)}/config.json --learning-rate ..."
     finally:
         with _undisturbed():
             if status == "KILLED":
@@ -368,16 +384,14 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         print(f"{prog}: warning: {lost}", file=sys.stderr)
     resumable = (run.path / "checkpoint.npz").is_file()
     if status == "KILLED":
-        where = (
-            f"continue with: {prog} --resume {_shown(run.path)}" if resumable else f"no {kind.counts[0]} was done yet"
-        )
+        where = again if resumable else f"no {kind.counts[0]} was done yet"
         print(f"{prog}: stopped; {where}", file=sys.stderr)
         if not resumable:
             _discard(made)
     elif status == "FAILED":
         if not resumable:
             _discard(made)
-        fail(prog, message, f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "", FAILED)
+        fail(prog, message, again if resumable else "", FAILED)
     else:
         console.print(message)
     return code

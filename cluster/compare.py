@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 import re
 import shutil
 import sys
@@ -21,7 +22,7 @@ from rich.progress import Progress as Bar
 
 from cluster import checkpoint, experiment, tables
 from cluster.checkpoint import CheckpointError
-from cluster.cli import FAILED, INTERRUPTED, MAX_WORKERS, cores, fail, parse
+from cluster.cli import FAILED, INTERRUPTED, MAX_WORKERS, TERMINATED, Stopped, cores, fail, parse, stoppable
 from cluster.experiment import (
     ERROR_FIGURES,
     ERRORS_KEPT,
@@ -114,10 +115,13 @@ KEPT = ("runs", "output", "name", "reference")  # go with --runs
 def compare_main() -> None:
     """Entry point of `gridsim-compare`."""
     try:
-        sys.exit(_compare(sys.argv[1:]))
+        with stoppable():
+            sys.exit(_compare(sys.argv[1:]))
     except KeyboardInterrupt:  # before there was anything to keep, or for the second time
         print(f"{PROG}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
+    except Stopped:
+        sys.exit(TERMINATED)
 
 
 def _compare(arguments: Sequence[str]) -> int:
@@ -133,6 +137,7 @@ def _compare(arguments: Sequence[str]) -> int:
         from cluster import tracking
 
         uri = tracking.check_uri(flags.tracking_uri or None)
+        experiment.hold(folder.path)
     except (ExperimentError, CheckpointError) as error:
         fail(PROG, str(error))
     except tracking.TrackingError as error:
@@ -140,8 +145,11 @@ def _compare(arguments: Sequence[str]) -> int:
     return _experiment(console, folder, cells, flags, uri)
 
 
-def _stamped(name: str) -> str:
-    return name or f"comparison-{time.strftime('%Y%m%d-%H%M%S')}"
+def _stamped(flags: CompareFlags) -> str:
+    if flags.name:
+        return flags.name
+    name = f"comparison-{time.strftime('%Y%m%d-%H%M%S')}"
+    return f"{name}-{os.getpid()}" if (Path(flags.output) / name).exists() else name
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
@@ -152,7 +160,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
         raise ExperimentError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
     if not flags.resume:
         plan = flags.plan()
-        return ComparisonFolder(experiment.new_folder(Path(flags.output), _stamped(flags.name)), plan), flags
+        return ComparisonFolder(experiment.new_folder(Path(flags.output), _stamped(flags)), plan), flags
     folder = experiment.open_comparison(Path(flags.resume))
     plan = folder.plan
     base = CompareFlags(
@@ -185,13 +193,12 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
     from cluster.tracking import TrackingError
 
     left = [cell for cell in cells if not cell.finished()]
-    status = "FAILED"
+    status, code = "FAILED", FAILED
     failed = 0
     problem = ""
     tracker: Tracker | None = None
     results: Results | None = None
     try:
-        folder.path.mkdir(parents=True, exist_ok=True)
         folder.write()
         tracker = _tracker(folder, uri, flags.experiment)
         results = Results(folder.path, folder.plan)
@@ -220,9 +227,11 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
                 failed = experiment.train(cells, execute, done, shown.begin)
             finally:
                 execute.close()
-        status = "FINISHED"
+        status, code = "FINISHED", 0
     except KeyboardInterrupt:
-        status = "KILLED"
+        status, code = "KILLED", INTERRUPTED
+    except Stopped:
+        status, code = "KILLED", TERMINATED
     except (ExperimentError, CheckpointError, MemoryError, OSError) as error:
         problem = str(error) or type(error).__name__
     if results and results.runs and not problem:
@@ -238,10 +247,9 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
         console.print(results.closing())
     if status == "KILLED":
         print(f"{PROG}: stopped; {again}", file=sys.stderr)
-        return INTERRUPTED
-    if failed:
+    elif failed:
         fail(PROG, f"{failed} of {len(cells)} runs failed", again, FAILED)
-    return 0
+    return code
 
 
 def _tracker(folder: ComparisonFolder, uri: str, name: str) -> Tracker:
@@ -359,7 +367,7 @@ def _existing(console: Console, flags: CompareFlags) -> int:
         except DriveError as error:
             raise ExperimentError(f"--reference {error}") from error
     runs = experiment.read_runs([Path(name) for name in flags.runs])
-    path = experiment.new_folder(Path(flags.output), _stamped(flags.name))
+    path = experiment.new_folder(Path(flags.output), _stamped(flags))
     path.mkdir(parents=True)
     try:
         results = Results(path, reference=flags.reference)

@@ -18,7 +18,7 @@ from cluster.pool import Collected
 from cluster.settings import DqnSettings
 from cluster.worker import CollectTask
 from evolution.curriculum import success_rate
-from evolution.dqn import DqnConfig, DqnLearner
+from evolution.dqn import DqnConfig, DqnLearner, diverged
 from evolution.replay import PriorityConfig, Replay
 from evolution.rollout import Limits
 from gridsim.scenarios import map_of
@@ -83,7 +83,7 @@ class Dqn(Learning):
         self.outcomes.clear()
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
         steps, distance, episodes, reward, speeds = 0, 0.0, 0, 0.0, 0.0
-        while steps < self.settings.evaluate_every:
+        while steps < self.settings.evaluate_every and not (steps and self.out_of_time()):
             brought = self._collect()
             n = int(brought.results["steps"].sum())
             steps += n
@@ -100,7 +100,7 @@ class Dqn(Learning):
         updates = sum(n for n, _, _ in self._losses)
         row["loss"] = sum(n * loss for n, loss, _ in self._losses) / max(updates, 1)
         row["q/mean"] = sum(n * q for n, _, q in self._losses) / max(updates, 1)
-        row["q/change"] = self._watch()
+        row["q/change"] = self._watch(updates)
         row["exploration"] = float(self._epsilons(EPISODES[0]).mean())
         row["learning_rate"] = self.learner.config.learning_rate_at(self.learner.updates)
         row |= {"episodes": float(self.episodes), "updates": float(self.learner.updates)}
@@ -118,7 +118,7 @@ class Dqn(Learning):
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         task = CollectTask(
             policy=s.policy,
-            weights=self.learner.weights,
+            weights=self._network(),
             episodes=episodes.rows,
             worlds=episodes.worlds,
             maps=tuple((s.scenario, map_of(s.scenario, seed)) for seed in episodes.maps),
@@ -151,7 +151,7 @@ class Dqn(Learning):
         """Make some of the updates that are owed. Returns whether some are left."""
         if self.meanwhile:
             self.meanwhile()
-        if len(self.replay) < WARM_UP:
+        if len(self.replay) < min(WARM_UP, self.replay.capacity):
             self._owed = 0.0
         n = min(int(self._owed), SLICE)
         if n:
@@ -164,8 +164,10 @@ class Dqn(Learning):
 
     def _evaluate_network(self) -> dict[str, float]:
         """Try the network on validation's first episodes, beside who is on trial. Returns its part of the row."""
-        self.elites.append(self.learner.weights)
-        self.trials.enter(self.elites[-1][None], self.steps)
+        network = self._network()
+        self.elites.append(network)
+        # Also who was tried before, where nothing was learned since: its figures are the row's.
+        self.trials.first, self.trials.first_generation = network[None], self.steps
         episodes, asked = self._trial()
         genomes = np.concatenate([self.trials.first, self.trials.last])
         results = self._evaluate(
@@ -180,17 +182,31 @@ class Dqn(Learning):
             "network/success_rate": float(success_rate(first[None])[0]),
         }
 
-    def _watch(self) -> float:
-        """How far the Q values of fixed observations moved since the last evaluation, as a share of their spread."""
+    def _network(self) -> np.ndarray:
+        """The network as it is, float32 [genes]. Raises: FloatingPointError with one line once it has diverged."""
+        weights = self.learner.weights
+        if not np.isfinite(weights).all():
+            raise diverged(self.learner.updates)
+        return weights
+
+    def _watch(self, updates: int) -> float:
+        """How far the Q values of fixed observations moved since the last evaluation, as a share of their spread.
+
+        Without updates in between they stand still and tell nothing. Raises: FloatingPointError as `_network`: what
+        is not finite could not be taken up again.
+        """
         if not len(self.probe):
             key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
             self.probe = self.replay.sample(key, PROBE[self.spec.observation]).observations
-        q = self.learner.q_values(self.probe)
-        before, self.probe_q = self.probe_q, q
+        before, self.probe_q = self.probe_q, self.learner.q_values(self.probe)
+        self._network()
+        if not np.isfinite(self.probe_q).all():
+            raise diverged(self.learner.updates)
         change = 1.0
         if len(before):
+            q = self.probe_q.astype(np.float64)  # squares of large values are beyond float32
             change = float(np.sqrt(np.mean((q - before) ** 2)) / max(float(q.std()), 1e-9))
-        self.calm = self.calm + 1 if change < self.settings.converged else 0
+        self.calm = self.calm + 1 if updates and change < self.settings.converged else 0
         return change
 
     # ------------------------------------------------------------------------------------------------------- state

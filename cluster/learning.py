@@ -128,6 +128,7 @@ class Learning(ABC):
     wall_before_s: float = 0.0
     on_progress: Callable[[str, int, int], None] | None = None
     meanwhile: Callable[[], None] | None = None  # called in each step when the workers are busy
+    out_of_time: Callable[[], bool] = lambda: False  # whether a budget of wall time is spent: a long step ends early
 
     def __post_init__(self) -> None:
         s = self.settings

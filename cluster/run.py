@@ -212,8 +212,7 @@ class Session:
         process_started: time.perf_counter() of the process's start.
         on_row: told how many steps are done, and the last one's row.
         film: whether the champion is filmed.
-        wall_limit_s: seconds of learning, those before a resumption included, after which no step but the first is
-            begun.
+        wall_limit_s: seconds of learning, with those before a resumption, after which no step but the first is begun.
         lost: one line about what could not be written, beside what matters.
     """
 
@@ -244,9 +243,9 @@ class Session:
             self._log(step, past)  # what MLflow has is skipped
         if learning.history:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
-        learning.meanwhile = self._save_last
+        learning.meanwhile, learning.out_of_time = self._save_last, self._out_of_time
         try:
-            while not learning.done() and (not learning.steps or self._wall_s() < self.wall_limit_s):
+            while not learning.done() and not (learning.steps and self._out_of_time()):
                 row = learning.step()
                 learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
                 self._unsaved = True
@@ -262,6 +261,9 @@ class Session:
     def _wall_s(self) -> float:
         """Seconds that the run has taken, in this process and before."""
         return self.learning.wall_before_s + now() - self.process_started
+
+    def _out_of_time(self) -> bool:
+        return self._wall_s() >= self.wall_limit_s
 
     def _save_last(self) -> None:
         """Save and log the last step, if that was not done."""

@@ -9,14 +9,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeVar, get_args, get_type_hints
 
+from cluster.checkpoint import MAX_BYTES
 from evolution.curriculum import CurriculumConfig
+from evolution.experience import observation_dtype_and_width
 from evolution.genetic import GeneticConfig
 from evolution.policy import Observation, PolicySpec
+from evolution.replay import MAX_N_STEP
 from gridsim.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
 MAX_REPLAY = 10_000_000
+REPLAY_BYTES = 16  # of a row, beside the observation, at most
+REPLAY_SHARE = 0.75  # of the largest checkpoint
+MAX_STEPS = 10**15  # car-steps or episodes
+MAX_UPDATES = 1_000_000  # for each thousand car-steps
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -49,6 +56,10 @@ class RunSettings:
     until: float = 0.985
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
+    pace: float = 0.0
+    """Mean speed in m/s below which a champion's success counts for less, and which training's time limits follow; 0:
+    the scenario's own, a little above its lower speed."""
+
     def __post_init__(self) -> None:
         if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
             object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
@@ -65,6 +76,8 @@ class RunSettings:
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
         low, _ = speed_interval(self.scenario)
+        if self.pace:
+            return CurriculumConfig(pace=self.pace + 1.15, champion_pace=self.pace)
         if self.traffic:
             return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3)
         return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
@@ -87,10 +100,13 @@ class RunSettings:
             raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
         if not 0 <= self.seed < 1 << 63:
             raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
-        if self.car_steps < 0:
-            raise SettingsError(f"--car-steps must be 0 or more, not {self.car_steps}")
+        if not 0 <= self.car_steps <= MAX_STEPS:
+            raise SettingsError(f"--car-steps must be 0 to {MAX_STEPS:,}, not {self.car_steps:,}")
         if not self.until > 0.0:
             raise SettingsError(f"--until must be above 0, not {self.until}")
+        low, high = speed_interval(self.scenario)
+        if self.pace and not low <= self.pace <= high:
+            raise SettingsError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
         try:
             spec = PolicySpec.parse(self.policy)
         except ValueError as error:
@@ -220,6 +236,11 @@ class DqnSettings(RunSettings):
         for name in ("evaluate_every", "batch", "replay", "n_step", "anneal", "target_period"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"--{name.replace('_', '-')} must be 1 or more, not {getattr(self, name)}")
+        for name, most in (
+            ("n_step", MAX_N_STEP), ("anneal", MAX_STEPS), ("episodes", MAX_STEPS), ("updates", MAX_UPDATES),
+        ):  # fmt: skip
+            if getattr(self, name) > most:
+                raise SettingsError(f"--{name.replace('_', '-')} must be {most:,} or less, not {getattr(self, name):,}")
         for name in ("discount", "epsilon", "converged"):
             _check_share(self, name)
         for name in ("updates", "learning_rate"):
@@ -229,8 +250,18 @@ class DqnSettings(RunSettings):
             raise SettingsError(f"--episodes must be 0 or more, not {self.episodes}")
         if not self.batch <= self.replay <= MAX_REPLAY:
             raise SettingsError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
+        self._check_replay_fits()
         if self.device not in ("auto", "cpu", "cuda"):
             raise SettingsError(f"--device must be auto, cpu or cuda, not {self.device}")
+
+    def _check_replay_fits(self) -> None:
+        """Raises SettingsError where a checkpoint could not hold the replay beside what else there is."""
+        dtype, width = observation_dtype_and_width(PolicySpec.parse(self.policy))
+        most = int(REPLAY_SHARE * MAX_BYTES) // (dtype.itemsize * width + REPLAY_BYTES)
+        if self.replay > most:
+            raise SettingsError(
+                f"--replay must be {most:,} or less for {self.policy}, not {self.replay:,}: a checkpoint holds no more"
+            )
 
 
 SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}

@@ -95,6 +95,11 @@ class Training(NamedTuple):
     error: float  # size of Q - y
 
 
+def diverged(update: int) -> FloatingPointError:
+    """What is raised once the network has no finite numbers any more."""
+    return FloatingPointError(f"the Q network diverged at update {update}: try a lower learning rate")
+
+
 def device_of(name: str) -> torch.device:
     """The device that `auto`, `cpu`, `cuda` or `cuda:N` names; `auto` is cuda where there is one.
 
@@ -277,7 +282,7 @@ class DqnLearner:
         loss, q, errors = self.loss(batch)
         step = Step(loss.item(), q.mean().item(), errors.abs().mean().item(), errors.cpu().numpy())
         if not math.isfinite(step.loss):
-            raise FloatingPointError(f"the Q network diverged at update {self.updates}: try a lower learning rate")
+            raise diverged(self.updates)
         gradients = torch.autograd.grad(loss, self._leaves)
         torch.cat([gradient.flatten() for gradient in gradients], out=self._gradient)
         norm = torch.linalg.vector_norm(self._gradient)
@@ -344,8 +349,7 @@ class DqnLearner:
         Raises: ValueError with one line for what no learner of this network can have written; nothing is changed.
         """
         updates = meta.get("updates")
-        # Adam counts its steps in float32.
-        if type(updates) is not int or not 0 <= updates < 1 << 24:
+        if type(updates) is not int or not 0 <= updates < 1 << 62:
             raise ValueError(f"a saved learner's updates are not a number of them: {str(updates)[:40]!r}")
         found = []
         for name in ("weights", "target", "adam_mean", "adam_variance"):
