@@ -118,7 +118,7 @@ class Dqn(Learning):
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         task = CollectTask(
             policy=s.policy,
-            weights=self._network(),
+            weights=_finite(self.learner.weights, self.learner.updates),
             episodes=episodes.rows,
             worlds=episodes.worlds,
             maps=tuple((s.scenario, map_of(s.scenario, seed)) for seed in episodes.maps),
@@ -163,8 +163,8 @@ class Dqn(Learning):
     # ------------------------------------------------------------------------------------------------- the evaluation
 
     def _evaluate_network(self) -> dict[str, float]:
-        """Try the network on validation's first episodes, beside who is on trial. Returns its part of the row."""
-        network = self._network()
+        """Try the averaged network on validation's first episodes, beside who is on trial. Returns its figures."""
+        network = _finite(self.learner.average, self.learner.updates)
         self.elites.append(network)
         # Also who was tried before, where nothing was learned since: its figures are the row's.
         self.trials.first, self.trials.first_generation = network[None], self.steps
@@ -182,24 +182,17 @@ class Dqn(Learning):
             "network/success_rate": float(success_rate(first[None])[0]),
         }
 
-    def _network(self) -> np.ndarray:
-        """The network as it is, float32 [genes]. Raises: FloatingPointError with one line once it has diverged."""
-        weights = self.learner.weights
-        if not np.isfinite(weights).all():
-            raise diverged(self.learner.updates)
-        return weights
-
     def _watch(self, updates: int) -> float:
         """How far the Q values of fixed observations moved since the last evaluation, as a share of their spread.
 
-        Without updates in between they stand still and tell nothing. Raises: FloatingPointError as `_network`: what
+        Without updates in between they stand still and tell nothing. Raises: FloatingPointError as `_finite`: what
         is not finite could not be taken up again.
         """
         if not len(self.probe):
             key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
             self.probe = self.replay.sample(key, PROBE[self.spec.observation]).observations
         before, self.probe_q = self.probe_q, self.learner.q_values(self.probe)
-        self._network()
+        _finite(self.learner.weights, self.learner.updates)
         if not np.isfinite(self.probe_q).all():
             raise diverged(self.learner.updates)
         change = 1.0
@@ -280,6 +273,13 @@ class Dqn(Learning):
             raise ValueError("its numbers are out of range")
         if (meta["evaluation"], meta["updates"]) != (self.steps, self.learner.updates):
             raise ValueError("its parts do not fit each other")
+
+
+def _finite(weights: np.ndarray, updates: int) -> np.ndarray:
+    """Weights as they are. Raises: FloatingPointError with one line once they have diverged."""
+    if not np.isfinite(weights).all():
+        raise diverged(updates)
+    return weights
 
 
 def _named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -50,6 +50,7 @@ class DqnConfig:
         1e-5  # Adam's; greater than its authors' 1e-8, as in Rainbow, since squared gradients are small
     )
     target_period: int = 500  # updates after which the target becomes the network
+    average: int = 2000  # updates that the average of the weights goes back (Polyak and Juditsky 1992), exponentially
     double: bool = True  # Double DQN
     huber_delta: float = 1.0  # size of an error from which the loss grows linearly (Mnih et al. 2015 clip errors at 1)
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
@@ -57,7 +58,7 @@ class DqnConfig:
 
     def check(self) -> None:
         """Raises ValueError with one line for parameters that make no sense. `Replay` checks its own."""
-        for name in ("batch", "learning_rate_updates", "target_period"):
+        for name in ("batch", "learning_rate_updates", "target_period", "average"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name.replace('_', ' ')} must be 1 or more, not {getattr(self, name)}")
         for name in ("learning_rate", "adam_epsilon", "huber_delta", "gradient_clip"):
@@ -227,6 +228,7 @@ class DqnLearner:
         # Adam's moments and steps.
         self._mean, self._variance = torch.zeros_like(self._gradient), torch.zeros_like(self._gradient)
         self._steps = torch.zeros((), device=self.device)
+        self._average = torch.zeros_like(self._gradient)
         self._key = int(np.random.SeedSequence([seed, _SAMPLES]).generate_state(1, np.uint64)[0])
         self.load_weights(new_weights(spec, seed))
 
@@ -234,6 +236,14 @@ class DqnLearner:
     def weights(self) -> np.ndarray:
         """The network as a genome: float32 [genes], a copy."""
         return self.online.genome.detach().cpu().numpy().copy()
+
+    @property
+    def average(self) -> np.ndarray:
+        """The average of the network over its last updates, as a genome: float32 [genes], a copy.
+
+        It drives better than any of those, which swing from update to update.
+        """
+        return self._average.cpu().numpy().copy()
 
     def load_weights(self, genome: np.ndarray) -> None:
         """Begin training anew, with a genome [genes].
@@ -243,15 +253,23 @@ class DqnLearner:
         if genome.shape != (self.spec.size,) or not np.isfinite(genome).all():
             raise ValueError(f"a genome of {self.spec} has {self.spec.size} finite genes, not {list(genome.shape)}")
         zeros = np.zeros(self.spec.size, dtype=np.float32)
-        self._become(genome.astype(np.float32), genome.astype(np.float32), zeros, zeros, 0)
+        weights = genome.astype(np.float32)
+        self._become(weights, weights, weights, zeros, zeros, 0)
 
     def _become(
-        self, weights: np.ndarray, target: np.ndarray, mean: np.ndarray, variance: np.ndarray, updates: int
+        self,
+        weights: np.ndarray,
+        target: np.ndarray,
+        average: np.ndarray,
+        mean: np.ndarray,
+        variance: np.ndarray,
+        updates: int,
     ) -> None:
         # Copies into memory that PyTorch made: views of NumPy's would not be aligned alike in every process, and what
         # a matrix product rounds to depends on that.
         self.online.genome.data.copy_(torch.from_numpy(weights))
         self.target.genome.data.copy_(torch.from_numpy(target))
+        self._average.copy_(torch.from_numpy(average))
         self._mean.copy_(torch.from_numpy(mean))
         self._variance.copy_(torch.from_numpy(variance))
         self._steps.fill_(updates)
@@ -289,6 +307,7 @@ class DqnLearner:
         self._gradient.mul_((self.config.gradient_clip / norm).clamp_(max=1.0))
         self._adam_step(self.config.learning_rate_at(self.updates))
         self.updates += 1
+        self._average.lerp_(self.online.genome.detach(), 1.0 / min(self.updates, self.config.average))
         if self.updates % self.config.target_period == 0:
             self.target.genome.data.copy_(self.online.genome.data)
         return step
@@ -337,6 +356,7 @@ class DqnLearner:
         tensors = {
             "weights": self.online.genome,
             "target": self.target.genome,
+            "average": self._average,
             "adam_mean": self._mean,
             "adam_variance": self._variance,
         }
@@ -352,12 +372,12 @@ class DqnLearner:
         if type(updates) is not int or not 0 <= updates < 1 << 62:
             raise ValueError(f"a saved learner's updates are not a number of them: {str(updates)[:40]!r}")
         found = []
-        for name in ("weights", "target", "adam_mean", "adam_variance"):
+        for name in ("weights", "target", "average", "adam_mean", "adam_variance"):
             array = arrays.get(name)
             if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.shape != (self.spec.size,):
                 raise ValueError(f"a saved learner's {name} is not float32 [{self.spec.size}], as {self.spec} needs")
             if not np.isfinite(array).all() or (name == "adam_variance" and (array < 0).any()):
                 raise ValueError(f"a saved learner's {name} has numbers that training does not give")
             found.append(array)
-        weights, target, mean, variance = found
-        self._become(weights, target, mean, variance, updates)
+        weights, target, average, mean, variance = found
+        self._become(weights, target, average, mean, variance, updates)

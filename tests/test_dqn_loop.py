@@ -1,5 +1,7 @@
 """The DQN's loop in this process: what it does where nothing is learned, where learning diverges, where time is up."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,13 @@ def loop(maps, monkeypatch):
     monkeypatch.setattr(dqn_loop, "WARM_UP", 3000)
 
     def make(**changes):
-        settings = {"scenario": "curved", "policy": "mlp:4", "replay": 4000, "evaluate_every": 1000, "batch": 32}
+        settings: dict[str, Any] = {
+            "scenario": "curved",
+            "policy": "mlp:4",
+            "replay": 4000,
+            "evaluate_every": 1000,
+            "batch": 32,
+        }
         return Dqn(DqnSettings(**settings | changes), SerialPool(maps.build), maps)
 
     return make
