@@ -222,7 +222,8 @@ class Cell:
         if not self.folder.exists():
             return
         if not (self.folder / CONFIG).is_file():
-            if not self.folder.is_dir() or any(self.folder.iterdir()):
+            # Killed while it wrote its first file, a run leaves a hidden one.
+            if not self.folder.is_dir() or any(not path.name.startswith(".") for path in self.folder.iterdir()):
                 raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
             return
         config = read_json(self.folder / CONFIG)

@@ -397,6 +397,16 @@ def test_budget_is_looked_at_often_enough(tmp_path, budget, every):
     assert (settings.car_steps, settings.evaluate_every) == (cell.plan.budget.car_steps, every)
 
 
+def test_a_run_that_was_killed_while_it_began_is_not_in_the_way(tmp_path):
+    (cell,) = Plan(("curved",), ("dqn",), 1, Budget(car_steps=1_000_000)).cells(tmp_path)
+    cell.folder.mkdir()
+    (cell.folder / ".config.json.123.tmp").write_text("{")
+    cell.check()
+    (cell.folder / "thesis.tex").write_text("")
+    with pytest.raises(ExperimentError, match="is in the way and no run"):
+        cell.check()
+
+
 def test_an_unfinished_run_that_was_edited_is_refused(tmp_path):
     (cell,) = Plan(("curved",), ("dqn",), 1, Budget(car_steps=1_000_000)).cells(tmp_path)
     settings = dataclasses.replace(settings_of(cell), car_steps=5)
