@@ -23,20 +23,17 @@ from rich.progress import Progress as Bar
 from cluster import checkpoint, experiment, tables
 from cluster.checkpoint import CheckpointError
 from cluster.cli import FAILED, INTERRUPTED, MAX_WORKERS, TERMINATED, Stopped, cores, fail, parse, stoppable
-from cluster.experiment import (
+from cluster.experiment import Budget, Cell, CellError, ComparisonFolder, Plan
+from cluster.finished import (
     ERROR_FIGURES,
     ERRORS_KEPT,
     LEARNERS,
-    Budget,
-    Cell,
-    CellError,
-    ComparisonFolder,
     Errors,
     ExperimentError,
     Learner,
-    Plan,
     Run,
     errors_of,
+    read_run,
     series_of,
 )
 from evolution.policy import Observation
@@ -218,7 +215,7 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
                     shown.failed(cell, str(error))
                     return
                 shown.note("measuring errors")
-                run = results.take([experiment.read_run(cell.folder)])[0]
+                run = results.take([read_run(cell.folder)])[0]
                 results.write_tables()
                 tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
                 shown.done(cell, run)

@@ -79,7 +79,7 @@ class Progress:
             self._bar.update(self._task, text=f"{self._text}  [dim]{stage} {done}/{total}")
 
     def note(self, text: str) -> None:
-        """What happens after the last generation."""
+        """What happens after the last step."""
         self._bar.update(self._task, text=text)
         if not self._live:
             self._console.print(text)

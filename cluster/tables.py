@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cluster.experiment import ERROR_FIGURES, RUN_FIGURES, Plan, Run
+from cluster.experiment import Plan
+from cluster.finished import ERROR_FIGURES, RUN_FIGURES, Run
 from cluster.statistics import RESAMPLES, Spread, separation_by_chance, span_coverage, spread
 from gridsim.scenarios import REGISTRY, default_traffic, label
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import time
 
@@ -131,6 +132,8 @@ def test_a_run_of_the_other_learner_is_refused(reference, tmp_path):
         (["--replay", "10"], "--replay must be 256"),
         (["--learning-rate", "nan"], "--learning-rate must be above 0, not nan"),
         (["--policy", "cnn"], "policy cnn sees the grid"),
+        (["--n-step", "300"], "--n-step must be 255 or less, not 300"),
+        (["--observation", "grid", "--replay", "9000000"], "--replay must be 1,9"),
         (["--generations", "3"], "--generations"),
     ],
 )
@@ -141,6 +144,22 @@ def test_wrong_use_is_one_clear_line(flags, words, tmp_path):
     assert words in done.stderr
     assert len(done.stderr.splitlines()) <= 3
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_that_diverges_says_so(tmp_path):
+    done = dqn("--workers", "0", "--name", "d", *SMALL, "--learning-rate", "1e38", cwd=tmp_path)
+    assert done.returncode == 1
+    assert re.fullmatch(r"gridsim-dqn: error: the Q network diverged at update \d+: [^\n]*\n", done.stderr)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_champion_without_numbers_is_no_start(reference, tmp_path):
+    arrays, meta = load(reference / "champion.npz")
+    arrays["genome"][7] = np.nan
+    save(tmp_path / "c.npz", arrays, meta)
+    done = dqn("--init", "c.npz", *SMALL, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("gridsim-dqn: error: --init c.npz: some of its genes are no numbers")
 
 
 @pytest.mark.parametrize(

@@ -21,23 +21,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from cluster import compare, experiment, report, tables
-from cluster.champion import Champion
-from cluster.experiment import (
+from cluster import checkpoint, compare, experiment, report, tables
+from cluster.cells import Cells, settings_of
+from cluster.champion import Champion, evaluate, load_champion
+from cluster.experiment import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
+from cluster.finished import (
     ERROR_FIGURES,
     LEARNERS,
-    Budget,
-    CellError,
-    ComparisonFolder,
+    RUN_FIGURES,
     Errors,
     ExperimentError,
-    Plan,
     Run,
-    open_comparison,
+    errors_of,
     read_run,
-    read_runs,
-    train,
 )
+from cluster.run import RunFolder
+from cluster.settings import DqnSettings
 from cluster.statistics import separation_by_chance, span_coverage, spread
 from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
@@ -71,7 +70,7 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, 
 
 def run(learner, scenario, seed, percent, training_s=10.0, success=0.9, traffic=0, observation="rays"):
     """A finished run with its errors."""
-    figures = dict.fromkeys([*experiment.RUN_FIGURES, *ERROR_FIGURES], 1.0)
+    figures = dict.fromkeys([*RUN_FIGURES, *ERROR_FIGURES], 1.0)
     figures |= {"velocity_error_percent": percent, "training_s": training_s, "success_rate": success}
     name = f"{scenario}-{learner}-s{seed}"
     return Run(Path(name), learner, scenario, seed, traffic, observation, name, figures)
@@ -251,6 +250,18 @@ def test_errors_are_measured_once(tmp_path):
 # ------------------------------------------------------------------------------------------------ damaged and hostile
 
 
+@pytest.mark.parametrize("learner", ["evolution", "dqn"])
+def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path, learner):
+    make_run(tmp_path / "r", learner)
+    made = read_run(tmp_path / "r")
+    metres = evaluate(load_champion(tmp_path / "r/champion.npz"), "curved", traffic=0)["distance_m"]
+    weak = dataclasses.replace(made, figures={**made.figures, "distance_m": metres})
+    assert set(errors_of(weak, "")) == set(ERROR_FIGURES)  # however short: it is no other version's
+    other = dataclasses.replace(made, figures={**made.figures, "distance_m": 10.0 * metres + 10.0})
+    with pytest.raises(ExperimentError, match="another version of GridSim made it"):
+        errors_of(other, "")
+
+
 def test_run_is_read(tmp_path):
     make_run(tmp_path / "a", "dqn", "seamless", 3)
     found = read_run(tmp_path / "a")
@@ -368,6 +379,45 @@ def test_damaged_comparison_is_refused(tmp_path, text):
     (tmp_path / "comparison.json").write_text(text)
     with pytest.raises(ExperimentError, match=r"comparison\.json"):
         open_comparison(tmp_path)
+
+
+def test_a_folder_is_worked_on_by_one_process(tmp_path):
+    experiment.hold(tmp_path / "c")
+    with pytest.raises(ExperimentError, match="another process is at work on it"):
+        experiment.hold(tmp_path / "c")
+    experiment.hold(tmp_path / "d")
+
+
+@pytest.mark.parametrize(("budget", "every"), [("200k", 20_000), ("1G", DqnSettings.evaluate_every)])
+def test_budget_is_looked_at_often_enough(tmp_path, budget, every):
+    (cell,) = Plan(("curved",), ("dqn",), 1, Budget.parse(budget)).cells(tmp_path)
+    settings = settings_of(cell)
+    settings.check()
+    assert isinstance(settings, DqnSettings)
+    assert (settings.car_steps, settings.evaluate_every) == (cell.plan.budget.car_steps, every)
+
+
+def test_a_run_that_was_killed_while_it_began_is_not_in_the_way(tmp_path):
+    (cell,) = Plan(("curved",), ("dqn",), 1, Budget(car_steps=1_000_000)).cells(tmp_path)
+    cell.folder.mkdir()
+    (cell.folder / ".config.json.123.tmp").write_text("{")
+    cell.check()
+    (cell.folder / "thesis.tex").write_text("")
+    with pytest.raises(ExperimentError, match="is in the way and no run"):
+        cell.check()
+
+
+def test_an_unfinished_run_that_was_edited_is_refused(tmp_path):
+    (cell,) = Plan(("curved",), ("dqn",), 1, Budget(car_steps=1_000_000)).cells(tmp_path)
+    settings = dataclasses.replace(settings_of(cell), car_steps=5)
+    cell.folder.mkdir()
+    edited = RunFolder(cell.folder, settings)
+    edited.write_config()
+    meta = dict.fromkeys(settings.counts, 0) | {"solved": False, "digest": edited.digest()}
+    meta["tracking"] = {"uri": "", "key": "", "run_id": None}
+    checkpoint.save(cell.folder / "checkpoint.npz", {}, meta)
+    with pytest.raises(CellError, match=r"is not what comparison[.]json asks for; one of them was edited"):
+        Cells(0, "", "", "gridsim")(cell)
 
 
 def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
@@ -548,17 +598,6 @@ def begin(folder, *arguments):
     )  # fmt: skip
 
 
-def children(pid):
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 def wait_until(condition, timeout_s=240.0):
     end = time.monotonic() + timeout_s
     while not condition():
@@ -576,12 +615,9 @@ def test_a_killed_comparison_goes_on_without_repeating_what_is_finished(tmp_path
     try:
         wait_until(lambda: second.exists() or process.poll() is not None)
         assert process.poll() is None, process.communicate()
-        trainers = children(process.pid)
-        assert trainers
     finally:
         process.kill()
         process.communicate()
-    wait_until(lambda: not any(alive(pid) for pid in trainers), 30)  # nobody goes on writing to the second's folder
     before = {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.iterdir()}
     assert "summary.json" in before
 
