@@ -21,7 +21,7 @@ from evolution.episodes import Episodes, lane_starts
 from evolution.rollout import EPISODE, Limits
 from gridsim.ego import End
 from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
-from gridsim.world import check_worlds
+from gridsim.world import FIELDS, LANE, check_worlds
 
 HELD_OUT_MAPS = 16
 HELD_OUT_EPISODES = 64
@@ -42,6 +42,7 @@ class CurriculumConfig:
     crash_starts: int = 6  # short episodes a generation that start before a crash of a recent leader
     crash_target: float = 120.0  # m, their length
     crash_memory: int = 64  # crashes that are remembered
+    crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
     rewind: int = 64  # control steps before the crash
     racers: int = 24  # members raced on more episodes
     race_episodes: int = 16
@@ -81,11 +82,12 @@ class Curriculum:
         period_s: float,
         traffic: int = 0,
     ):
-        self.config, self.seed, self.build, self.traffic = config, seed, build, traffic
+        self.config, self.seed, self.build = config, seed, build
+        self.traffic, self.crowd = traffic, round(config.crowd * traffic)
         self.goal, self.period = target_m, period_s
         self.goal_steps = round(time_s / period_s)
         self.target = min(config.first_target, target_m)
-        self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), traffic)
+        self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
         self._validation: Episodes | None = None
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
         self.map_seeds = [
@@ -126,7 +128,7 @@ class Curriculum:
         maps = rng.choice(n, count, replace=count > n)
         used = sorted({int(m) for m in maps})
         local = np.array([used.index(int(m)) for m in maps])
-        return used, *lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng, self.traffic)
+        return used, *lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng, self.crowd)
 
     def episodes(self, generation: int) -> Episodes:
         """What every member of a generation meets: new episodes, and some that start before crashes.
@@ -193,11 +195,17 @@ class Curriculum:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
     def validation(self) -> Episodes:
-        """What champions are chosen on, the same for every run of the scenario."""
+        """What champions are chosen on, the same for every run of the scenario: the traffic that is asked for.
+
+        It is driven beside a generation's episodes, so that as many cars belong to it; the others are not there.
+        """
         if self._validation is None:
-            self._validation = spread_starts(
+            maps, rows, worlds = spread_starts(
                 self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation, self.traffic
             )
+            absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
+            absent[:, :, LANE] = -1.0
+            self._validation = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
         return self._validation
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:

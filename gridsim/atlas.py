@@ -13,7 +13,7 @@ from gridsim.roads import Road, freeze
 
 LANE_ARRAYS = (
     "points", "speeds", "offsets", "steps", "successors", "left", "right", "crossing_offsets", "crossings", "clear",
-    "boxes",
+    "room", "boxes",
 )  # fmt: skip
 
 
@@ -92,6 +92,7 @@ def network_of(atlas: Atlas, m: int) -> Network:
         lanes.crossing_offsets[here[1] + m : there[1] + m + 1],
         lanes.crossings[here[2] : there[2]],
         lanes.clear[here[2] : there[2]],
+        lanes.room[here[0] : there[0]],
         lanes.boxes[here[1] : there[1]],
         atlas.sizes[m, 0],
         atlas.sizes[m, 1],

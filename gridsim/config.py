@@ -61,6 +61,9 @@ class TrafficConfig:
     threshold: float = 0.2  # m/s2 to be gained by a change of lanes
     safe_braking: float = 3.0  # m/s2 that a change of lanes may ask of who is behind
     lane_change_speed: float = 1.25  # m/s sideways: three seconds for a lane
+    kerb: float = 1.3  # m that the middle of a car which moves over keeps from the road's edge
+    give_way: float = 0.9  # m to the right that it moves over for who comes the other way, at most
+    taper: float = 0.15  # m a m of way that it moves over
     apart: float = 2.35  # m between the middles of two lanes below which cars on them may touch
     spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
     spawn_gap_ego: float = 22.0  # m between a car and the ego car then

@@ -17,7 +17,7 @@ _F, _I = np.float32, np.int32
 _ZERO, _HALF = _F(0.0), _F(0.5)
 
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
-_CROSSING_TIME = _F(3.0)  # s, what it takes to leave a junction
+_CROSSING_TIME = _F(7.0)  # s, what it takes from a standstill to leave a junction (critical gaps of drivers: 6 to 7)
 _NEAR = _F(7.0)  # m around the ego car where nobody enters a junction
 _AHEAD = _F(0.6)  # cosine of the angle from its heading within which it may get to before long
 

@@ -29,6 +29,7 @@ class Network(NamedTuple):
     crossing_offsets: np.ndarray  # int32 [lanes + 1]
     crossings: np.ndarray  # int32 [c], junction lanes that cross each lane
     clear: np.ndarray  # float32 [c], m along those from which on a car's middle is out of the way
+    room: np.ndarray  # float32 [n], m that a car there can move over to the right for who comes the other way
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y of the box around each lane's points and half its sides
     width: np.float32  # m, of the torus
     height: np.float32
@@ -41,12 +42,13 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
     for lane in range(lanes):
         first, last = offsets[lane], offsets[lane + 1] - 1
         for p in range(first, last + 1):
-            a, b, c = max(p - 2, first), min(max(p, first + 2), last - 2), min(p + 2, last)
+            b = min(max(p, first + 2), last - 2)
+            a, c = b - 2, b + 2
             if last - first < 4:
                 a, b, c = first, (first + last) // 2, last
             ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
             vx, vy = points[c, 0] - points[b, 0], points[c, 1] - points[b, 1]
-            turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy))
+            turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy)) if a < b else 0.0
             length = 0.5 * (math.hypot(ux, uy) + math.hypot(vx, vy))
             speeds[p] = min(top, math.sqrt(lateral * length / max(turn, 1e-6))) if length > 1e-6 else top
     for _ in range(4):  # a bend is felt through the lanes before it
@@ -59,6 +61,27 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
             speeds[last] = onward
             for p in range(last - 1, first - 1, -1):
                 speeds[p] = min(speeds[p], math.sqrt(speeds[p + 1] ** 2 + 2.0 * comfort * steps[lane]))
+
+
+@njit
+def _ease(offsets, steps, successors, slope, room):
+    """Let the room on the right end and begin gently, so many m a m of way, over lanes' ends as well."""
+    lanes = offsets.shape[0] - 1
+    for _ in range(4):
+        for lane in range(lanes):
+            first, last = offsets[lane], offsets[lane + 1] - 1
+            for k in range(successors.shape[1]):
+                if successors[lane, k] >= 0:
+                    onward = offsets[successors[lane, k]]
+                    room[last] = min(room[last], room[onward] + slope * steps[lane])
+            for p in range(last - 1, first - 1, -1):
+                room[p] = min(room[p], room[p + 1] + slope * steps[lane])
+            for p in range(first + 1, last + 1):
+                room[p] = min(room[p], room[p - 1] + slope * steps[lane])
+            for k in range(successors.shape[1]):
+                if successors[lane, k] >= 0:
+                    onward = offsets[successors[lane, k]]
+                    room[onward] = min(room[onward], room[last] + slope * steps[lane])
 
 
 @njit
@@ -89,8 +112,18 @@ def _boxes(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return freeze(np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32))
 
 
-def make_network(lanes: Lanes, width: float, height: float, speed_limit: float, config: TrafficConfig) -> Network:
-    """Tables of a map's lanes; `speed_limit` (m/s) is the scenario's own."""
+def make_network(
+    lanes: Lanes,
+    width: float,
+    height: float,
+    speed_limit: float,
+    config: TrafficConfig,
+    clearances: np.ndarray | None = None,
+) -> Network:
+    """Tables of a map's lanes; `speed_limit` (m/s) is the scenario's own.
+
+    Args: clearances float32 [points], m from each point of the lanes to the road's edge; without, nobody keeps right.
+    """
     f = np.float32
     speeds = np.empty(len(lanes.points), dtype=np.float32)
     clear = np.zeros(len(lanes.crossings), dtype=np.float32)
@@ -102,10 +135,18 @@ def make_network(lanes: Lanes, width: float, height: float, speed_limit: float, 
             points, offsets, steps, freeze(lanes.crossing_offsets), freeze(lanes.crossings), f(width), f(height),
             f(config.apart), clear,
         )  # fmt: skip
-    return network_of_lanes(lanes, freeze(speeds), freeze(clear), width, height)
+    room = np.zeros(len(lanes.points), dtype=np.float32)
+    if clearances is not None and len(lanes):
+        beside = np.maximum(lanes.left, lanes.right) >= 0  # where a lane is beside, that is where one moves over to
+        room = np.clip(clearances - f(config.kerb), 0.0, config.give_way).astype(np.float32)
+        room[np.repeat(beside, np.diff(lanes.offsets))] = 0.0
+        _ease(offsets, steps, successors, f(config.taper), room)
+    return network_of_lanes(lanes, freeze(speeds), freeze(clear), freeze(room), width, height)
 
 
-def network_of_lanes(lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, width: float, height: float) -> Network:
+def network_of_lanes(
+    lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, room: np.ndarray, width: float, height: float
+) -> Network:
     """Tables from what `make_network` computed before; all arrays read-only already."""
     return Network(
         points=lanes.points,
@@ -118,6 +159,7 @@ def network_of_lanes(lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, width:
         crossing_offsets=lanes.crossing_offsets,
         crossings=lanes.crossings,
         clear=clear,
+        room=room,
         boxes=_boxes(lanes.points, lanes.offsets),
         width=np.float32(width),
         height=np.float32(height),

@@ -296,6 +296,15 @@ def clearance(road, x, y):
     return (low + uy * (high - low)) * _F(1.0 / FIELD_UNITS) + _F(FIELD_FLOOR)
 
 
+@njit
+def clearances(road, points):
+    """Signed distances (m), float32 [n], from points [n, 2] to the road's edge, as `clearance` gives them."""
+    found = np.empty(points.shape[0], dtype=np.float32)
+    for k in range(points.shape[0]):
+        found[k] = clearance(road, points[k, 0], points[k, 1])
+    return found
+
+
 def freeze(array: np.ndarray) -> np.ndarray:
     """The array, C-contiguous and read-only: the one form in which kernels are given their inputs."""
     array = np.ascontiguousarray(array)

@@ -27,6 +27,7 @@ from gridsim.roads import (
     Road,
     Strips,
     clearance_nodes,
+    clearances,
     freeze,
     make_road,
 )
@@ -86,6 +87,7 @@ class Scenario:
             **vars(self.strips),
             "speeds": self.network.speeds,
             "clear": self.network.clear,
+            "room": self.network.room,
             "starts": self.starts,
         }
 
@@ -113,7 +115,7 @@ class Scenario:
             ),
             lanes=lanes,
             strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
-            network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], width, height),
+            network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], frozen["room"], width, height),
             torus=bool(torus),
             starts=frozen["starts"],
         )
@@ -193,13 +195,15 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     strips, lanes, width, height = spec.layout(rng)
     nodes = clearance_nodes(strips, width, height)
     lanes = Lanes(**{name: freeze(array) for name, array in vars(lanes).items()})
+    road = make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls)
+    top = TRAFFIC_PACE * sum(spec.speed_interval)
     return Scenario(
         name=name,
         seed=seed,
-        road=make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls),
+        road=road,
         lanes=lanes,
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
-        network=make_network(lanes, width, height, TRAFFIC_PACE * sum(spec.speed_interval), config.traffic),
+        network=make_network(lanes, width, height, top, config.traffic, clearances(road, lanes.points)),
     )
 
 

@@ -2,7 +2,8 @@
 
 Longitudinal motion is the intelligent driver model (Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
 (Kesting, Treiber and Helbing 2007). The ego car is an obstacle like any other, and has the right of way at junctions
-(`junctions.py`). What a car's state holds is in `world.py`, a map's lanes are in `network.py`.
+(`junctions.py`); who meets it keeps to the right (`encounters.py`). What a car's state holds is in `world.py`, a map's
+lanes are in `network.py`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import SimConfig
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.encounters import meets, moved_over, room_beside, runs_into
 from gridsim.jit import leaf, njit
 from gridsim.junctions import CAUTION, may_enter
 from gridsim.network import away, is_junction, lane_length, turned, wrapped
@@ -45,6 +47,7 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 _LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
 _LENGTH = _F(5.0)  # m, added to a car's horizon: another car's middle is further away than its rear
+_EASE = _F(0.12)  # m to the right a m of way that a path is thought to go there
 _SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
 
 
@@ -63,6 +66,7 @@ class Drivers(NamedTuple):
     half_length: np.float32  # m
     half_width: np.float32  # m
     dt: np.float32  # s
+    ego: Constants  # of the ego car, by which its way is foreseen
 
 
 def drivers(sim: SimConfig) -> Drivers:
@@ -81,6 +85,7 @@ def drivers(sim: SimConfig) -> Drivers:
         half_length=f(sim.vehicle.length / 2),
         half_width=f(sim.vehicle.width / 2),
         dt=f(sim.episode.control_period),
+        ego=constants(sim),
     )
 
 
@@ -117,11 +122,13 @@ def _ahead(network, car, other):
 
 
 @leaf
-def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
+def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
     """M from a car's middle along its path to where its way is blocked by a car at (x, y) with a heading; 1e9 if not.
 
-    Looks at points of the path from the car's front on, up to `horizon` m.
+    Looks at points of the path from the car's front on, up to `horizon` m. The path is as far to the right of the lane
+    as the car is now, and goes further there, `more` m a m of way, as far as there is room.
     """
+    right = max(-car[SHIFT], _ZERO)
     half_length = drivers.half_length + drivers.half_width + CAUTION
     half_width = drivers.half_width + drivers.half_width + CAUTION
     lane = _I(car[LANE])
@@ -146,6 +153,9 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon):
                     return _F(1e9)
                 k = first + _N(_I(along / step))
                 px, py = network.points[k, 0], network.points[k, 1]
+                aside_by = min(network.room[k], right + more * travelled)
+                if aside_by > _ZERO:
+                    px, py = moved_over(network, k, k + _N(1) if along + step <= length else k - _N(1), aside_by)
                 dx, dy = turned(px - x, network.width), turned(py - y, network.height)
                 forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
@@ -177,15 +187,18 @@ def follow(network, drivers, car, other, is_ego):
         looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
     if not looked:
         near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
-        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near)
+        more = _EASE if is_ego and meets(network, car, other) else _ZERO
+        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, more)
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
-    same_way = car[COS] * other[COS] + car[SIN] * other[SIN] > _HALF
-    if is_ego and not looked and same_way and other[SPEED] > _ONE and forward > _ZERO:
-        # Where the ego car will be in a second: it may be about to cut in.
-        x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
-        near = min(car[HORIZON], car[GAP])
-        at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near)
+    if is_ego and not looked and other[SPEED] > _ONE:
+        if car[COS] * other[COS] + car[SIN] * other[SIN] <= _HALF:
+            at = runs_into(network, drivers, car, other)
+        elif forward > _ZERO:
+            # Where the ego car will be in a second: it may be about to cut in.
+            x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
+            near = min(car[HORIZON], car[GAP])
+            at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, _ZERO)
         if at < car[GAP]:
             car[GAP], car[LEAD] = at, along
 
@@ -322,19 +335,21 @@ def _choose_neighbour(network, drivers, world, i, ego):
 
 
 @leaf
-def _go(network, drivers, car):
-    """Move one car by its acceleration for a control period."""
+def _go(network, drivers, car, ego):
+    """Move one car by its acceleration for a control period, and to the right or back by how it meets the ego car."""
     after = max(car[SPEED] + car[PACE] * drivers.dt, _ZERO)
     car[ALONG] += _HALF * (car[SPEED] + after) * drivers.dt
     car[SPEED] = after
-    sway = _ZERO
-    if car[SHIFT] != _ZERO:
-        slide = min(drivers.shift * drivers.dt, abs(car[SHIFT])) * min(after, _ONE)
-        if car[SHIFT] > _ZERO:
+    sway, place = _ZERO, _ZERO
+    if meets(network, car, ego):
+        place = -room_beside(network, car)
+    if car[SHIFT] != place:
+        slide = min(drivers.shift * drivers.dt, abs(car[SHIFT] - place)) * min(after, _ONE)
+        if car[SHIFT] > place:
             slide = -slide
         car[SHIFT] += slide
-        if abs(car[SHIFT]) < _F(1e-3):
-            car[SHIFT] = _ZERO
+        if abs(car[SHIFT] - place) < _F(1e-3):
+            car[SHIFT] = place
         sway = slide / max(after * drivers.dt, _F(0.1))
         sway = min(max(sway, _F(-0.2)), _F(0.2))
     length = lane_length(network, _I(car[LANE]))
@@ -354,8 +369,8 @@ def _go(network, drivers, car):
 def flow(network, drivers, world, ego):
     """One control period of a world's traffic around the ego car as it was before its own move.
 
-    Args: world [cars, FIELDS], changed; ego, a car of which X to SPEED are read (without a heading, COS and SIN 0, it
-    is not there).
+    Args: world [cars, FIELDS], changed; ego, a car of which X to STEERING are read (without a heading, COS and SIN 0,
+    it is not there).
     """
     cars = world.shape[0]
     _see(network, drivers, world, ego)
@@ -380,4 +395,4 @@ def flow(network, drivers, world, ego):
             change_lanes(network, drivers, world, i, ego)
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
-            _go(network, drivers, world[i])
+            _go(network, drivers, world[i], ego)

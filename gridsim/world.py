@@ -1,7 +1,8 @@
 """Worlds: the other cars around one ego car, where they are on their lanes, and how they get there.
 
 A world is float32 [cars, FIELDS], the fields below. Whatever happens in it follows from that array and from the ego
-car alone. A car is on rails: its centre of mass lies on its lane, shifted sideways while it changes lanes.
+car alone. A car is on rails: its centre of mass lies on its lane, shifted sideways while it changes lanes or meets
+the ego car.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ ALONG = 6  # m along it
 NEXT, AFTER = 7, 8  # the two lanes that come then
 PAST = 9  # junction lane that its rear may still be on, or -1
 PERMIT = 10  # junction lane that it may enter next, or -1
-SHIFT = 11  # m to the left of its lane, while it changes lanes
+SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
 FACTOR = 12  # desired speed over the lane's
 SEED = 13  # of its turns, below 2 ** 24
 TURNS = 14  # lanes it has chosen so far

@@ -19,6 +19,8 @@ from gridsim.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=2, elites=2, parents=8, seed=9)
 
+CROWD = 6  # cars in training
+
 
 @pytest.fixture(scope="module")
 def maps():
@@ -89,7 +91,7 @@ def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     arrays, _ = load(halfway)
     worlds = arrays["crash_worlds"]
     assert len(worlds) == len(arrays["crashes"]) > 0
-    assert worlds.shape[1:] == (3, FIELDS)
+    assert worlds.shape[1:] == (CROWD, FIELDS)
     assert (worlds[..., LANE] >= 0).any()
     evolution = begin(maps)
     evolution.restore(*load(halfway))
@@ -98,6 +100,18 @@ def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     remembered = {world.tobytes() for world in worlds}
     assert all(world.tobytes() in remembered for world in episodes.worlds[-starts:])
     assert len(episodes.worlds) == len(episodes.rows)
+
+
+def test_training_is_among_more_cars_than_validation(maps):
+    """Twice as many as were asked for; champions are chosen, and measured, among those that were."""
+    curriculum = begin(maps).curriculum
+    for episodes in (curriculum.episodes(0), curriculum.race(0)):
+        assert episodes.worlds.shape[1:] == (CROWD, FIELDS)
+        assert (episodes.worlds[..., LANE] >= 0).mean() > 0.95
+    there = curriculum.validation().worlds[..., LANE] >= 0
+    assert there.shape[1] == CROWD  # it is driven beside training's
+    assert (there.sum(axis=1) <= SETTINGS.traffic).all()
+    assert there[:, : SETTINGS.traffic].mean() > 0.95
 
 
 @pytest.mark.parametrize(

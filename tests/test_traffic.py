@@ -11,12 +11,14 @@ from scipy import stats
 
 from gridsim.boxes import boxes_touch
 from gridsim.config import SimConfig, constants
+from gridsim.ego import STEERING
 from gridsim.jit import njit
 from gridsim.lanes import Path, lay_lanes
 from gridsim.network import make_network, wrapped
-from gridsim.roads import freeze
+from gridsim.roads import clearances, freeze
 from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.traffic import drivers, flow, idm
+from gridsim.vehicle import path_curvature
 from gridsim.world import AFTER, ALONG, COS, FACTOR, FIELDS, LANE, NEXT, PAST, PERMIT, SHIFT, SIN, SPEED, X, Y, spawn
 
 F = np.float32
@@ -192,6 +194,107 @@ def test_the_ego_car_beside_the_lane_is_passed(ring):
     history = watch(ring, cars_on(ring, (0, 400.0, 12.0, 1.0)), 20, ego(500.0, 32.0 + 2.6))
     assert history[-1, 0, ALONG] == pytest.approx(640.0, abs=1.0)
     assert history[:, 0, SPEED].min() > 11.9
+
+
+@pytest.mark.parametrize("heading", np.arange(8) * math.pi / 4)
+@pytest.mark.parametrize("radius", [math.inf, 16.0, -16.0])
+def test_lanes_are_as_fast_as_their_bends_allow(heading, radius):
+    """All along the lanes of a loop, their ends included, whichever way they point: the limit, or sqrt(a R)."""
+    if math.isinf(radius):  # round the torus
+        piece = (128.0 if heading % (math.pi / 2) == 0.0 else 128.0 * math.sqrt(2.0), 0.0)
+        dx, dy = piece[0] * math.cos(heading), piece[0] * math.sin(heading)
+        paths = [Path(k * dx, k * dy, heading, (piece,)) for k in range(2)]
+    else:
+        piece = (math.pi / 2 * abs(radius), 1.0 / radius)
+        at = [(heading + k * math.copysign(math.pi / 2, radius)) for k in range(4)]
+        paths = [Path(100.0 + radius * math.sin(h), 100.0 - radius * math.cos(h), h, (piece,)) for h in at]
+    network = network_of(paths, 256.0, 256.0)
+    fastest = min(12.0, math.sqrt(CONFIG.traffic.lateral * abs(radius)))
+    assert network.speeds == pytest.approx(fastest, rel=2e-3)
+
+
+@pytest.fixture(scope="module")
+def narrow():
+    """A road of two lanes along x, eastwards at y = 30.25 and westwards at 33.75, 4 m either side of its middle."""
+    paths = [Path(0.0, 30.25, 0.0, ((1024.0, 0.0),)), Path(1024.0, 33.75, math.pi, ((1024.0, 0.0),))]
+    lanes = lay_lanes(paths, 1024.0, 64.0)
+    for array in vars(lanes).values():
+        freeze(array)
+    beside = (4.0 - np.abs(lanes.points[:, 1] - 32.0)).astype(F)
+    return make_network(lanes, 1024.0, 64.0, 8.5, CONFIG.traffic, beside)
+
+
+@pytest.mark.parametrize("lane", [0, 1])
+def test_who_meets_the_ego_car_keeps_to_the_right_and_passes(narrow, lane):
+    """The ego car comes along the middle of the road, on a car's own half; they pass, and the car goes back."""
+    world = cars_on(narrow, (lane, 400.0, 8.0, 1.0))
+    ahead = 1.0 - 2.0 * lane
+    car = ego(world[0, X] + 80.0 * ahead, 32.0, math.pi * (1 - lane), 6.0)
+    right, speeds = [], []
+    for _ in range(300):
+        flow(narrow, D, world, car)
+        car[X] -= 6.0 * DT * ahead
+        dx = wrapped(F(car[X] - world[0, X]), narrow.width)
+        assert not boxes_touch(K, dx, car[Y] - world[0, Y], world[0, COS], world[0, SIN], car[COS], car[SIN])
+        right.append((abs(float(world[0, Y]) - 32.0) - 1.75, abs(dx)))
+        speeds.append(world[0, SPEED])
+    aside, apart = np.array(right).T
+    assert aside[apart > 36.0] == pytest.approx(0.0, abs=0.2)
+    assert aside[apart < CONFIG.vehicle.length] == pytest.approx(CONFIG.traffic.give_way, abs=1e-3)
+    assert aside[-1] == 0.0
+    assert min(speeds) > 7.0  # nobody has to wait
+    assert np.abs(np.diff(aside)).max() < CONFIG.traffic.lane_change_speed * DT + 1e-3
+
+
+def test_nobody_keeps_further_right_than_there_is_room():
+    for name in ("seamless", "roundabout", "city", "curved", "highway"):
+        scenario = build(name, 3)
+        network, width, traffic = scenario.network, CONFIG.vehicle.width, CONFIG.traffic
+        room = network.room
+        first = np.setdiff1d(np.arange(len(room)), network.offsets[1:] - 1)
+        along = network.points[first + 1] - network.points[first]
+        along /= np.hypot(*along.T)[:, None]
+        right = network.points[first] + room[first, None] * np.stack([along[:, 1], -along[:, 0]], axis=1)
+        kerb = clearances(scenario.road, freeze(right.astype(F)))
+        assert (room >= 0.0).all()
+        assert (kerb[room[first] > 0] >= traffic.kerb - 0.02).all()
+        assert traffic.kerb > width / 2
+        assert room.max() == (0.0 if name == "highway" else pytest.approx(traffic.give_way))
+        # Gently, from lane to lane as well.
+        steps = np.repeat(network.steps, np.diff(network.offsets))
+        assert (np.abs(np.diff(room))[first] <= traffic.taper * steps[first] + 1e-4).all()
+        for lane, onward in np.argwhere(network.successors >= 0):
+            after = network.successors[lane, onward]
+            gap = abs(room[network.offsets[lane + 1] - 1] - room[network.offsets[after]])
+            assert gap <= traffic.taper * network.steps[lane] + 1e-4
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.25])
+@pytest.mark.parametrize("late", np.arange(-1.5, 0.1, 0.5))
+def test_a_car_in_a_junction_foresees_the_ego_car(crossing, turn, late):
+    """The ego car comes northwards, up to 1.5 s before a car on the eastern way is where these cross, straight on or
+    on the arc that it steers; they never touch, and they do where nobody looks ahead."""
+    radius = 1.0 / float(path_curvature(K, F(6.0), F(turn))) if turn else math.inf
+
+    def drive(foresees):
+        world = cars_on(crossing, (1, 0.0, 7.0, 1.0))
+        touched = False
+        for step in range(60):
+            way = 6.0 * (step * DT - 8.0 / 7.0 - late)  # m of the ego car's to where it crosses the car's lane
+            x, y, heading = (128.0, 128.0 + way, math.pi / 2)
+            if turn:
+                angle = way / radius
+                x, y = 128.0 - radius * (1.0 - math.cos(angle)), 128.0 + radius * math.sin(angle)
+                heading += angle
+            car = ego(x, y, heading, 6.0)
+            car[STEERING] = turn
+            flow(crossing, D, world, car if foresees else NOBODY)
+            dx, dy = car[X] - world[0, X], car[Y] - world[0, Y]
+            touched |= boxes_touch(K, dx, dy, world[0, COS], world[0, SIN], car[COS], car[SIN])
+        return touched
+
+    assert not drive(True)
+    assert drive(False) == (late > -1.25)
 
 
 # --- Junctions -------------------------------------------------------------------------------------------------------
