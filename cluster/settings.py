@@ -202,8 +202,8 @@ class DqnSettings(RunSettings):
     """Transitions of one update."""
     updates: float = 4.0
     """Updates for each thousand car-steps collected."""
-    replay: int = 1_000_000
-    """Observations that the replay buffer holds."""
+    replay: int = 0
+    """Observations that the replay buffer holds; 0: a million, of grids a hundred thousand."""
     prioritised: bool = False
     """Draw transitions by their errors (Schaul et al. 2016) in place of uniformly."""
     double: bool = True
@@ -223,6 +223,11 @@ class DqnSettings(RunSettings):
     2018)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the learner computes: auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.replay:
+            object.__setattr__(self, "replay", 1_000_000 if self.observation == "rays" else 100_000)
 
     @property
     def algorithm(self) -> str:
