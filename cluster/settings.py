@@ -189,7 +189,7 @@ class DqnSettings(RunSettings):
     """Network of the Q function: mlp: and the sizes of its hidden layers, with +steering if it sees how its own wheels
     stand, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
     layer and the number of frames, by default cnn:16,32,256@4."""
-    car_steps: int = 60_000_000
+    car_steps: int = 40_000_000
     """Car-steps at most, checked after each evaluation; 0: any number."""
     episodes: int = 0
     """Training episodes at most, checked after each evaluation; 0: any number."""
@@ -214,7 +214,7 @@ class DqnSettings(RunSettings):
     """Discount factor of a step."""
     learning_rate: float = 5e-4
     """Of Adam, at the start; it falls to a twentieth over --anneal."""
-    anneal: int = 20_000_000
+    anneal: int = 30_000_000
     """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth."""
     target_period: int = 500
     """Updates from one copy of the target network to the next."""
