@@ -14,7 +14,7 @@ ARGS   ?=
 PORT   ?= 5000
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve test ui bench pictures lint format
+.PHONY: help install evolve dqn compare test ui bench pictures lint format
 
 help: ## This list
 	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
@@ -25,6 +25,12 @@ install: $(STAMP) ## Create .venv and install into it (the others do so by thems
 
 evolve: $(STAMP) ## Evolve a driver; ARGS="--workers 2 --seed 3" are passed on, ARGS=--help lists them
 	@$(BIN)/gridsim-evolve $(ARGS)
+
+dqn: $(STAMP) ## Train a driver by deep Q-learning instead; ARGS as above
+	@$(BIN)/gridsim-dqn $(ARGS)
+
+compare: $(STAMP) ## Compare the learners on all roads, up to an hour; ARGS=--quick takes minutes
+	@$(BIN)/gridsim-compare $(ARGS)
 
 test: $(STAMP) ## Run all tests; ARGS='-m "not e2e"' leaves out those with real Ray workers
 	$(BIN)/python -m pytest $(ARGS)

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 
-from cluster.coordinator import Maps, held_out_episodes
+from cluster.learning import Maps, held_out_episodes
 from gridsim.config import SimConfig
 from gridsim.ego import DISTANCE, PACED, End
 from gridsim.reference import ReferenceDriver

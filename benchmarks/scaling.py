@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from cluster.coordinator import Maps
+from cluster.learning import Maps
 from cluster.pool import WorkerPool
 from cluster.ray_pool import RayPool
 from cluster.run import Session, make_tracker, new_run
@@ -62,17 +62,17 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dic
     pool = RayPool(2, maps.build)
     states: deque[tuple[dict[str, np.ndarray], dict[str, Any]]] = deque(maxlen=LAST + 1)
     this = session(folder, "whole", settings, pool, maps)
-    compile_kernels(settings.policy, settings.traffic)
+    compile_kernels(settings.policy, settings.traffic, settings.command)
 
     def keep(generation: int, row: dict[str, float]) -> None:
-        arrays, meta = this.evolution.state()
+        arrays, meta = this.learning.state()
         states.append(({k: v.copy() for k, v in arrays.items()}, meta))
         if sys.stderr.isatty():
             print(f"\rdefault run: generation {generation} ", end="", file=sys.stderr, flush=True)
 
     this.on_row = keep
     try:
-        this.evolve()
+        this.learn()
     finally:
         pool.close()
         this.tracker.close("FINISHED")
@@ -89,28 +89,28 @@ def last_generations(
     """Evolve LAST generations from a state. Returns figures of each."""
     pool = RayPool(workers, maps.build)
     this = session(folder, f"last-{workers}", settings, pool, maps)
-    this.evolution.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
-    compile_kernels(settings.policy, settings.traffic)
+    this.learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
+    compile_kernels(settings.policy, settings.traffic, settings.command)
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
     begun = 0.0
 
     def measure(generation: int, row: dict[str, float]) -> None:
         nonlocal begun
         end = time.perf_counter()
-        outcomes = this.evolution.outcomes
+        outcomes = this.learning.outcomes
         busiest = sum(max(o.busy_s.values()) for o in outcomes)
         main = outcomes[0]
         figures["wall"].append(end - begun)
         figures["overhead"].append(end - begun - busiest)
         figures["bytes"].append((main.bytes_down + main.bytes_up) / settings.population)
         figures["broadcast"].append(sum(o.broadcast_bytes for o in outcomes))
-        this.evolution.solved = len(figures["wall"]) > LAST
+        this.learning.solved = len(figures["wall"]) > LAST
         begun = time.perf_counter()
 
     this.on_row = measure
     try:
         begun = time.perf_counter()
-        this.evolve()
+        this.learn()
     finally:
         pool.close()
         this.tracker.close("FINISHED")

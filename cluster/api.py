@@ -10,7 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from cluster.champion import Champion, evaluate, load_champion
-from cluster.coordinator import Evolution, Maps
+from cluster.coordinator import Evolution
+from cluster.learning import Maps
 from cluster.pool import SerialPool, WorkerPool
 from cluster.settings import EvolveSettings
 from gridsim.config import SimConfig
@@ -57,6 +58,7 @@ def evolve(
             row = evolution.step()
             if on_generation:
                 on_generation(evolution.generation, row)
+        evolution.conclude()
         assert evolution.champion is not None
         champion = Champion(
             evolution.champion.genome, settings.policy, settings.scenario, evolution.sim, settings.traffic

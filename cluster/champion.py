@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import os
 from dataclasses import dataclass
 from typing import Any
@@ -17,10 +18,11 @@ import numpy as np
 
 from cluster import checkpoint
 from cluster.checkpoint import CheckpointError
-from cluster.coordinator import Maps, summarise
+from cluster.learning import Maps, summarise
 from cluster.settings import MAX_TRAFFIC
 from evolution import convnet
 from evolution.curriculum import HELD_OUT_MAPS, spread_starts
+from evolution.episodes import Episodes
 from evolution.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from evolution.rollout import Limits
 from evolution.rollout import evaluate as roll_out
@@ -59,9 +61,9 @@ class Champion:
     def act(self, observation: np.ndarray, speed: float | np.ndarray | None = None) -> int | np.ndarray:
         """The action for an observation, or actions [n] for n of them.
 
-        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed. Of the grid, what
-        `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which a grid does not show:
-        the environment's `info["speed_mps"]`.
+        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed, and what else it may see
+        (`make_env` gives it). Of the grid, what `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the
+        speed in m/s, which a grid does not show: the environment's `info["speed_mps"]`.
         Raises: ValueError with one line for an observation that this champion does not see.
         """
         spec = PolicySpec.parse(self.policy)
@@ -75,6 +77,7 @@ class Champion:
             observation,
             self.sim.sensors.range,
             self.sim.vehicle.speed_limit,
+            math.radians(self.sim.vehicle.steering_limit),
         )
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:
@@ -86,7 +89,7 @@ class Champion:
         if isinstance(spec, CnnSpec):
             sees["frames"] = spec.frames
         elif isinstance(spec, MlpSpec):
-            sees["motion"] = spec.motion
+            sees |= {"motion": spec.motion, "steering": spec.steering}
         if scenario in (None, self.scenario):
             sees["traffic"] = self.traffic
         return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **{**sees, **options})
@@ -140,28 +143,33 @@ def evaluate(
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
     name = scenario or champion.scenario
-    check_name(name)
-    if episodes < 1:
-        raise ValueError(f"episodes must be 1 or more, not {episodes}")
-    if traffic is not None and not 0 <= traffic <= MAX_TRAFFIC:
-        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     maps = Maps(name, champion.sim)
     try:
-        if traffic is None:
-            traffic = champion.traffic if name == champion.scenario else default_traffic(name)
-        held_out = spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)
+        chosen = held_out(champion, maps, name, episodes, seed, traffic)
         episode = champion.sim.episode
         limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
-        scenarios = [maps.get(s) for s in held_out.maps]
+        scenarios = [maps.get(s) for s in chosen.maps]
         results = roll_out(
             PolicySpec.parse(champion.policy),
             champion.genome[None],
             scenarios,
-            held_out.rows,
+            chosen.rows,
             limits,
             champion.sim,
-            worlds=held_out.worlds,
+            worlds=chosen.worlds,
         )[0]
         return summarise(results[0], episode.control_period)
     finally:
         maps.close()
+
+
+def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int, traffic: int | None) -> Episodes:
+    """The episodes that `evaluate` drives. Raises: ValueError as it does."""
+    check_name(name)
+    if episodes < 1:
+        raise ValueError(f"episodes must be 1 or more, not {episodes}")
+    if traffic is None:
+        traffic = champion.traffic if name == champion.scenario else default_traffic(name)
+    if not 0 <= traffic <= MAX_TRAFFIC:
+        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
+    return spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 VERSION = 1
-MAX_BYTES = 1 << 30
+MAX_BYTES = 1 << 32
 """The largest file, in bytes, that is written or read."""
 MAX_ARRAYS = 1024
 
@@ -122,7 +122,12 @@ def _add(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(array))
     # A fixed time, so that the same content gives the same bytes.
-    archive.writestr(zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0)), header.getvalue() + array.tobytes())
+    info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+    info.file_size = len(header.getvalue()) + array.nbytes  # whether its entry must be a large one
+    with archive.open(info, "w") as member:
+        member.write(header.getvalue())
+        if array.size:
+            member.write(array.reshape(-1).view(np.uint8).data)  # no copy: a replay has gigabytes
 
 
 def _read(path: str | os.PathLike[str]) -> bytes:

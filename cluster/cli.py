@@ -15,21 +15,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
+import numpy as np
 import tyro
 from rich.console import Console
 
-from cluster.settings import EvolveSettings, SettingsError
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError
 from gridsim.scenarios import is_map_file
 
 if TYPE_CHECKING:
-    from cluster.coordinator import Maps
+    from cluster.learning import Maps
     from cluster.pool import WorkerPool
     from cluster.run import RunFolder
     from cluster.tracking import Tracker
     from cluster.warm import Warming
 
 T = TypeVar("T")
-FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
+FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 MAX_WORKERS = 10_000
 
 
@@ -43,12 +44,8 @@ def cores() -> int:
 
 
 @dataclass(frozen=True)
-class EvolveFlags(EvolveSettings):
-    """Evolve a driver: a genetic algorithm over neural networks, its population evaluated in parallel.
-
-    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
-    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
-    """
+class RunFlags:
+    """Where a learner's run is computed, kept and logged."""
 
     workers: int = field(default_factory=cores)
     """Worker processes; 0 evaluates in this process."""
@@ -69,9 +66,27 @@ class EvolveFlags(EvolveSettings):
     experiment: str = "gridsim"
     """MLflow's experiment."""
 
-    def settings(self) -> EvolveSettings:
-        """What decides the champion."""
-        return EvolveSettings(**{f.name: getattr(self, f.name) for f in dataclasses.fields(EvolveSettings)})
+
+@dataclass(frozen=True)
+class EvolveFlags(RunFlags, EvolveSettings):
+    """Evolve a driver: a genetic algorithm over neural networks, its population evaluated in parallel.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
+    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+
+@dataclass(frozen=True)
+class DqnFlags(RunFlags, DqnSettings):
+    """Train a driver by deep Q-learning: the workers collect experience while the learner trains on what they brought.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
+    curves, on the same axes as those of gridsim-evolve. The champion is the network that did best on validation. It
+    depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+
+Flags = EvolveFlags | DqnFlags
 
 
 @dataclass(frozen=True)
@@ -88,6 +103,10 @@ class EvaluateFlags:
     """How many; the default 64 are the held-out episodes of every run."""
     seed: int = 2_000_000
     """Seed of the first map; those of held-out maps begin at 2,000,000."""
+    errors: bool = False
+    """Also its velocity and steering errors against the reference driver."""
+    reference: str = ""
+    """A drive.csv of gridsim-drive: errors against that drive, on its map and in its traffic, in place of --errors."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -138,7 +157,7 @@ class Stopped(BaseException):
 
 
 @contextlib.contextmanager
-def _stoppable() -> Iterator[None]:
+def stoppable() -> Iterator[None]:
     """SIGTERM raises Stopped in the main thread, as Ctrl-C raises KeyboardInterrupt."""
 
     def stop(*_: object) -> None:
@@ -162,20 +181,29 @@ def _undisturbed() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-# ------------------------------------------------------------------------------------------------------------ evolve
+# ------------------------------------------------------------------------------------------------------------- learn
 
 
 def evolve_main() -> None:
     """Entry point of `gridsim-evolve`."""
+    _learn_main(EvolveFlags)
+
+
+def dqn_main() -> None:
+    """Entry point of `gridsim-dqn`."""
+    _learn_main(DqnFlags)
+
+
+def _learn_main(kind: type[Flags]) -> None:
     started = time.perf_counter() - process_age_s()
     try:
-        with _stoppable():
-            sys.exit(_evolve(sys.argv[1:], started))
+        with stoppable():
+            sys.exit(_learn(kind, sys.argv[1:], started))
     except KeyboardInterrupt:  # before there was anything to save
-        print("gridsim-evolve: stopped", file=sys.stderr)
+        print(f"{kind.command}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except Stopped:
-        sys.exit(143)
+        sys.exit(TERMINATED)
 
 
 def _given(arguments: Sequence[str], flag: str) -> str:
@@ -189,17 +217,17 @@ def _given(arguments: Sequence[str], flag: str) -> str:
     return value
 
 
-def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
+def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     """Flags and the run's folder, checked; nothing is written yet. Raises UsageError."""
     from cluster import run as runs
     from cluster.champion import load_champion
     from cluster.checkpoint import CheckpointError
     from evolution.policy import PolicySpec
 
-    prog = "gridsim-evolve"
+    prog = kind.command
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
     if {"-h", "--help"} & set(arguments) or not (resume or config):
-        flags = parse(EvolveFlags, prog, arguments)
+        flags = parse(kind, prog, arguments)
     elif resume and config:
         raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
     else:
@@ -211,10 +239,12 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
                 settings, init = runs.read_config(Path(config))
         except runs.RunError as error:
             raise UsageError(str(error)) from error
-        base = EvolveFlags(**dataclasses.asdict(settings), init=init)
+        if settings.command != prog:
+            raise UsageError(f"{resume or config} is a run of {settings.command}; give it to that command")
+        base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
-        flags = parse(EvolveFlags, prog, arguments, base)
+        flags = parse(kind, prog, arguments, base)
     if flags.traffic and is_map_file(flags.scenario):
         print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
         flags = dataclasses.replace(flags, traffic=0)
@@ -223,8 +253,8 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
     if flags.workers == 0 and flags.address:
         raise UsageError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
     if resume:
-        for f in dataclasses.fields(EvolveFlags):
-            if f.name in ("workers", "address", "tracking_uri", "experiment", "generations"):
+        for f in dataclasses.fields(kind):
+            if f.name in ("workers", "address", "tracking_uri", "experiment", *kind.unbound):
                 continue
             now, then = getattr(flags, f.name), getattr(base, f.name)
             if f.name == "output":
@@ -233,15 +263,13 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
                 raise UsageError(
                     f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
                 )
-        done = run.saved[1]["generation"]  # type: ignore[index]
-        if flags.generations < run.settings.generations and flags.generations <= done:
-            # Champions are looked for while a generation is the last; nothing can be made of one that was not.
-            raise UsageError(f"--generations {flags.generations}: the run has done {done} already; give more")
-        run.settings = flags.settings()
+        run.settings = settings_of(flags)
         run.settings.check()
+        _check_device(flags)
         return flags, run
-    settings = flags.settings()
+    settings = settings_of(flags)
     settings.check()
+    _check_device(flags)
     digest = ""
     if flags.init:
         try:
@@ -250,6 +278,8 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
             raise UsageError(f"--init {error}") from error
         if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
             raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
+        if not np.isfinite(champion.genome).all():
+            raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
         digest = champion.sha256
     try:
         return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
@@ -257,21 +287,43 @@ def _prepare(arguments: Sequence[str]) -> tuple[EvolveFlags, RunFolder]:
         raise UsageError(str(error)) from error
 
 
-def _evolve(arguments: Sequence[str], started: float) -> int:
+def _check_device(flags: Flags) -> None:
+    """Raises UsageError for a device that is not there."""
+    if isinstance(flags, DqnFlags) and flags.device == "cuda":
+        from evolution.dqn import device_of
+
+        try:
+            device_of(flags.device)
+        except ValueError as error:
+            if flags.resume:
+                raise UsageError(
+                    f"{flags.resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
+                ) from error
+            raise UsageError(f"--device {flags.device}: {error}") from error
+
+
+def settings_of(flags: Flags) -> RunSettings:
+    """What decides the champion."""
+    kind = EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings
+    return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})
+
+
+def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
     from cluster import tracking
 
-    prog = "gridsim-evolve"
+    prog = kind.command
     console = Console()
     try:
-        flags, run = _prepare(arguments)
+        flags, run = _prepare(kind, arguments)
         from cluster import warm
-        from cluster.coordinator import Maps
+        from cluster.learning import Maps
         from cluster.pool import PoolError, SerialPool
         from cluster.run import is_finished, make_tracker
         from gridsim.config import SimConfig
 
         if is_finished(run):
-            console.print(f"{run.path} is finished: {run.saved[1]['generation']} generations; nothing to do.")  # type: ignore[index]
+            first = kind.counts[0]
+            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; nothing to do.", soft_wrap=True)  # type: ignore[index]
             return 0
         saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
         uri = tracking.check_uri(flags.tracking_uri or saved or None)
@@ -303,20 +355,23 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
     status: tracking.Status = "FAILED"
     code = FAILED
     message = ""
+    again = f"continue with: {prog} --resume {_shown(run.path)}"
     try:
         message = _run(console, run, pool, maps, tracker, flags, started, warming)
         status, code = "FINISHED", 0
     except KeyboardInterrupt:
         status, code = "KILLED", INTERRUPTED
     except Stopped:
-        status, code = "KILLED", 143
+        status, code = "KILLED", TERMINATED
     except Exception as error:
         from cluster.checkpoint import CheckpointError
         from evolution.curriculum import CrashError
 
-        if not isinstance(error, PoolError | CheckpointError | CrashError | MemoryError | OSError):
+        if not isinstance(error, PoolError | CheckpointError | CrashError | FloatingPointError | MemoryError | OSError):
             raise
         message = str(error) or type(error).__name__
+        if isinstance(error, FloatingPointError):  # to go on would be to come to the same
+            again = f"repeat it with: {prog} --config {_shown(run.path)}/config.json --learning-rate ..."
     finally:
         with _undisturbed():
             if status == "KILLED":
@@ -329,24 +384,24 @@ def _evolve(arguments: Sequence[str], started: float) -> int:
         print(f"{prog}: warning: {lost}", file=sys.stderr)
     resumable = (run.path / "checkpoint.npz").is_file()
     if status == "KILLED":
-        where = f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "no generation was done yet"
+        where = again if resumable else f"no {kind.counts[0]} was done yet"
         print(f"{prog}: stopped; {where}", file=sys.stderr)
         if not resumable:
             _discard(made)
     elif status == "FAILED":
         if not resumable:
             _discard(made)
-        fail(prog, message, f"continue with: {prog} --resume {_shown(run.path)}" if resumable else "", FAILED)
+        fail(prog, message, again if resumable else "", FAILED)
     else:
         console.print(message)
     return code
 
 
 def _run(
-    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: EvolveFlags,
+    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: Flags,
     started: float, warming: Warming,
 ) -> str:  # fmt: skip
-    """Evolve and finish. Returns the closing words."""
+    """Learn and finish. Returns the closing words."""
     from cluster import progress, report, warm
     from cluster.champion import load_champion
     from cluster.run import Session
@@ -357,13 +412,13 @@ def _run(
     if warming.processes:
         with console.status("compiling the simulator for this machine, once (some 10 s)"):
             warming.wait()
-    maps.ahead(session.evolution.curriculum.map_seeds[:3])
-    warm.compile_kernels(run.settings.policy, run.settings.traffic)  # before workers need them: never twice
+    maps.ahead(session.learning.curriculum.map_seeds[:3])
+    warm.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
     run.write_config()
     with progress.Progress(console, session, _shown(run.path)) as shown:
         session.on_row = shown.row
-        session.evolution.on_progress = shown.members
-        session.evolve()
+        session.learning.on_progress = shown.members
+        session.learn()
         shown.note("measuring and filming the champion on held-out roads")
         summary = session.finish(flags.workers)
         shown.note("logging to MLflow")
@@ -373,11 +428,12 @@ def _run(
         session.write_summary(summary)
         tracker.log_artifacts(run.path)
     if session.lost:
-        print(f"gridsim-evolve: warning: {session.lost}", file=sys.stderr)
+        print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
     console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))
     found = "solved" if summary["solved"] else "the best so far"
+    name = session.learning.step_name
     return (
-        f"{found} after {summary['generations']} generations, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
+        f"{found} after {summary[name + 's']} {name}s, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
         f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
         f"watch it: gridsim-watch {_shown(run.path)}\ncompare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
     )
@@ -420,23 +476,30 @@ def evaluate_main() -> None:
         flags = parse(EvaluateFlags, prog, sys.argv[1:])
         from cluster.champion import evaluate, load_champion
         from cluster.checkpoint import CheckpointError
+        from cluster.errors import errors
 
         path = Path(flags.champion)
         try:
             champion = load_champion(path / "champion.npz" if path.is_dir() else path)
             traffic = None if flags.traffic == -1 else flags.traffic
-            figures = evaluate(champion, flags.scenario or None, flags.episodes, flags.seed, traffic)
+            chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
+            missed = None
+            if flags.errors or flags.reference:  # first: a wrong --reference is told at once
+                missed = errors(champion, *chosen, flags.reference or None).figures()
+            figures = evaluate(champion, *chosen)
         except (CheckpointError, ValueError) as error:
             fail(prog, str(error))
         if flags.json:
             import json
 
-            print(json.dumps(figures))
+            print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         else:
-            from cluster.report import held_out_table
+            from cluster.report import errors_table, held_out_table
 
             title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
             Console().print(held_out_table(title, figures))
+            if missed is not None:
+                Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
     except KeyboardInterrupt:
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)

@@ -19,6 +19,11 @@ def evolve_main() -> None:
     _enter("evolve_main")
 
 
+def dqn_main() -> None:
+    """Run `gridsim-dqn`."""
+    _enter("dqn_main")
+
+
 def evaluate_main() -> None:
     """Run `gridsim-evaluate`."""
     _enter("evaluate_main")
@@ -32,3 +37,8 @@ def watch_main() -> None:
 def drive_main() -> None:
     """Run `gridsim-drive`."""
     _enter("drive_main", "cluster.watch")
+
+
+def compare_main() -> None:
+    """Run `gridsim-compare`."""
+    _enter("compare_main", "cluster.compare")

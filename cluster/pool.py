@@ -5,23 +5,29 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from cluster.worker import Task, Worker
-from evolution.rollout import targets
+from cluster.worker import CollectTask, Task, Worker
+from evolution.breeding import RECIPE
+from evolution.experience import Experience, from_bytes, join, to_bytes
+from evolution.policy import PolicySpec
+from evolution.rollout import RESULT, targets
 from gridsim.roads import freeze
 from gridsim.scenarios import Scenario
 
 BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
-Progress = Callable[[int, int], None]  # (members done, members in all)
+Progress = Callable[[int, int], None]  # (members done, members in all), or episodes where experience is collected
+Meanwhile = Callable[[], bool | None]  # something to do; called until it returns something false
 
 PARTS = 4  # as many workers' chunks are a pool's that has one worker and nothing to send: for progress alone
 METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it is known better
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to take in its results
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
+FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
 
 
 class PoolError(Exception):
@@ -35,23 +41,19 @@ class Chunk(NamedTuple):
     columns: slice
 
 
-@dataclass
-class Outcome:
-    """What one call of `evaluate` brought.
+@dataclass(kw_only=True)
+class Cost:
+    """What one call of a pool took.
 
     Attributes:
-        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
-        asked: episodes of members that were asked for.
         wall_s: seconds from call to return.
-        busy_s: seconds that each worker (by its number) was evaluating. A replaced worker's number goes on counting.
+        busy_s: seconds that each worker (by its number) was at work. A replaced worker's number goes on counting.
         retries: chunks that were sent again because their worker died.
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
         broadcast_bytes: put into the object store: the task and the maps that were new to it.
     """
 
-    results: np.ndarray
-    asked: int
     wall_s: float = 0.0
     busy_s: dict[int, float] = field(default_factory=dict)
     retries: int = 0
@@ -60,9 +62,30 @@ class Outcome:
     broadcast_bytes: int = 0
     _done: int = 0
 
+    def _count(self, worker: int, done: int, seconds: float) -> None:
+        self._done += done
+        self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
+
+
+@dataclass
+class Outcome(Cost):
+    """What one call of `evaluate` brought, and what it took.
+
+    Attributes:
+        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
+        asked: episodes of members that were asked for.
+    """
+
+    results: np.ndarray
+    asked: int
+
     def members(self) -> int:
         """Members that are done, counting the parts of those that are done in part."""
         return len(self.results) * self._done // self.asked if self.asked else 0
+
+    def progress(self) -> tuple[int, int]:
+        """What `Progress` is told."""
+        return self.members(), len(self.results)
 
     def whole(self) -> bool:
         """Whether every result is there."""
@@ -71,12 +94,77 @@ class Outcome:
     def add(self, worker: int, chunk: Chunk, results: np.ndarray, seconds: float) -> None:
         """Take in a chunk's results [rows, columns] and the time that they took."""
         self.results[chunk.rows, chunk.columns] = results
-        self._done += results.size
-        self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
+        self._count(worker, results.size, seconds)
+
+    def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
+        """The same of what `answer` made."""
+        results = np.frombuffer(raw, self.results.dtype, offset=8)
+        columns = chunk.columns.stop - chunk.columns.start
+        self.add(worker, chunk, results.reshape(-1, columns), float(np.frombuffer(raw, np.float64, 1)[0]))
+        self.bytes_up += len(raw)
+
+
+@dataclass
+class Collected(Cost):
+    """What one call of `collect` brought, and what it took.
+
+    Attributes:
+        policy: whose experience it is.
+        results: RESULT [episodes].
+        experience: of all episodes, in their order.
+    """
+
+    policy: PolicySpec
+    results: np.ndarray
+    _parts: dict[int, Experience] = field(default_factory=dict)  # by their first episodes
+
+    @cached_property
+    def experience(self) -> Experience:
+        return join(self.policy, [self._parts.pop(first) for first in sorted(self._parts)])
+
+    def progress(self) -> tuple[int, int]:
+        """What `Progress` is told."""
+        return self._done, len(self.results)
+
+    def whole(self) -> bool:
+        """Whether every episode is there."""
+        return self._done >= len(self.results)
+
+    def add(self, worker: int, chunk: Chunk, experience: Experience, results: np.ndarray, seconds: float) -> None:
+        """Take in a chunk's experience, its results [episodes] and the time that they took."""
+        self._parts[chunk.columns.start] = experience
+        self.results[chunk.columns] = results
+        self._count(worker, len(results), seconds)
+
+    def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
+        """The same of what `answer` made."""
+        results = np.frombuffer(raw, RESULT, chunk.columns.stop - chunk.columns.start, 8)
+        experience = from_bytes(self.policy, memoryview(raw)[8 + results.nbytes :])
+        self.add(worker, chunk, experience, results, float(np.frombuffer(raw, np.float64, 1)[0]))
+        self.bytes_up += len(raw)
+
+
+def answer(
+    worker: Worker, task: Task | CollectTask, maps: Sequence[Scenario], payload: bytes, first: int, stop: int
+) -> bytes:
+    """What a worker says to a chunk: its seconds as float64, its results, its experience if that is what is asked for.
+
+    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is recipes; `first` and `stop` say which of
+    the task's episodes.
+    """
+    if isinstance(task, CollectTask):
+        experience, results, seconds = worker.collect(task, maps, first, stop)
+        return b"".join([np.float64(seconds).tobytes(), results.tobytes(), to_bytes(experience)])
+    results, seconds = worker.evaluate(of_episodes(task, first, stop), maps, np.frombuffer(payload, RECIPE))
+    return np.float64(seconds).tobytes() + results.tobytes()
 
 
 class WorkerPool(Protocol):
-    """Evaluates generations. What it returns depends on task and recipes alone, never on the workers."""
+    """Evaluates generations and collects experience. What it returns depends on the arguments, never on the workers.
+
+    `meanwhile` is called again and again while workers are busy, until it returns something false; a call returns no
+    sooner than that. What it raises ends the call.
+    """
 
     def workers(self) -> int:
         """Workers that are up now."""
@@ -87,13 +175,21 @@ class WorkerPool(Protocol):
         recipes: np.ndarray,
         on_progress: Progress | None = None,
         asked: Sequence[Chunk] | None = None,
-        meanwhile: Callable[[], None] | None = None,
+        meanwhile: Meanwhile | None = None,
     ) -> Outcome:
         """Breed recipes RECIPE [n] and drive them through the task's episodes.
 
         Args:
             asked: who is to drive what, the longest episodes first; None is all members on all episodes.
-            meanwhile: called once, when the workers are busy.
+            meanwhile: what to do here while workers are busy.
+
+        Raises: PoolError where that cannot be done.
+        """
+
+    def collect(
+        self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
+    ) -> Collected:
+        """Drive the task's policy through its episodes and bring all that it met.
 
         Raises: PoolError where that cannot be done.
         """
@@ -118,25 +214,54 @@ class SerialPool:
         recipes: np.ndarray,
         on_progress: Progress | None = None,
         asked: Sequence[Chunk] | None = None,
-        meanwhile: Callable[[], None] | None = None,
+        meanwhile: Meanwhile | None = None,
     ) -> Outcome:
         started = time.perf_counter()
         recipes = freeze(recipes)
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
         maps = [self._build_map(*name) for name in task.maps]
-        if meanwhile:
-            meanwhile()
-        for index, chunk in enumerate(cut(task, asked, PARTS)):
-            try:
-                part = of_episodes(task, chunk.columns.start, chunk.columns.stop)
-                outcome.add(0, chunk, *self._worker.evaluate(part, maps, recipes[chunk.rows]))
-            except Exception as error:
-                raise PoolError(f"a worker failed on {describe(index, chunk)}: {last_line(error)}") from error
-            if on_progress:
-                on_progress(outcome.members(), len(recipes))
+
+        def evaluate(chunk: Chunk) -> None:
+            part = of_episodes(task, chunk.columns.start, chunk.columns.stop)
+            outcome.add(0, chunk, *self._worker.evaluate(part, maps, recipes[chunk.rows]))
+
+        self._work(task, cut(task, asked, PARTS), evaluate, outcome, on_progress, meanwhile)
         outcome.wall_s = time.perf_counter() - started
         return outcome
+
+    def collect(
+        self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
+    ) -> Collected:
+        started = time.perf_counter()
+        collected = new_collected(task)
+        maps = [self._build_map(*name) for name in task.maps]
+
+        def collect(chunk: Chunk) -> None:
+            columns = chunk.columns
+            collected.add(0, chunk, *self._worker.collect(task, maps, columns.start, columns.stop))
+
+        self._work(task, cut(task, all_episodes(task), PARTS), collect, collected, on_progress, meanwhile)
+        collected.wall_s = time.perf_counter() - started
+        return collected
+
+    def _work(
+        self,
+        task: Task | CollectTask,
+        chunks: list[Chunk],
+        do: Callable[[Chunk], None],
+        brought: Outcome | Collected,
+        on_progress: Progress | None,
+        meanwhile: Meanwhile | None,
+    ) -> None:
+        finish(meanwhile)
+        for index, chunk in enumerate(chunks):
+            try:
+                do(chunk)
+            except Exception as error:
+                raise PoolError(f"a worker failed on {describe(task, index, chunk)}: {last_line(error)}") from error
+            if on_progress:
+                on_progress(*brought.progress())
 
     def close(self) -> None:
         pass
@@ -145,6 +270,11 @@ class SerialPool:
 def everything(task: Task, recipes: np.ndarray) -> list[Chunk]:
     """All members on all episodes."""
     return [Chunk(slice(0, len(recipes)), slice(0, len(task.episodes)))]
+
+
+def all_episodes(task: CollectTask) -> list[Chunk]:
+    """All episodes of the one member that there is."""
+    return [Chunk(slice(0, 1), slice(0, len(task.episodes)))]
 
 
 def size(chunk: Chunk) -> int:
@@ -158,12 +288,23 @@ def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outc
     return Outcome(results, sum(size(chunk) for chunk in asked))
 
 
-def metres(task: Task, chunk: Chunk) -> float:
+def new_collected(task: CollectTask) -> Collected:
+    """A collection to be filled."""
+    return Collected(PolicySpec.parse(task.policy), np.zeros(len(task.episodes), dtype=RESULT))
+
+
+def finish(meanwhile: Meanwhile | None) -> None:
+    """Do what is left to do."""
+    while meanwhile and meanwhile():
+        pass
+
+
+def metres(task: Task | CollectTask, chunk: Chunk) -> float:
     """How far the members of a chunk drive if all of them reach their targets."""
     return float(targets(task.episodes[chunk.columns], task.limits).sum()) * (chunk.rows.stop - chunk.rows.start)
 
 
-def cut(task: Task, asked: Sequence[Chunk], workers: int, metre_s: float = METRE_S) -> list[Chunk]:
+def cut(task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s: float = METRE_S) -> list[Chunk]:
     """Cut what is asked for into chunks, by the metres to be driven: large ones first, small ones last.
 
     Each takes most of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
@@ -201,8 +342,10 @@ def of_episodes(task: Task, first: int, stop: int) -> Task:
     return replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
 
 
-def describe(index: int, chunk: Chunk) -> str:
+def describe(task: Task | CollectTask, index: int, chunk: Chunk) -> str:
     """A chunk in words."""
+    if isinstance(task, CollectTask):
+        return f"chunk {index} (episodes {chunk.columns.start} to {chunk.columns.stop - 1})"
     return f"chunk {index} (members {chunk.rows.start} to {chunk.rows.stop - 1})"
 
 

@@ -14,21 +14,21 @@ if TYPE_CHECKING:
     from cluster.run import Session
 
 LINE_S = 5.0  # between lines where there is no terminal
-WINDOW = 10  # generations that the ETA is taken from
+WINDOW = 10  # steps that the ETA is taken from
 
 
 class Progress:
-    """Shows generation, best and mean distance, speed, car-steps per second and ETA."""
+    """Shows how far a run is, distance, speed, car-steps per second and ETA."""
 
     def __init__(self, console: Console, session: Session, folder: str):
-        self._console, self._session = console, session
+        self._console, self._learning = console, session.learning
         self._live = console.is_terminal
-        self._ends: deque[float] = deque([time.perf_counter()], WINDOW + 1)
+        done, total, _ = self._learning.way()
+        self._ends: deque[tuple[float, float]] = deque([(time.perf_counter(), done)], WINDOW + 1)
         self._printed = 0.0
         self._text = ""
-        self._generations = session.run.settings.generations
         self._bar = Bar(
-            TextColumn("[bold]generation {task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("[bold]{task.fields[way]}"),
             BarColumn(bar_width=20),
             TaskProgressColumn(show_speed=False),
             TextColumn("{task.fields[text]}"),
@@ -38,14 +38,11 @@ class Progress:
             transient=True,
         )
         self._task = self._bar.add_task(
-            "evolve", total=self._generations, completed=session.evolution.generation, text="starting the workers"
+            "learn", total=total or None, completed=int(done), text="starting the workers", way=self._way()
         )
         settings = session.run.settings
-        begun = "continuing" if session.evolution.generation else "evolving"
-        console.print(
-            f"{begun} {settings.policy} on {settings.scenario}, seed {settings.seed}, "
-            f"population {settings.population:,} -> {folder}"
-        )
+        verb = "continuing" if done else self._learning.verb
+        console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}")
 
     def __enter__(self) -> Progress:
         self._bar.start()
@@ -54,31 +51,35 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def row(self, generation: int, row: dict[str, float]) -> None:
-        """A generation is done."""
+    def _way(self) -> str:
+        """How far it is, in words."""
+        done, total, unit = self._learning.way()
+        of = f"/{total:g}" if total else ""
+        return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{unit} {done:.0f}{of}"
+
+    def row(self, step: int, row: dict[str, float]) -> None:
+        """So many steps are done."""
         now = time.perf_counter()
-        self._ends.append(now)
-        pace = (self._ends[-1] - self._ends[0]) / max(len(self._ends) - 1, 1)
-        eta = pace * (self._generations - generation)
+        way, total, _ = self._learning.way()
+        self._ends.append((now, way))
+        begun, first = self._ends[0]
         champion = row["validation/success_rate"]
-        self._text = (
-            f"distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
-            f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
-            + (f"  champion {champion:.0%}" if champion else "")
-            + f"  ETA {_clock(eta)} at most"
-        )
-        self._bar.update(self._task, completed=generation, text=self._text)
-        if not self._live and (now - self._printed > LINE_S or generation == self._generations):
+        self._text = self._learning.describe(row) + f"  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
+        self._text += f"  champion {champion:.0%}" if champion else ""
+        if total:
+            self._text += f"  ETA {_clock((now - begun) / max(way - first, 1e-9) * max(total - way, 0.0))} at most"
+        self._bar.update(self._task, completed=int(way), text=self._text, way=self._way())
+        if not self._live and (now - self._printed > LINE_S or self._learning.done()):
             self._printed = now
-            self._console.print(f"generation {generation}/{self._generations}  {self._text}", soft_wrap=True)
+            self._console.print(f"{self._way()}  {self._text}", soft_wrap=True)
 
     def members(self, stage: str, done: int, total: int) -> None:
-        """Part of a generation is done."""
+        """Part of a step is done."""
         if self._live:
             self._bar.update(self._task, text=f"{self._text}  [dim]{stage} {done}/{total}")
 
     def note(self, text: str) -> None:
-        """What happens after the last generation."""
+        """What happens after the last step."""
         self._bar.update(self._task, text=text)
         if not self._live:
             self._console.print(text)

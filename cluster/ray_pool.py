@@ -1,4 +1,4 @@
-"""A pool of Ray actors, on a Ray of its own or on an existing cluster. The only file that knows Ray.
+"""A pool of Ray actors, on a Ray of its own or on an existing cluster. The only file that imports Ray.
 
 What differs from Ray's own habits, and why:
 
@@ -17,68 +17,60 @@ import importlib
 import logging
 import os
 import pickle
-import secrets
 import shutil
 import signal
-import socket
 import threading
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cluster.pool import (
+    FINER,
     METRE_S,
     BuildMap,
     Chunk,
+    Collected,
+    Meanwhile,
     Outcome,
     PoolError,
     Progress,
+    all_episodes,
+    answer,
     cut,
     describe,
     everything,
+    finish,
     last_line,
     metres,
+    new_collected,
     new_outcome,
-    of_episodes,
 )
-from cluster.worker import Task, Worker
-from evolution.breeding import RECIPE
+from cluster.ray_address import (
+    AUTH_ENVIRONMENT,
+    ENVIRONMENT,
+    OWN_ENVIRONMENT,
+    STORE_BYTES,
+    TOKEN,
+    environment,
+    has_token,
+    no_interrupt,
+    probe,
+    store_bytes,
+)
+from cluster.worker import CollectTask, Task, Worker
 from evolution.rollout import Limits
-from gridsim.roads import freeze
 from gridsim.scenarios import Scenario
 
-PROBE_S = 3.0
 CONNECT_S = 60.0
 QUEUE = 2  # chunks that a worker holds: one that it works on, one so that it need not wait for us
 MAX_KILLS = 3  # workers that one chunk may cost
 MAX_FAILED_STARTS = 3  # in a row
-STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used
-LEAST_STORE_BYTES = 80 << 20  # Ray takes no less than 75 MiB
 MAP_BYTES = 512 << 20  # of maps kept there: those of training and validation, or they are sent every generation
-
-# Read when Ray is imported.
-_ENVIRONMENT = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
-    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal when we are told to stop
-}
-# Read by the processes of a Ray of our own.
-_OWN_ENVIRONMENT = {
-    "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it just misses its object store, and then sleeps 1 s
-    "RAY_raylet_client_num_connect_attempts": "500",
-    "RAY_prestart_worker_first_driver": "0",  # with it, init waits for ever where a worker dies as it starts
-    "RAY_enable_metrics_collection": "0",
-    "RAY_task_events_report_interval_ms": "0",
-}
-_TOKEN = secrets.token_hex(32)
-_AUTH_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-
 
 _Name = tuple[str, int]  # of a map: scenario and seed
 
@@ -87,7 +79,7 @@ _News = tuple[Any, dict[_Name, Any], list[_Name]]
 
 
 class _Actor:
-    """Runs in a worker's process: holds the generation's task and maps, answers chunks."""
+    """Runs in a worker's process: holds the present task and its maps, answers chunks."""
 
     def __init__(self, factory: Callable[[], Worker]):
         # Ctrl-C goes to every process of the terminal; whether the workers stop is the coordinator's business.
@@ -95,25 +87,20 @@ class _Actor:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._worker = factory()
         self._serial = 0
-        self._task: Task | None = None
+        self._task: Task | CollectTask | None = None
         self._maps: dict[_Name, Scenario] = {}
 
     def hello(self) -> int:
         return os.getpid()
 
-    def run(self, serial: int, recipes: bytes, first: int, stop: int, news: _News | None) -> bytes:
-        """A chunk's seconds as float64, then its results [n, episodes], as bytes: a fifth of what pickled arrays take.
-
-        `first` and `stop` say which of the task's episodes; `news` is for a worker that does not have the task yet.
-        """
+    def run(self, serial: int, payload: bytes, first: int, stop: int, news: _News | None) -> bytes:
+        """What `cluster.pool.answer` says; `news` is for a worker that does not have the task yet."""
         if news:
             self._take_up(serial, *news)
         if self._task is None or serial != self._serial:
             raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
         maps = [self._maps[name] for name in self._task.maps]
-        part = of_episodes(self._task, first, stop)
-        results, seconds = self._worker.evaluate(part, maps, np.frombuffer(recipes, RECIPE))
-        return np.float64(seconds).tobytes() + results.tobytes()
+        return answer(self._worker, self._task, maps, payload, first, stop)
 
     def _take_up(self, serial: int, task_ref: Any, map_refs: dict[_Name, Any], gone: list[_Name]) -> None:
         import ray
@@ -152,7 +139,7 @@ class RayPool:
         worker_factory: makes what evaluates; must be importable in the workers.
         start_timeout_s: how long there may be no worker at all; default 60 s, on a cluster 300 s (it may be growing).
 
-    Raises PoolError at once where nothing answers at `address`; all else that goes wrong is raised by `evaluate`.
+    Raises PoolError at once where nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
 
     def __init__(
@@ -165,7 +152,7 @@ class RayPool:
     ):
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
-        for name, value in _ENVIRONMENT.items():
+        for name, value in ENVIRONMENT.items():
             os.environ.setdefault(name, value)
         self.address = None if address is None else check_address(address)
         self._asked = workers
@@ -177,7 +164,7 @@ class RayPool:
         self._map_bytes = MAP_BYTES
         self._serial = 0
         self._failed_starts = 0
-        self._metre_s: dict[Limits, float] = {}  # what a metre of such tasks took the last time
+        self._metre_s: dict[tuple[type, Limits], float] = {}  # what a metre of such tasks took the last time
         self._session: str | None = None  # folder of our own Ray's logs
         self._failure: BaseException | None = None
         self._connected = self._troubled = False
@@ -198,40 +185,61 @@ class RayPool:
         recipes: np.ndarray,
         on_progress: Progress | None = None,
         asked: Sequence[Chunk] | None = None,
-        meanwhile: Callable[[], None] | None = None,
+        meanwhile: Meanwhile | None = None,
     ) -> Outcome:
+        asked = everything(task, recipes) if asked is None else asked
+        outcome = new_outcome(task, recipes, asked)
+        self._work(task, asked, 1, lambda chunk: recipes[chunk.rows].tobytes(), outcome, on_progress, meanwhile)
+        return outcome
+
+    def collect(
+        self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
+    ) -> Collected:
+        collected = new_collected(task)
+        self._work(task, all_episodes(task), FINER, lambda _: b"", collected, on_progress, meanwhile)
+        return collected
+
+    def _work(
+        self,
+        task: Task | CollectTask,
+        asked: Sequence[Chunk],
+        finer: int,
+        payload: Callable[[Chunk], bytes],
+        brought: Outcome | Collected,
+        on_progress: Progress | None,
+        meanwhile: Meanwhile | None,
+    ) -> None:
+        """Have what is asked for done, in chunks `finer` times as small as they need be, and fill `brought`."""
         import ray
 
         started = time.perf_counter()
         self._wait_for_ray()
-        recipes = freeze(recipes)
-        asked = everything(task, recipes) if asked is None else asked
-        outcome = new_outcome(task, recipes, asked)
-        parts = cut(task, asked, self._asked, self._metre_s.get(task.limits, METRE_S))
+        kind = type(task), task.limits
+        parts = cut(task, asked, finer * self._asked, self._metre_s.get(kind, METRE_S))
         todo = deque(range(len(parts)))
         kills: Counter[int] = Counter()
         suspects: set[int] = set()
         self._serial += 1
         for slot in self._slots:
             slot.sent.clear()  # left over where the last call was interrupted
-        task_ref = self._broadcast(task, outcome)
+        task_ref = self._broadcast(task, brought)
         nobody_since = time.monotonic()
 
-        while not outcome.whole():
+        while not brought.whole():
             for slot in self._free(todo, suspects):
                 chunk = todo.popleft()
-                rows, columns = parts[chunk]
-                raw = recipes[rows].tobytes()
+                columns, raw = parts[chunk].columns, payload(parts[chunk])
                 what = None if slot.serial == self._serial else self._news(slot, task, task_ref)
-                answer = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, what)
-                slot.sent.append((chunk, answer))
+                answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, what)
+                slot.sent.append((chunk, answered))
                 slot.serial = self._serial
-                outcome.bytes_down += len(raw)
-            if meanwhile and self.pids():
-                meanwhile()
+                brought.bytes_down += len(raw)
+            if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
-            for ref in ray.wait(list(waiting), num_returns=1, timeout=1.0)[0]:
+            # Where there is something else to do, take what is there; else wait for the next.
+            patience = (len(waiting), 0.0) if meanwhile and self.pids() else (1, 1.0)
+            for ref in ray.wait(list(waiting), num_returns=patience[0], timeout=patience[1])[0]:
                 slot = waiting[ref]
                 if slot.hello:
                     self._greet(slot)
@@ -242,42 +250,38 @@ class RayPool:
                     raw = ray.get(ref)
                 except ray.exceptions.RayTaskError as error:
                     cause = error.cause if isinstance(error.cause, BaseException) else error
-                    raise PoolError(f"a worker failed on {describe(chunk, part)}: {last_line(cause)}") from error
+                    raise PoolError(f"a worker failed on {describe(task, chunk, part)}: {last_line(cause)}") from error
                 except ray.exceptions.RayError as error:
                     kills[chunk] += 1
                     if kills[chunk] >= MAX_KILLS:
                         raise PoolError(
-                            f"{describe(chunk, part)} killed its worker {MAX_KILLS} times; the last time "
+                            f"{describe(task, chunk, part)} killed its worker {MAX_KILLS} times; the last time "
                             + _reason(error)
                             + self._logs()
                         ) from error
                     suspects.update(index for index, _ in slot.sent)
                     todo.extendleft(index for index, _ in reversed(slot.sent))
-                    outcome.retries += len(slot.sent)
+                    brought.retries += len(slot.sent)
                     self._replace(slot)
                     continue
                 slot.sent.popleft()
-                results = np.frombuffer(raw, task.row, offset=8).reshape(-1, part.columns.stop - part.columns.start)
-                outcome.add(slot.number, part, results, float(np.frombuffer(raw, np.float64, 1)[0]))
-                outcome.bytes_up += len(raw)
+                brought.take(slot.number, part, raw)
                 if on_progress:
-                    on_progress(outcome.members(), len(recipes))
+                    on_progress(*brought.progress())
             if self.pids():
                 nobody_since = time.monotonic()
             elif time.monotonic() - nobody_since > self._start_timeout_s:
                 raise PoolError(f"no worker came up within {self._start_timeout_s:g} s: {_capacity()}")
-        if meanwhile:  # there was nothing to do
-            meanwhile()
-        if outcome.asked:
-            driven = sum(metres(task, block) for block in asked)
-            self._metre_s[task.limits] = max(sum(outcome.busy_s.values()) / driven, 1e-9)
-        outcome.wall_s = time.perf_counter() - started
-        return outcome
+        finish(meanwhile)
+        driven = sum(metres(task, block) for block in asked)
+        if driven > 0.0:
+            self._metre_s[kind] = max(sum(brought.busy_s.values()) / driven, 1e-9)
+        brought.wall_s = time.perf_counter() - started
 
     def close(self) -> None:
         if self._closed.is_set():
             return
-        with _no_interrupt():  # a second Ctrl-C must not leave half of it behind
+        with no_interrupt():  # a second Ctrl-C must not leave half of it behind
             self._booted.wait(CONNECT_S)  # what is only just starting cannot be stopped
             if self._connected:
                 import ray
@@ -303,7 +307,7 @@ class RayPool:
             ray_worker: Any = importlib.import_module("ray._private.worker")
             ray_worker._worker_logs_enabled = False  # else it prints each worker's death, `log_to_driver` or not
             if self.address is None:
-                store = _store_bytes()
+                store = store_bytes()
                 self._map_bytes = store * MAP_BYTES // STORE_BYTES
                 self._session = _start_own(self._asked, store)
             else:
@@ -373,26 +377,26 @@ class RayPool:
             if len(todo) > len(up) and 0 < len(slot.sent) < QUEUE and suspects.isdisjoint([todo[0], slot.sent[0][0]]):
                 yield slot
 
-    def _broadcast(self, task: Task, outcome: Outcome) -> Any:
+    def _broadcast(self, task: Task | CollectTask, brought: Outcome | Collected) -> Any:
         """Put the task, and those of its maps that are not there yet, into the object store; returns its reference."""
         import ray
 
         buffers: list[pickle.PickleBuffer] = []
         head = pickle.dumps(task, protocol=5, buffer_callback=buffers.append)
-        outcome.broadcast_bytes = len(head) + sum(buffer.raw().nbytes for buffer in buffers)
+        brought.broadcast_bytes = len(head) + sum(buffer.raw().nbytes for buffer in buffers)
         for name in task.maps:
             if name not in self._maps:
                 arrays = self._build_map(*name).arrays()
                 size = sum(array.nbytes for array in arrays.values())
                 self._maps[name] = ray.put(arrays), size
-                outcome.broadcast_bytes += size
+                brought.broadcast_bytes += size
             self._maps.move_to_end(name)
         used = sum(size for _, size in self._maps.values())
         while used > self._map_bytes and len(self._maps) > len(set(task.maps)):
             used -= self._maps.popitem(last=False)[1][1]
         return ray.put(task)
 
-    def _news(self, slot: _Slot, task: Task, task_ref: Any) -> _News:
+    def _news(self, slot: _Slot, task: Task | CollectTask, task_ref: Any) -> _News:
         """What a worker needs to take up a task; from then on it has that."""
         gone = [name for name in slot.maps if name not in self._maps]
         refs = {name: self._maps[name][0] for name in task.maps if name not in slot.maps}
@@ -418,76 +422,19 @@ def check_address(address: str) -> str:
             raise PoolError(
                 "no Ray cluster runs on this machine; start one with `ray start --head`, or give its host:port"
             ) from None
-    host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65_536 or "/" in address:
-        raise PoolError(f"{address!r} is no address of a Ray cluster; give host:port (of `ray start --head`) or auto")
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), PROBE_S) as connection:
-            if os.environ.get("RAY_USE_TLS", "0") in ("", "0"):
-                answer = _ask_for_cluster_id(connection)
-                if b"InvalidAuthToken" in answer and not _has_token(host):
-                    raise PoolError(
-                        f"the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and RAY_AUTH_TOKEN to "
-                        "what `ray get-auth-token` says on its head"
-                    )
-                if b"grpc-status" not in answer:
-                    raise PoolError(f"what answers at {address} is no Ray cluster; is that its head's port?")
-    except OSError as error:
-        reason = f"no answer within {PROBE_S:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
-        raise PoolError(f"no Ray cluster answers at {address}: {reason}; is `ray start --head` up?") from None
+    probe(address)
     return address
-
-
-def _ask_for_cluster_id(connection: socket.socket) -> bytes:
-    """Ray's simplest request (gRPC over HTTP/2) written by hand, without a token; returns all of the answer."""
-
-    def frame(kind: int, flags: int, stream: int, body: bytes = b"") -> bytes:
-        return len(body).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + body
-
-    headers = {
-        ":method": "POST",
-        ":scheme": "http",
-        ":path": "/ray.rpc.NodeInfoGcsService/GetClusterId",
-        ":authority": "ray",
-        "te": "trailers",
-        "content-type": "application/grpc",
-    }
-    literal = b"".join(bytes([0, len(k)]) + k.encode() + bytes([len(v)]) + v.encode() for k, v in headers.items())
-    message = frame(4, 0, 0) + frame(1, 4, 1, literal) + frame(0, 1, 1, bytes(5))  # settings, headers, an empty message
-    connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + message)
-    answer, until = b"", time.monotonic() + PROBE_S
-    with contextlib.suppress(TimeoutError):
-        while b"grpc-status" not in answer and (left := until - time.monotonic()) > 0:
-            connection.settimeout(left)
-            part = connection.recv(4096)
-            if not part:
-                break
-            answer += part
-    return answer
-
-
-def _has_token(host: str) -> bool:
-    """Whether Ray has a token to show there. It looks for one by itself on the own machine only, and so do we."""
-    if "RAY_AUTH_MODE" in os.environ:
-        return os.environ["RAY_AUTH_MODE"].lower() == "token"
-    family, kind, _, _, name = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_STREAM)[0]
-    with socket.socket(family, kind) as probe:
-        try:
-            probe.bind(name)  # possible for an address of this machine alone
-        except OSError:
-            return False
-    return any(name in os.environ for name in _AUTH_ENVIRONMENT) or (Path.home() / ".ray/auth_token").exists()
 
 
 def _start_own(workers: int, store_bytes: int) -> str:
     """Start Ray on this machine with one CPU for each worker; returns the folder of its logs."""
     import ray
 
-    if not any(name in os.environ for name in _AUTH_ENVIRONMENT):
+    if not any(name in os.environ for name in AUTH_ENVIRONMENT):
         # Ray listens on all interfaces and lets in who has its token. One of our own need not outlive the run in
         # ~/.ray, where it would change what `ray start` does from then on.
-        os.environ["RAY_AUTH_TOKEN"] = _TOKEN
-    with _environment(_OWN_ENVIRONMENT), _lean_head():
+        os.environ["RAY_AUTH_TOKEN"] = TOKEN
+    with environment(OWN_ENVIRONMENT), _lean_head():
         context: Any = ray.init(
             address="local",  # whatever RAY_ADDRESS says
             num_cpus=workers,
@@ -504,7 +451,7 @@ def _join(address: str) -> None:
     """Connect to a cluster that was found to let us in."""
     import ray
 
-    if _has_token(address.rpartition(":")[0]):
+    if has_token(address.rpartition(":")[0]):
         with contextlib.suppress(ImportError, AttributeError):  # what Ray does where it is asked to find the cluster
             setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
             setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
@@ -538,49 +485,15 @@ def _lean_head() -> Iterator[None]:
         node.start_api_server, parameter.RayParams = start_api_server, ray_params
 
 
-@contextlib.contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Set environment variables for the processes that are started meanwhile; what the user has set stays."""
-    ours = {name: value for name, value in values.items() if name not in os.environ}
-    os.environ.update(ours)
-    try:
-        yield
-    finally:
-        for name in ours:
-            os.environ.pop(name, None)
-
-
-@contextlib.contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Ignore Ctrl-C meanwhile (where signals can be set: in the main thread)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def _forget_token() -> None:
     """Leave Ray and the environment as they were: with our token, a cluster that is joined next could not call us."""
-    if os.environ.get("RAY_AUTH_TOKEN") == _TOKEN:
+    if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
         del os.environ["RAY_AUTH_TOKEN"]
         os.environ.pop("RAY_AUTH_MODE", None)  # Ray's own doing
         with contextlib.suppress(ImportError, AttributeError):
             raylet = importlib.import_module("ray._raylet")
             raylet.Config.initialize("")
             raylet.AuthenticationTokenLoader.instance().reset_cache()
-
-
-def _store_bytes() -> int:
-    """Size of the object store: small, and smaller where shared memory is (a container's default is 64 MB)."""
-    try:
-        free = shutil.disk_usage("/dev/shm").free
-    except OSError:
-        return STORE_BYTES
-    return max(min(STORE_BYTES, free * 9 // 10), LEAST_STORE_BYTES)
 
 
 def _capacity() -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.table import Table
@@ -14,44 +14,56 @@ from gridsim.ego import X, Y
 from gridsim.roads import FIELD_FLOOR, FIELD_UNITS
 from gridsim.scenarios import Scenario
 
+if TYPE_CHECKING:
+    from cluster.tables import Group
+    from gridsim.errors import Series
+
+_BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
+_LEARNERS = {"evolution": "#0b7285", "dqn": "#f08c00", "random": "#868e96"}
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
-    """A figure that needs no display and no global state."""
+def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Any, Any]:
+    """A figure that needs no display and no global state, and the axes of its columns, or of its rows."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, columns, squeeze=False)[0]
+    return figure, figure.subplots(rows, columns, squeeze=False, sharex=rows > 1).ravel()
 
 
-def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str]) -> None:
-    """Draw fitness, distance, speed and success over the generations to a PNG."""
+def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
+    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
     figure, axes = _figure(15, 3.8, 4)
-    generation = np.arange(len(history))
+    step = np.arange(len(history))
 
-    def column(name: str) -> np.ndarray:
-        return np.array([row[name] for row in history])
+    def plot(axis: Any, name: str, color: str, label: str, **style: Any) -> np.ndarray:
+        values = np.array([row[name] for row in history])
+        axis.plot(step, values, color=color, label=label, **style)
+        return values
 
-    mean, std = column("fitness/mean"), column("fitness/std")
-    axes[0].plot(generation, column("fitness/best"), color="#0b7285", label="best")
-    axes[0].plot(generation, mean, color="#868e96", label="mean")
-    axes[0].fill_between(generation, mean - std, mean + std, color="#868e96", alpha=0.2, linewidth=0)
-    axes[0].set(title="fitness", ylim=(0, 1.05))
-    axes[1].plot(generation, column("distance_m/best"), color="#0b7285", label="best")
-    axes[1].plot(generation, column("distance_m/mean"), color="#868e96", label="mean")
-    axes[1].step(generation, column("target_m"), color="#f08c00", linestyle=":", where="mid", label="episode length")
-    axes[1].set(title="distance, m")
-    axes[2].plot(generation, column("speed_mps/best"), color="#0b7285", label="best")
-    axes[2].plot(generation, column("speed_mps/mean"), color="#868e96", label="mean")
-    axes[2].set(title="speed, m/s")
-    axes[3].plot(generation, column("validation/success_rate"), color="#0b7285", label="champion, validation")
-    axes[3].plot(generation, column("race/success_rate"), color="#f08c00", alpha=0.5, label="leaders, training")
+    if history and "fitness/best" in history[0]:
+        plot(axes[0], "fitness/best", _BEST, "best")
+        mean, std = plot(axes[0], "fitness/mean", _MEAN, "mean"), np.array([row["fitness/std"] for row in history])
+        axes[0].fill_between(step, mean - std, mean + std, color=_MEAN, alpha=0.2, linewidth=0)
+        axes[0].set(title="fitness", ylim=(0, 1.05))
+        best, mean_of, success = "best", "mean", ("race/success_rate", "leaders, training")
+        plot(axes[1], "target_m", _OTHER, "episode length", linestyle=":", drawstyle="steps-mid")
+    else:
+        plot(axes[0], "q/mean", _BEST, "Q, mean")
+        plot(axes[0], "loss", _OTHER, "loss")
+        axes[0].set(title="Q values, loss")
+        best, mean_of, success = "network, validation", "training", ("network/success_rate", "network, validation")
+    for axis, name, title in ((axes[1], "distance_m", "distance, m"), (axes[2], "speed_mps", "speed, m/s")):
+        plot(axis, f"{name}/best", _BEST, best)
+        plot(axis, f"{name}/mean", _MEAN, mean_of)
+        axis.set(title=title)
+    plot(axes[3], "validation/success_rate", _BEST, "champion, validation")
+    plot(axes[3], success[0], _OTHER, success[1], alpha=0.5)
     axes[3].set(title="success rate", ylim=(-0.02, 1.05))
     for axis in axes:
-        axis.set_xlabel("generation")
+        axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
         axis.legend(frameon=False, fontsize=8)
     figure.savefig(Path(path), dpi=100)
@@ -92,6 +104,90 @@ def trajectory(scenario: Scenario, states: np.ndarray, path: str | os.PathLike[s
     figure.savefig(Path(path), dpi=100)
 
 
+def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
+    """Draw velocity error and training time of each road and learner to a PNG.
+
+    Bars are medians over seeds, whiskers quartiles, dots the seeds.
+    """
+    roads = list(dict.fromkeys(group.road for group in groups))
+    names = list(dict.fromkeys((group.name, group.learner, group.observation) for group in groups))
+    width = 0.8 / len(names)
+    figure, axes = _figure(max(9.0, 3.0 + 2.2 * len(roads)), 4.6, 2)
+    panels = (
+        ("velocity_error_percent", "velocity error, % of the reference's speed"),
+        ("training_s", "training time, s"),
+    )
+    for axis, (name, title) in zip(axes, panels, strict=True):
+        for group in groups:
+            which = [other[0] for other in names].index(group.name)
+            place = roads.index(group.road) + (which - (len(names) - 1) / 2) * width
+            found = group.spread(name)
+            if not found.n:
+                axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
+                continue
+            whiskers = [[found.median - found.lower], [found.upper - found.median]] if found.n > 1 else None
+            hatch = "//" if group.observation == "grid" and len({view for _, _, view in names}) > 1 else None
+            axis.bar(
+                place, found.median, 0.92 * width, color=_LEARNERS[group.learner], alpha=0.75, yerr=whiskers, capsize=3,
+                hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2,
+            )  # fmt: skip
+            seeds = [value for value in group.values(name) if np.isfinite(value)]
+            beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
+            axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
+                      markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
+        axis.set_title(title)
+        axis.set_xticks(range(len(roads)), roads)
+        axis.set_xlim(-0.5, len(roads) - 0.5)
+        axis.set_ylim(bottom=0.0)
+        axis.grid(axis="y", alpha=0.25, zorder=0)
+        axis.spines[["top", "right"]].set_visible(False)
+    from matplotlib.patches import Patch
+
+    patches = [Patch(color=_LEARNERS[learner], alpha=0.75, label=name) for name, learner, _ in names]
+    figure.legend(
+        handles=patches, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
+        title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
+    )  # fmt: skip
+    figure.savefig(Path(path), dpi=100)
+
+
+def along_route(
+    drives: Mapping[str, Sequence[Series]], names: Mapping[str, str], metres: float, path: str | os.PathLike[str],
+    title: str,
+) -> None:  # fmt: skip
+    """Draw velocity and steering error along a route to a PNG.
+
+    Args: for each learner its seeds' drives from the same start, the one to be drawn as a line first, the others as
+    the band from the smallest to the largest error; what learners are called; how far along the route.
+    """
+    figure, axes = _figure(12.0, 6.2, rows=2)
+    for axis, name, unit in zip(axes, ("velocity_error", "steering_error"), ("m/s", "degrees"), strict=True):
+        axis.axhline(0.0, color="#212529", linewidth=1.2, label="reference", zorder=3)
+        for learner, found in drives.items():
+            colour = _LEARNERS[learner]
+            arc = np.arange(0.0, min(metres, max(float(series.arc[-1]) for series in found)), 0.5)
+            errors = np.array(
+                [np.interp(arc, series.arc, getattr(series, name), right=np.nan) for series in found]
+            )  # fmt: skip
+            there = np.isfinite(errors).any(axis=0)
+            if len(found) > 1:
+                low, high = np.nanmin(errors[:, there], axis=0), np.nanmax(errors[:, there], axis=0)
+                axis.fill_between(arc[there], low, high, color=colour, alpha=0.16, linewidth=0, zorder=1)
+            axis.plot(arc, errors[0], color=colour, linewidth=1.4, label=names[learner], zorder=4)
+            if found[0].arc[-1] < metres:
+                axis.plot(found[0].arc[-1], getattr(found[0], name)[-1], marker="X", color=colour, markersize=9,
+                          markeredgecolor="white", linestyle="", zorder=5)  # fmt: skip
+        axis.set_ylabel(f"{name.replace('_', ' ')}, {unit}")
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].set_title(title)
+    axes[0].set_xlim(0.0, metres)
+    axes[-1].set_xlabel("distance along the route, m")
+    lines, words = axes[0].get_legend_handles_labels()
+    figure.legend(lines, words, loc="outside lower center", ncols=len(words), frameon=False)
+    figure.savefig(Path(path), dpi=100)
+
+
 def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
     """The closing table: how good a champion is where it never was."""
     table = Table(title=title, title_justify="left", show_header=False)
@@ -102,4 +198,21 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
     table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
     table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
     table.add_row("collisions", f"{figures['collision_rate']:.1%}")
+    return table
+
+
+def errors_table(title: str, figures: Mapping[str, float]) -> Table:
+    """Velocity and steering errors, `gridsim.errors.Errors.figures`."""
+    table = Table("", "mean", "max", title=title, title_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, unit, digits in (("velocity", "mps", 2), ("steering", "deg", 1)):
+        shown = "m/s" if unit == "mps" else "degrees"
+        table.add_row(
+            f"{name} error, {shown}",
+            *(f"{figures[f'{name}_{kind}_{unit}']:.{digits}f}" for kind in ("mean", "max")),
+        )
+        of = "the reference's mean speed" if unit == "mps" else "the steering limit"
+        table.add_row(f"  % of {of}", *(f"{figures[f'{name}_{kind}_percent']:.1f}" for kind in ("mean", "max")))
+    table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
     return table

@@ -1,8 +1,8 @@
-"""A run's folder and its life: prepare or resume, evolve, save after every generation, close.
+"""A run's folder and its life: prepare or resume, learn, save after every step, close.
 
-The order of saving, after each generation: the checkpoint (which holds the history), history.csv made from it, the
-MLflow row. It is saved while the workers are busy with the next one. Whatever kills the process, the folder holds a
-whole generation, the last or the one before, and a resumed run gives the same champion.
+A step is a generation or an evaluation. The order of saving after each: the checkpoint (which holds the history),
+history.csv made from it, the MLflow row. It is saved while the workers are busy with the next one. Whatever kills the
+process, the folder holds a whole step, the last or the one before, and a resumed run gives the same champion.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import math
 import os
 import re
 import time
@@ -26,9 +27,10 @@ import numpy as np
 from cluster import checkpoint
 from cluster.champion import Champion
 from cluster.checkpoint import CheckpointError
-from cluster.coordinator import COLUMNS, Evolution, Maps, held_out_episodes, now
+from cluster.coordinator import Evolution
+from cluster.learning import Learning, Maps, held_out_episodes, now
 from cluster.pool import WorkerPool
-from cluster.settings import EvolveSettings, SettingsError, from_dict, to_dict
+from cluster.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
 from cluster.tracking import Tracker, git_commit
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
@@ -38,7 +40,7 @@ from gridsim.scenarios import Scenario, is_map_file, label
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
 CONFIG_FORMAT = 1
-METRICS = tuple(name for name in COLUMNS if name not in ("target_m",))
+NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
 class RunError(Exception):
@@ -60,7 +62,7 @@ class RunFolder:
     """
 
     path: Path
-    settings: EvolveSettings
+    settings: RunSettings
     init: str = ""
     init_sha256: str = ""
     map_sha256: str = ""
@@ -75,7 +77,7 @@ class RunFolder:
         """What config.json holds: enough to repeat the run."""
         return {
             "format": CONFIG_FORMAT,
-            "command": "gridsim-evolve",
+            "command": self.settings.command,
             "gridsim": version("gridsim"),
             "settings": to_dict(self.settings),
             "curriculum": dataclasses.asdict(self.settings.curriculum()),
@@ -88,7 +90,8 @@ class RunFolder:
     def digest(self) -> str:
         """Of what must not differ between a run and its resumption."""
         parts = self.config()
-        parts["settings"].pop("generations")
+        for name in self.settings.unbound:
+            parts["settings"].pop(name)
         for name in ("gridsim", "init"):
             parts.pop(name)
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
@@ -98,15 +101,15 @@ class RunFolder:
         checkpoint.write_atomic(self.path / CONFIG, (json.dumps(self.config(), indent=2) + "\n").encode())
 
 
-def read_config(path: Path) -> tuple[EvolveSettings, str]:
-    """Settings and the initial champion's path from a run's config.json. Raises RunError."""
+def read_config(path: Path) -> tuple[RunSettings, str]:
+    """Settings of either learner and the initial champion's path from a run's config.json. Raises RunError."""
     try:
         if path.stat().st_size > 1 << 20:
             raise RunError(f"{path}: too large for a run's {CONFIG}")
         config = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(config, dict) or config.get("format") != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim")
-        settings = from_dict(dict(config["settings"]))
+        settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))
         if config.get("map_sha256", "") != _map_sha256(settings):
             raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
         return settings, str(config.get("init", ""))
@@ -118,7 +121,7 @@ def read_config(path: Path) -> tuple[EvolveSettings, str]:
         raise RunError(f"{path}: not a run's {CONFIG}: {type(error).__name__}") from error
 
 
-def _map_sha256(settings: EvolveSettings) -> str:
+def _map_sha256(settings: RunSettings) -> str:
     """Digest of the map's file, or "". Raises SettingsError."""
     try:
         return map_digest(settings.scenario) if is_map_file(settings.scenario) else ""
@@ -144,7 +147,7 @@ def open_run(folder: Path) -> RunFolder:
         raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
     tracking = meta["tracking"] if isinstance(meta.get("tracking"), dict) else {}
     fits = (
-        all(type(meta.get(name)) is int for name in ("generation", "car_steps"))
+        all(type(meta.get(name)) is int for name in settings.counts)
         and type(meta.get("solved")) is bool
         and all(isinstance(tracking.get(name), str) for name in ("uri", "key"))
         and isinstance(tracking.get("run_id"), str | None)
@@ -155,13 +158,12 @@ def open_run(folder: Path) -> RunFolder:
     return run
 
 
-def new_run(output: Path, name: str, settings: EvolveSettings, init: str = "", init_sha256: str = "") -> RunFolder:
+def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init_sha256: str = "") -> RunFolder:
     """A new run's folder, checked but not yet made. Raises RunError."""
     if not name:
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        kind = "evolution" if settings.search == "evolution" else "random"
         road = re.sub(r"[^\w.+=@-]", "_", label(settings.scenario))
-        name = f"{road}-{kind}-s{settings.seed}-{stamp}"
+        name = f"{road}-{settings.algorithm}-s{settings.seed}-{stamp}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
@@ -178,16 +180,24 @@ def new_run(output: Path, name: str, settings: EvolveSettings, init: str = "", i
 
 
 def is_finished(run: RunFolder) -> bool:
-    """Whether there is nothing left to do: evolved to the end, and all files are there."""
-    if run.saved is None or not (run.path / SUMMARY).is_file():
-        return False
-    meta = run.saved[1]
-    limit = run.settings.car_steps
-    return (
-        bool(meta["solved"])
-        or int(meta["generation"]) >= run.settings.generations
-        or 0 < limit <= int(meta["car_steps"])
-    )
+    """Whether there is nothing left to do: learned to the end, and all files are there."""
+    return run.saved is not None and (run.path / SUMMARY).is_file() and run.settings.ended(run.saved[1])
+
+
+def new_learning(
+    settings: RunSettings,
+    pool: WorkerPool,
+    maps: Maps,
+    initial: np.ndarray | None = None,
+    on_progress: Callable[[str, int, int], None] | None = None,
+) -> Learning:
+    """The learner that such settings ask for."""
+    if isinstance(settings, EvolveSettings):
+        return Evolution(settings, pool, maps, initial, on_progress=on_progress)
+    assert isinstance(settings, DqnSettings)
+    from cluster.dqn_loop import Dqn  # and PyTorch, which evolution does not need
+
+    return Dqn(settings, pool, maps, initial, on_progress=on_progress)
 
 
 @dataclass
@@ -200,7 +210,9 @@ class Session:
         maps: who builds maps.
         tracker: who logs to MLflow.
         process_started: time.perf_counter() of the process's start.
-        on_row: told each generation's number and row.
+        on_row: told how many steps are done, and the last one's row.
+        film: whether the champion is filmed.
+        wall_limit_s: seconds of learning, with those before a resumption, after which no step but the first is begun.
         lost: one line about what could not be written, beside what matters.
     """
 
@@ -212,53 +224,61 @@ class Session:
     initial: np.ndarray | None = None
     on_row: Callable[[int, dict[str, float]], None] | None = None
     on_progress: Callable[[str, int, int], None] | None = None
+    film: bool = True
+    wall_limit_s: float = math.inf
     lost: str = ""
-    evolution: Evolution = field(init=False)
-    _unsaved: bool = False  # whether the last generation is in memory alone
+    learning: Learning = field(init=False)
+    _unsaved: bool = False  # whether the last step is in memory alone
 
     def __post_init__(self) -> None:
-        self.evolution = Evolution(self.run.settings, self.pool, self.maps, self.initial, on_progress=self.on_progress)
+        self.learning = new_learning(self.run.settings, self.pool, self.maps, self.initial, self.on_progress)
         self._digest = self.run.digest()
         if self.run.saved is not None:
-            self.evolution.restore(*self.run.saved)
+            self.learning.restore(*self.run.saved)
 
-    def evolve(self) -> None:
-        """Evolve to the end, saving after every generation."""
-        evolution = self.evolution
-        for step, past in enumerate(evolution.history):
+    def learn(self) -> None:
+        """Learn to the end, saving after every step."""
+        learning = self.learning
+        for step, past in enumerate(learning.history):
             self._log(step, past)  # what MLflow has is skipped
-        if evolution.history:
+        if learning.history:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
-        evolution.meanwhile = self._save_last
+        learning.meanwhile, learning.out_of_time = self._save_last, self._out_of_time
         try:
-            while not evolution.done():
-                row = evolution.step()
-                wall = evolution.wall_before_s + now() - self.process_started
-                evolution.timed(row, wall, evolution.history[-2] if len(evolution.history) > 1 else None)
+            while not learning.done() and not (learning.steps and self._out_of_time()):
+                row = learning.step()
+                learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
                 self._unsaved = True
                 if self.on_row:
-                    self.on_row(evolution.generation, row)
+                    self.on_row(learning.steps, row)
             self._save_last()
         except CheckpointError:
             raise
         except BaseException:
-            self._save_last()  # the state is whole until the next generation's results are there
+            self._save_last()  # the state is whole until the next step changes it
             raise
 
+    def _wall_s(self) -> float:
+        """Seconds that the run has taken, in this process and before."""
+        return self.learning.wall_before_s + now() - self.process_started
+
+    def _out_of_time(self) -> bool:
+        return self._wall_s() >= self.wall_limit_s
+
     def _save_last(self) -> None:
-        """Save and log the last generation, if that was not done."""
+        """Save and log the last step, if that was not done."""
         if self._unsaved:
-            evolution = self.evolution
+            learning = self.learning
             self.save()
             self._unsaved = False
-            self._log(evolution.generation - 1, evolution.history[-1])
+            self._log(learning.steps - 1, learning.history[-1])
 
     def _log(self, step: int, row: dict[str, float]) -> None:
-        self.tracker.log_row(step, {name: row[name] for name in METRICS})
+        self.tracker.log_row(step, {name: row[name] for name in self.learning.columns if name not in NOT_LOGGED})
 
     def save(self) -> None:
         """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
-        arrays, meta = self.evolution.state()
+        arrays, meta = self.learning.state()
         meta |= {
             "digest": self._digest,
             "init_sha256": self.run.init_sha256,
@@ -268,7 +288,7 @@ class Session:
         self._write_history()
 
     def _write_history(self) -> None:
-        checkpoint.write_atomic(self.run.path / HISTORY, self.evolution.history_csv(), durable=False)
+        checkpoint.write_atomic(self.run.path / HISTORY, self.learning.history_csv(), durable=False)
 
     def finish(self, workers: int) -> dict[str, Any]:
         """Measure the champion on held-out roads and write what is left: champion, elites, summary, pictures.
@@ -277,42 +297,44 @@ class Session:
         """
         from cluster import report
 
-        evolution, path = self.evolution, self.run.path
-        assert evolution.champion is not None
+        learning, path = self.learning, self.run.path
+        learning.conclude()
+        assert learning.champion is not None
         settings = self.run.settings
         champion = Champion(
-            evolution.champion.genome, settings.policy, settings.scenario, evolution.sim, settings.traffic
+            learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic
         )
         champion.save(path / CHAMPION)
-        checkpoint.save(path / ELITES, {"genomes": np.array(evolution.elites)}, {"policy": self.run.settings.policy})
-        figures = evolution.held_out()
-        report.curves(evolution.history, path / "curves.png")
+        checkpoint.save(path / ELITES, {"genomes": np.array(learning.elites)}, {"policy": self.run.settings.policy})
+        figures = learning.held_out()
+        report.curves(learning.history, path / "curves.png", learning.step_name)
         episodes = held_out_episodes(self.maps, settings.traffic)
         scenario = self.maps.get(episodes.maps[int(episodes.rows[0]["map"])])
         result, states, _ = drive_trajectory(
-            evolution.spec, champion.genome, scenario, episodes.rows[0]["start"], evolution.curriculum.goal_limits(),
-            evolution.sim, episodes.worlds[0],
+            learning.spec, champion.genome, scenario, episodes.rows[0]["start"], learning.curriculum.goal_limits(),
+            learning.sim, episodes.worlds[0],
         )  # fmt: skip
         report.trajectory(
             scenario, states, path / "trajectory.png",
             f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
-        self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
-        wall = evolution.wall_before_s + now() - self.process_started
+        if self.film:
+            self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
+        wall = self._wall_s()
         summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracker.run_id or "",
             "scenario": self.run.settings.scenario,
             "seed": self.run.settings.seed,
             "workers": workers,
-            "generations": evolution.generation,
-            "car_steps": evolution.car_steps,
+            **learning.summary(),
+            "car_steps": learning.car_steps,
             "wall_s": round(wall, 3),
-            "car_steps_per_s": round(evolution.car_steps / wall, 1),
+            "car_steps_per_s": round(learning.car_steps / wall, 1),
             "champion_sha256": champion.sha256,
-            "champion_generation": evolution.champion.generation,
-            "validation_success_rate": evolution.champion.success_rate,
-            "solved": evolution.solved,
+            f"champion_{learning.step_name}": learning.champion.generation,
+            "validation_success_rate": learning.champion.success_rate,
+            "solved": learning.solved,
             "held_out": figures,
         }
         self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
@@ -326,7 +348,7 @@ class Session:
         try:
             champion_video(
                 champion, scenario, start, self.run.path / VIDEO,
-                f"{champion.scenario}, held-out map {scenario.seed:,}", self.evolution.on_progress, world,
+                f"{champion.scenario}, held-out map {scenario.seed:,}", self.learning.on_progress, world,
             )  # fmt: skip
         except VideoError as error:
             (self.run.path / VIDEO).unlink(missing_ok=True)
@@ -337,8 +359,8 @@ class Session:
         checkpoint.write_atomic(self.run.path / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
 
 
-def make_tracker(run: RunFolder, uri: str, experiment: str) -> Tracker:
-    """The run's tracker, not yet started."""
+def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "") -> Tracker:
+    """The run's tracker, not yet started; `parent_id` is MLflow's run that it belongs to."""
     settings = run.settings
     known = run.saved[1]["tracking"] if run.saved else {}
     params = {name: str(value) for name, value in to_dict(settings).items()}
@@ -346,12 +368,12 @@ def make_tracker(run: RunFolder, uri: str, experiment: str) -> Tracker:
     for part, values in dataclasses.asdict(SimConfig()).items():
         params |= {f"{part}/{k}": str(v) for k, v in values.items()}
     tags = {
-        "algorithm": "evolution",
-        "search": settings.search,
+        "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
+        "search": settings.algorithm,
         "scenario": settings.scenario,
         "seed": str(settings.seed),
         "git_commit": git_commit(),
-    }
+    } | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(
         uri, experiment, run.name, params, tags,
         run_id=known.get("run_id") if known.get("uri") == uri else None,

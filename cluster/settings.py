@@ -5,17 +5,27 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, TypeVar, get_args, get_type_hints
 
+from cluster.checkpoint import MAX_BYTES
 from evolution.curriculum import CurriculumConfig
+from evolution.experience import observation_dtype_and_width
 from evolution.genetic import GeneticConfig
 from evolution.policy import Observation, PolicySpec
+from evolution.replay import MAX_N_STEP
 from gridsim.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
-DEFAULT_POLICY: dict[Observation, str] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
+MAX_REPLAY = 10_000_000
+REPLAY_BYTES = 16  # of a row, beside the observation, at most
+REPLAY_SHARE = 0.75  # of the largest checkpoint
+MAX_STEPS = 10**15  # car-steps or episodes
+MAX_UPDATES = 1_000_000  # for each thousand car-steps
+
+S = TypeVar("S", bound="RunSettings")
 
 
 class SettingsError(ValueError):
@@ -23,8 +33,13 @@ class SettingsError(ValueError):
 
 
 @dataclass(frozen=True)
-class EvolveSettings:
-    """What an evolution run depends on: two runs with equal settings have the same champion."""
+class RunSettings:
+    """What any learner's run depends on: two runs with equal settings have the same champion."""
+
+    command: ClassVar[str]  # that makes such a run
+    default_policies: ClassVar[dict[Observation, str]]
+    unbound: ClassVar[tuple[str, ...]]  # what may be greater when a run is resumed: it only ends later
+    counts: ClassVar[tuple[str, ...]]  # what a checkpoint tells of how far a run has come, integers
 
     scenario: str = "seamless"
     """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
@@ -35,14 +50,90 @@ class EvolveSettings:
     observation: Observation = "rays"
     """What the network sees: 31 ranges, or the occupancy grid; and the speed."""
     policy: str = ""
+    """Network; by default one that suits the observation."""
+    car_steps: int = 0
+    """Car-steps at most, checked after each generation or evaluation; 0: any number."""
+    until: float = 0.985
+    """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
+
+    pace: float = 0.0
+    """Mean speed in m/s below which a champion's success counts for less, and which training's time limits follow; 0:
+    the scenario's own, a little above its lower speed."""
+
+    def __post_init__(self) -> None:
+        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
+            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
+        if self.traffic == -1:
+            object.__setattr__(self, "traffic", default_traffic(self.scenario))
+        if not self.policy:
+            object.__setattr__(self, "policy", self.default_policies.get(self.observation, ""))
+
+    @property
+    def algorithm(self) -> str:
+        """What learns: evolution, random or dqn."""
+        raise NotImplementedError
+
+    def curriculum(self) -> CurriculumConfig:
+        """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
+        low, _ = speed_interval(self.scenario)
+        if self.pace:
+            return CurriculumConfig(pace=self.pace + 1.15, champion_pace=self.pace)
+        if self.traffic:
+            return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3)
+        return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
+
+    def ended(self, so_far: Mapping[str, Any]) -> bool:
+        """Whether a run that has come so far (`counts`, and `solved`) has nothing left to do."""
+        return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
+
+    def check(self) -> None:
+        """Raises SettingsError, one line that says what to change."""
+        try:
+            check_name(self.scenario)
+            if is_map_file(self.scenario):
+                build(self.scenario, 0)  # kept, so that it is read once
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
+        if not 0 <= self.traffic <= MAX_TRAFFIC:
+            raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
+        if self.traffic and is_map_file(self.scenario):
+            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
+        if not 0 <= self.seed < 1 << 63:
+            raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
+        if not 0 <= self.car_steps <= MAX_STEPS:
+            raise SettingsError(f"--car-steps must be 0 to {MAX_STEPS:,}, not {self.car_steps:,}")
+        if not self.until > 0.0:
+            raise SettingsError(f"--until must be above 0, not {self.until}")
+        low, high = speed_interval(self.scenario)
+        if self.pace and not low <= self.pace <= high:
+            raise SettingsError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
+        try:
+            spec = PolicySpec.parse(self.policy)
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
+        if spec.observation != self.observation:
+            raise SettingsError(
+                f"policy {self.policy} sees the {spec.observation}; "
+                f"give --observation {spec.observation}, or a policy such as {self.default_policies[self.observation]}"
+            )
+
+
+@dataclass(frozen=True)
+class EvolveSettings(RunSettings):
+    """What an evolution run depends on."""
+
+    command: ClassVar[str] = "gridsim-evolve"
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
+    unbound: ClassVar[tuple[str, ...]] = ("generations",)
+    counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
+
+    policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, by default mlp:6,7; on the grid cnn: with the channels of two
     convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 120
     """Generations at most; a run whose champion is solved stops earlier."""
-    car_steps: int = 0
-    """Car-steps at most, checked after each generation; 0: any number."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8
@@ -61,85 +152,153 @@ class EvolveSettings:
     """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
-    until: float = 0.985
-    """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
-    def __post_init__(self) -> None:
-        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
-            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
-        if self.traffic == -1:
-            object.__setattr__(self, "traffic", default_traffic(self.scenario))
-        if not self.policy:
-            object.__setattr__(self, "policy", DEFAULT_POLICY.get(self.observation, ""))
+    @property
+    def algorithm(self) -> str:
+        return self.search
 
-    def curriculum(self) -> CurriculumConfig:
-        """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
-        low, _ = speed_interval(self.scenario)
-        if self.traffic:
-            return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3)
-        return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
+    def ended(self, so_far: Mapping[str, Any]) -> bool:
+        return super().ended(so_far) or int(so_far["generation"]) >= self.generations
 
     def check(self) -> None:
-        """Raises SettingsError, one line that says what to change."""
-        try:
-            check_name(self.scenario)
-            if is_map_file(self.scenario):
-                build(self.scenario, 0)  # kept, so that it is read once
-        except ValueError as error:
-            raise SettingsError(str(error)) from error
-        if not 0 <= self.traffic <= MAX_TRAFFIC:
-            raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
-        if self.traffic and is_map_file(self.scenario):
-            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
-        if not 0 <= self.seed < 1 << 63:
-            raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
-        if self.car_steps < 0:
-            raise SettingsError(f"--car-steps must be 0 or more, not {self.car_steps}")
+        super().check()
         if self.generations < 1:
             raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
         if self.population > MAX_POPULATION:
             raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
         for name in ("crossover", "mutation_rate", "bump_rate"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise SettingsError(f"--{name.replace('_', '-')} must be 0 to 1, not {getattr(self, name)}")
+            _check_share(self, name)
         if not 0.0 <= self.sigma < math.inf:
             raise SettingsError(f"--sigma must be 0 or more, not {self.sigma}")
-        if not self.until > 0.0:
-            raise SettingsError(f"--until must be above 0, not {self.until}")
         try:
-            spec = PolicySpec.parse(self.policy)
             GeneticConfig(self.population, self.elites, self.tournament, self.parents, self.crossover).check()
         except ValueError as error:
             raise SettingsError(str(error)) from error
-        if spec.observation != self.observation:
+
+
+@dataclass(frozen=True)
+class DqnSettings(RunSettings):
+    """What a run of the DQN depends on."""
+
+    command: ClassVar[str] = "gridsim-dqn"
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
+    unbound: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
+    counts: ClassVar[tuple[str, ...]] = ("evaluation", "car_steps", "episodes", "updates", "converged")
+
+    policy: str = ""
+    """Network of the Q function: mlp: and the sizes of its hidden layers, with +steering if it sees how its own wheels
+    stand, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
+    layer and the number of frames, by default cnn:16,32,256@4."""
+    car_steps: int = 40_000_000
+    """Car-steps at most, checked after each evaluation; 0: any number."""
+    episodes: int = 0
+    """Training episodes at most, checked after each evaluation; 0: any number."""
+    converged: float = 0.01
+    """Stop when the Q values of fixed observations change by less than this share of their spread from one evaluation
+    to the next, three times in a row; 0: never."""
+    evaluate_every: int = 1_000_000
+    """Car-steps from one evaluation to the next."""
+    batch: int = 256
+    """Transitions of one update."""
+    updates: float = 4.0
+    """Updates for each thousand car-steps collected."""
+    replay: int = 0
+    """Observations that the replay buffer holds; 0: a million, of grids a hundred thousand."""
+    prioritised: bool = False
+    """Draw transitions by their errors (Schaul et al. 2016) in place of uniformly."""
+    double: bool = True
+    """Double DQN (van Hasselt et al. 2016)."""
+    n_step: int = 3
+    """Steps of rewards in a target."""
+    discount: float = 0.99
+    """Discount factor of a step."""
+    learning_rate: float = 5e-4
+    """Of Adam, at the start; it falls to a twentieth over --anneal."""
+    anneal: int = 30_000_000
+    """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth."""
+    target_period: int = 500
+    """Updates from one copy of the target network to the next."""
+    epsilon: float = 0.4
+    """Share of random actions of the episode that explores most; others of a batch explore less (Horgan et al.
+    2018)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the learner computes: auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.replay:
+            object.__setattr__(self, "replay", 1_000_000 if self.observation == "rays" else 100_000)
+
+    @property
+    def algorithm(self) -> str:
+        return "dqn"
+
+    def ended(self, so_far: Mapping[str, Any]) -> bool:
+        return super().ended(so_far) or bool(so_far["converged"]) or 0 < self.episodes <= int(so_far["episodes"])
+
+    def check(self) -> None:
+        super().check()
+        for name in ("evaluate_every", "batch", "replay", "n_step", "anneal", "target_period"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"--{name.replace('_', '-')} must be 1 or more, not {getattr(self, name)}")
+        for name, most in (
+            ("n_step", MAX_N_STEP), ("anneal", MAX_STEPS), ("episodes", MAX_STEPS), ("updates", MAX_UPDATES),
+        ):  # fmt: skip
+            if getattr(self, name) > most:
+                raise SettingsError(f"--{name.replace('_', '-')} must be {most:,} or less, not {getattr(self, name):,}")
+        for name in ("discount", "epsilon", "converged"):
+            _check_share(self, name)
+        for name in ("updates", "learning_rate"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise SettingsError(f"--{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
+        if self.episodes < 0:
+            raise SettingsError(f"--episodes must be 0 or more, not {self.episodes}")
+        if not self.batch <= self.replay <= MAX_REPLAY:
+            raise SettingsError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
+        self._check_replay_fits()
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise SettingsError(f"--device must be auto, cpu or cuda, not {self.device}")
+
+    def _check_replay_fits(self) -> None:
+        """Raises SettingsError where a checkpoint could not hold the replay beside what else there is."""
+        dtype, width = observation_dtype_and_width(PolicySpec.parse(self.policy))
+        most = int(REPLAY_SHARE * MAX_BYTES) // (dtype.itemsize * width + REPLAY_BYTES)
+        if self.replay > most:
             raise SettingsError(
-                f"policy {self.policy} sees the {spec.observation}; "
-                f"give --observation {spec.observation}, or a policy such as {DEFAULT_POLICY[self.observation]}"
+                f"--replay must be {most:,} or less for {self.policy}, not {self.replay:,}: a checkpoint holds no more"
             )
 
 
-def to_dict(settings: EvolveSettings) -> dict[str, Any]:
+SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}
+
+
+def _check_share(settings: RunSettings, name: str) -> None:
+    value = getattr(settings, name)
+    if not 0.0 <= value <= 1.0:
+        raise SettingsError(f"--{name.replace('_', '-')} must be 0 to 1, not {value}")
+
+
+def to_dict(settings: RunSettings) -> dict[str, Any]:
     """Plain numbers and strings."""
     return dataclasses.asdict(settings)
 
 
-def from_dict(values: dict[str, Any]) -> EvolveSettings:
+def from_dict(kind: type[S], values: dict[str, Any]) -> S:
     """The inverse of `to_dict`. Raises SettingsError for names or types that do not fit."""
-    fields = {f.name: f for f in dataclasses.fields(EvolveSettings)}
+    fields = {f.name: f for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(fields))
     if unknown:
         raise SettingsError(f"unknown setting {unknown[0]!r}")
-    defaults = EvolveSettings()
+    defaults = kind()
     for name, value in values.items():
         wanted = type(getattr(defaults, name))
         if wanted is float and isinstance(value, int) and not isinstance(value, bool):
             value = values[name] = float(value)
         if type(value) is not wanted:
             raise SettingsError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
-    settings = EvolveSettings(**values)
-    if settings.ranking not in ("scalar", "pareto") or settings.search not in ("evolution", "random"):
-        raise SettingsError("ranking is scalar or pareto, search is evolution or random")
-    if settings.observation not in DEFAULT_POLICY:
-        raise SettingsError("observation is rays or grid")
+        choices = get_args(get_type_hints(kind)[name])
+        if choices and value not in choices:
+            raise SettingsError(f"setting {name!r} must be {' or '.join(choices)}, not {value!r}")
+    settings = kind(**values)
     settings.check()
     return settings

@@ -220,9 +220,16 @@ class Tracker:
             inside = path.relative_to(folder)
             if path.is_file() and not any(part.startswith(".") for part in inside.parts):
                 found.append((path, None if inside.parent == Path(".") else inside.parent.as_posix()))
+        self._queue(found)
+
+    def log_files(self, paths: Iterable[str | os.PathLike[str]]) -> None:
+        """Queue files, each under its own name; what `log_artifacts` says of them holds here too."""
+        self._queue([(Path(path).resolve(), None) for path in paths])
+
+    def _queue(self, files: Iterable[tuple[Path, str | None]]) -> None:
         with self._changed:
             self._check_open()
-            self._files.extend(found)
+            self._files.extend(files)
             self._changed.notify_all()
         self.start()
 

@@ -3,8 +3,8 @@
 Numba compiles one function at a time in a process. So processes of their own compile what a run needs while this one
 starts Ray, and all others then load it from the cache on disk (`gridsim.jit`).
 
-Run as `python -m cluster.warm kernels|roads SCENARIO POLICY TRAFFIC`, it is such a process: it prints a line when what
-a run needs first is there, and goes on with what is needed at the run's end.
+Run as `python -m cluster.warm kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it prints a line
+when what a run needs first is there, and goes on with what is needed at the run's end.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.settings import EvolveSettings
-from cluster.worker import Task, Worker
+from cluster.settings import DqnSettings, RunSettings
+from cluster.worker import CollectTask, Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, trajectory
@@ -58,14 +58,15 @@ class Warming:
         self.processes.clear()
 
 
-def begin(settings: EvolveSettings) -> Warming:
+def begin(settings: RunSettings) -> Warming:
     """Begin to compile what such a run needs, if it is not in the cache."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
-    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{'traffic' if settings.traffic else 'alone'}")
+    traffic = "traffic" if settings.traffic else "alone"
+    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}")
     if warming.done.exists():
         return warming
-    what = [settings.scenario, settings.policy, str(settings.traffic)]
+    what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
     # Neither the folder it is started from nor Ctrl-C is its own: it is stopped by `stop`.
     for part in ("kernels", "roads"):
         with contextlib.suppress(OSError):
@@ -88,8 +89,8 @@ def _absent(traffic: int) -> np.ndarray:
     return worlds
 
 
-def compile_kernels(policy: str, traffic: int) -> None:
-    """Compile, or load from the cache, what evaluates a generation."""
+def compile_kernels(policy: str, traffic: int, command: str) -> None:
+    """Compile, or load from the cache, what evaluates members, and for the DQN also what collects experience."""
     recipes = np.zeros(2, dtype=RECIPE)
     recipes["a"] = recipes["b"] = FRESH
     recipes["seed"] = 1
@@ -107,6 +108,21 @@ def compile_kernels(policy: str, traffic: int) -> None:
         rewind=1,
     )
     Worker().evaluate(task, [blank(config)], recipes)
+    if command == DqnSettings.command:
+        Worker().collect(
+            CollectTask(
+                policy=policy,
+                weights=task.parents[0].copy(),
+                episodes=task.episodes,
+                worlds=task.worlds,
+                maps=(),
+                epsilons=np.zeros(1, dtype=np.float32),
+                keys=np.zeros(1, dtype=np.uint64),
+                limits=task.limits,
+                config=config,
+            ),
+            [blank(config)], 0, 1,
+        )  # fmt: skip
 
 
 def compile_film(policy: str, traffic: int) -> None:
@@ -128,10 +144,10 @@ def compile_roads(scenario: str, traffic: int) -> None:
     spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig().traffic)
 
 
-def main(part: str, scenario: str, policy: str, traffic: int) -> None:
+def main(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
     """What the process does."""
     if part == "kernels":
-        compile_kernels(policy, traffic)
+        compile_kernels(policy, traffic, command)
         print("ready", flush=True)
     else:
         compile_roads(scenario, traffic)
@@ -141,4 +157,4 @@ def main(part: str, scenario: str, policy: str, traffic: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]))
+    main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]), sys.argv[5])

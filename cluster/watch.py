@@ -48,7 +48,7 @@ class WatchFlags:
     output: str = ""
     """Write a film, .mp4 or .gif, in place of the window."""
     generation: int | None = None
-    """Watch this generation's elite (0 is the first), not the champion."""
+    """Watch this generation's elite (of a DQN: this evaluation's network; 0 is the first), not the champion."""
     follow: bool = False
     """Watch the newest elite, while the run is still going."""
     scenario: str = ""
@@ -130,7 +130,7 @@ def _map(name: str, seed: int, config: SimConfig) -> tuple[Scenario, np.ndarray]
 
 
 class Elites:
-    """The elite of each generation of a run that is over, or still going."""
+    """The elite of each generation, of a DQN the network of each evaluation; of a run that is over, or still going."""
 
     def __init__(self, folder: Path):
         """Read the run's settings. Raises RunError."""
@@ -160,13 +160,13 @@ class Elites:
 
     def get(self, generation: int | None) -> tuple[Champion, str]:
         """The elite of a generation, or the newest, and what it is called. Raises CheckpointError, UsageError."""
-        genomes = self.read()
+        genomes, settings = self.read(), self.settings
+        step = settings.counts[0]  # generation, or evaluation
         number = len(genomes) - 1 if generation is None else generation
         if not 0 <= number < len(genomes):
-            raise UsageError(f"--generation {number}: the run has generations 0 to {len(genomes) - 1}")
-        settings = self.settings
+            raise UsageError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
         champion = Champion(genomes[number], settings.policy, settings.scenario, SimConfig(), settings.traffic)
-        return champion, f"elite of generation {number}"
+        return champion, f"elite of {step} {number}"
 
 
 def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
@@ -190,7 +190,7 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
         return lambda: (champion, "champion")
     elites = Elites(source)
     if flags.follow and not elites.changed():
-        print("waiting for the first generation ...", flush=True)
+        print(f"waiting for the first {elites.settings.counts[0]} ...", flush=True)
         while not elites.changed():
             time.sleep(0.1)
     if flags.generation is not None:

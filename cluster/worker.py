@@ -1,4 +1,4 @@
-"""What one worker does with its share of a generation: a plain class that any pool can hold. No Ray in it."""
+"""What one worker does with its share of a task: a plain class that any pool can hold. No Ray in it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from evolution.breeding import Mutation, breed
+from evolution.collecting import collect
+from evolution.experience import Experience
 from evolution.policy import PolicySpec
 from evolution.rollout import RESULT, Limits, evaluate, raced_dtype
 from gridsim.config import SimConfig
@@ -56,8 +58,39 @@ class Task:
         freeze(self.worlds)
 
 
+@dataclass(frozen=True)
+class CollectTask:
+    """What all chunks of a batch of experience share; broadcast once. Its arrays become read-only.
+
+    Attributes:
+        policy: the network, as in `mlp:64,64`.
+        weights: float32 [genes].
+        episodes: EPISODE [episodes].
+        worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
+        maps: (scenario, seed) of each map that `episodes` indexes.
+        epsilons: float32 [episodes], the share of random actions in each.
+        keys: uint64 [episodes], of the random numbers of each.
+        limits: where an episode ends if nothing happens.
+        config: the simulator's.
+    """
+
+    policy: str
+    weights: np.ndarray
+    episodes: np.ndarray
+    worlds: np.ndarray
+    maps: tuple[tuple[str, int], ...]
+    epsilons: np.ndarray
+    keys: np.ndarray
+    limits: Limits
+    config: SimConfig
+
+    def __post_init__(self) -> None:
+        for array in (self.weights, self.episodes, self.worlds, self.epsilons, self.keys):
+            freeze(array)  # as a Task's
+
+
 class Worker:
-    """Breeds members from recipes and drives them. It keeps nothing that a result depends on."""
+    """Breeds and drives members, or collects experience. It keeps nothing that a result depends on."""
 
     def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
         """Results `task.row` [n, episodes] of recipes RECIPE [n], and the seconds it took (for statistics only).
@@ -77,3 +110,25 @@ class Worker:
             raced["rewound"], raced["world"] = rewound, worlds
             results = raced
         return results, time.perf_counter() - started
+
+    def collect(
+        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+    ) -> tuple[Experience, np.ndarray, float]:
+        """Experience and RESULT [stop - first] of the task's episodes from `first` on, and the seconds it took.
+
+        `maps` are those of `task.maps`, in that order.
+        """
+        started = time.perf_counter()
+        these = slice(first, stop)
+        experience, results = collect(
+            PolicySpec.parse(task.policy),
+            task.weights,
+            maps,
+            task.episodes[these],
+            task.epsilons[these],
+            task.keys[these],
+            task.limits,
+            task.config,
+            task.worlds[these],
+        )
+        return experience, results, time.perf_counter() - started

@@ -149,6 +149,14 @@ class Curriculum:
             worlds = np.concatenate([worlds, self.crash_worlds[chosen]])
         return Episodes([self.map_seeds[m] for m in used], fresh, worlds)
 
+    def starts(self, batch: int, count: int) -> Episodes:
+        """So many new episodes on the training maps, for a learner that takes them in batches."""
+        return self._drawn(batch, count, 3)
+
+    def _drawn(self, generation: int, count: int, purpose: int) -> Episodes:
+        used, episodes, worlds = self._new_starts(generation, count, purpose)
+        return Episodes([self.map_seeds[m] for m in used], episodes, worlds)
+
     def _check(self, maps: np.ndarray, worlds: np.ndarray) -> None:
         """Refuse traffic [n, cars, fields] that is not on its map [n]; only here are the maps at hand for nothing."""
         if worlds.shape[1]:
@@ -161,8 +169,7 @@ class Curriculum:
 
     def race(self, generation: int) -> Episodes:
         """The race that decides among the generation's best."""
-        used, episodes, worlds = self._new_starts(generation, self.config.race_episodes, 2)
-        return Episodes([self.map_seeds[m] for m in used], episodes, worlds)
+        return self._drawn(generation, self.config.race_episodes, 2)
 
     def raced(self, order: np.ndarray, results: np.ndarray, race: Episodes) -> None:
         """Learn from a race: remember the leaders' crashes, lengthen the task when the best succeed.

@@ -25,6 +25,7 @@ MAX_GENES = 1_000_000
 _F, _U = np.float32, np.uint64
 RAY_HALF = _F(8.0)  # m, the range whose input is 0
 SPEED_SCALE = _F(10.0)  # m/s, the speed whose input is 0
+STEERING_SCALE = _F(0.5)  # rad, the steering angle whose input is 1
 
 
 Observation = Literal["rays", "grid"]
@@ -46,9 +47,10 @@ class PolicySpec(ABC):
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read `mlp:6,7`, `mlp:6,7+motion` or `cnn:16,32,256@4`. Raises ValueError with one line for all else."""
-        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?", text):
-            spec: PolicySpec = MlpSpec(tuple(int(n) for n in match[1].split(",")), motion=bool(match[2]))
+        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises ValueError with one line otherwise."""
+        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", text):
+            sizes = tuple(int(n) for n in match[1].split(","))
+            spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]))
             if min(spec.hidden) < 1 or spec.size > MAX_GENES:
                 raise ValueError(
                     f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
@@ -66,8 +68,8 @@ class PolicySpec(ABC):
                 raise ValueError(f"policy {text!r} has {spec.size:,} genes; {MAX_GENES:,} are the most")
             return spec
         raise ValueError(
-            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7 or mlp:6,7+motion, "
-            "or cnn for the grid, as in cnn:8,16,32@1"
+            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "
+            "mlp:6,7+steering, or cnn for the grid, as in cnn:8,16,32@1"
         )
 
     @property
@@ -94,21 +96,24 @@ class PolicySpec(ABC):
 class MlpSpec(PolicySpec):
     """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts.
 
-    With `motion` it also sees how fast the cars that rays meet come closer (`boxes.cast_boxes`).
+    With `motion` it also sees how fast the cars that rays meet come closer (`boxes.cast_boxes`), with `steering` how
+    its own wheels stand, which a driver without memory cannot know otherwise: they take half a second to turn.
     """
 
     observation = "rays"
 
     hidden: tuple[int, ...] = (6, 7)
     motion: bool = False
+    steering: bool = False
 
     def __str__(self) -> str:
-        return "mlp:" + ",".join(map(str, self.hidden)) + ("+motion" if self.motion else "")
+        more = ("+motion" if self.motion else "") + ("+steering" if self.steering else "")
+        return "mlp:" + ",".join(map(str, self.hidden)) + more
 
     @property
     def inputs(self) -> int:
-        """The rays, what they meet's motion if it is seen, and the speed."""
-        return INPUTS + (INPUTS - 1 if self.motion else 0)
+        """The rays, what they meet's motion if it is seen, the speed, and the steering angle if it is seen."""
+        return INPUTS + (INPUTS - 1 if self.motion else 0) + self.steering
 
     @property
     def layers(self) -> np.ndarray:
@@ -191,10 +196,11 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
 
 
 @leaf
-def encode(ranges, closing, speed, inputs):
-    """What the network sees: float32 [rays + 1], or [2 * rays + 1] where closing is not None; the speed is the last.
+def encode(ranges, closing, speed, steering, inputs):
+    """What the network sees: float32 [rays + 2], or [2 * rays + 2] where closing is not None.
 
-    Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out.
+    Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out; then how fast what they meet comes closer, the
+    speed, and the steering angle (rad), which is the last, so that who does not see it passes it over.
     """
     rays = ranges.shape[0]
     for i in range(rays):
@@ -205,6 +211,7 @@ def encode(ranges, closing, speed, inputs):
             inputs[rays + i] = closing[i] / SPEED_SCALE
         last = 2 * rays
     inputs[last] = speed / SPEED_SCALE - _F(1.0)
+    inputs[last + 1] = steering / STEERING_SCALE
 
 
 @leaf
@@ -315,30 +322,39 @@ def decide(packed, layers, scratch):
 
 
 @njit
-def _act_on(packed, layers, observations, motion, reach, speed_limit, actions):
+def _act_on(packed, layers, observations, motion, steers, reach, speed_limit, steering_limit, actions):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
-    rays = (layers[0] - 1) // 2 if motion else layers[0] - 1
+    rays = layers[0] - 2 if steers else layers[0] - 1
+    rays = rays // 2 if motion else rays
+    last = 2 * rays if motion else rays
     ranges, closing = np.empty(rays, dtype=np.float32), np.empty(rays, dtype=np.float32)
     for n in range(observations.shape[0]):
         for i in range(rays):
             ranges[i] = observations[n, i] * reach
-        speed = observations[n, layers[0] - 1] * speed_limit
+        speed = observations[n, last] * speed_limit
+        steering = observations[n, last + 1] * steering_limit if steers else _F(0.0)
         if motion:
             for i in range(rays):
                 closing[i] = observations[n, rays + i] * speed_limit
-            encode(ranges, closing, speed, scratch)
+            encode(ranges, closing, speed, steering, scratch)
         else:
-            encode(ranges, None, speed, scratch)
+            encode(ranges, None, speed, steering, scratch)
         actions[n] = decide(packed, layers, scratch)
 
 
 def act_on(
-    spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, reach: float, speed_limit: float
+    spec: PolicySpec,
+    genome: np.ndarray,
+    observation: np.ndarray,
+    reach: float,
+    speed_limit: float,
+    steering_limit: float,
 ) -> int | np.ndarray:
     """Actions of a genome for the environment's observations.
 
     Args: observation float32 [32] or [n, 32]: ranges / reach, then speed / speed_limit; with motion [63] or [n, 63],
-    closing speeds / speed_limit between them; reach m; speed limit m/s.
+    closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit; reach m;
+    speed limit m/s; steering limit rad.
     Returns: an action, or int64 [n]; -1 where the network gives no number.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
@@ -347,6 +363,9 @@ def act_on(
     packed = np.empty(packed_size(spec.layers), dtype=np.float32)
     pack(np.ascontiguousarray(genome), spec.layers, packed)
     actions = np.empty(len(many), dtype=np.int64)
-    motion = isinstance(spec, MlpSpec) and spec.motion
-    _act_on(packed, spec.layers, np.ascontiguousarray(many), motion, _F(reach), _F(speed_limit), actions)
+    motion, steers = (spec.motion, spec.steering) if isinstance(spec, MlpSpec) else (False, False)
+    _act_on(
+        packed, spec.layers, np.ascontiguousarray(many), motion, steers,
+        _F(reach), _F(speed_limit), _F(steering_limit), actions,
+    )  # fmt: skip
     return int(actions[0]) if np.ndim(observation) == 1 else actions

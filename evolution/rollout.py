@@ -1,6 +1,7 @@
 """Episodes of whole populations: the fused loop sense -> network -> act -> advance, until done.
 
-The only user of the simulator within `evolution`. Pure functions: what is returned depends on the arguments alone.
+With `collecting`, which shares the parts of that loop, the only user of the simulator within `evolution`. Pure
+functions: what is returned depends on the arguments alone.
 """
 
 from __future__ import annotations
@@ -83,7 +84,7 @@ class Eye(NamedTuple):
     grid: np.ndarray  # uint8 [cells]
 
 
-def _eye(spec: PolicySpec, config: SimConfig) -> Eye | None:
+def eye_of(spec: PolicySpec, config: SimConfig) -> Eye | None:
     """None for a policy on rays. Raises: ValueError if it sees another number of them."""
     if isinstance(spec, CnnSpec):
         return Eye(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
@@ -92,7 +93,7 @@ def _eye(spec: PolicySpec, config: SimConfig) -> Eye | None:
     return None
 
 
-def _closing(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
+def closing_of(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
     """Room for the motion that a policy sees, if it sees any."""
     sees = isinstance(spec, MlpSpec) and spec.motion
     return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
@@ -109,7 +110,7 @@ class Setting(NamedTuple):
     rays: int
 
 
-def _on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
+def settings_on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
     """The settings of episodes on these maps."""
     k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
@@ -152,7 +153,7 @@ def _copy_world(world, kept):
 
 
 @njit
-def _make_room(setting, layers, rows, cars):
+def make_room(setting, layers, rows, cars):
     """Room that keeps the last `rows` states of a car and of so many others."""
     road = setting.road
     return Room(
@@ -167,13 +168,46 @@ def _make_room(setting, layers, rows, cars):
 
 
 @njit
-def _packed(genome, layers, eye):
+def packed_genome(genome, layers, eye):
     """A genome as its network reads it."""
     if eye is not None:
         return genome
     packed = np.empty(packed_size(layers), dtype=np.float32)
     pack(genome, layers, packed)
     return packed
+
+
+@leaf
+def see(setting, car, world, room, closing, eye):
+    """What a car senses: its ranges, and then the network's inputs in `room.scratch`, or the grid in an Eye."""
+    look(setting.road, setting.constants, setting.fan, car, world, room.beams, room.ranges, closing)
+    if eye is None:
+        encode(room.ranges, closing, car[SPEED], car[STEERING], room.scratch)
+    else:
+        fill_grid(eye.table, room.ranges, eye.grid)
+
+
+@leaf
+def choose(packed, layers, car, room, eye, begun):
+    """Index of the action for what was seen, which is overwritten; -1 where the network gives no number."""
+    if eye is None:
+        return decide(packed, layers, room.scratch)
+    convnet.push(eye.grid, begun, eye.room)
+    return convnet.decide(packed, layers, car[SPEED], eye.room)
+
+
+@leaf
+def advance(setting, bounds, car, visits, world, action, steps):
+    """One control period of the car and its world, the episode's steps-th from 0. Returns: End as a number."""
+    if world is not None:
+        flow(setting.network, setting.drivers, world, car)
+    end = drive(setting.road, setting.constants, car, visits, world, action)
+    if end == 0:
+        if car[DISTANCE] >= bounds.target:
+            return 3
+        if steps + 1 >= bounds.steps:
+            return 4
+    return end
 
 
 @njit
@@ -184,37 +218,33 @@ def _run(setting, packed, layers, bounds, room, world, closing, eye):
 
     Returns: End as a number.
     """
-    road, constants, car, ranges = setting.road, setting.constants, room.car, room.ranges
-    place(road, bounds.start, car, room.visits)
+    car = room.car
+    place(setting.road, bounds.start, car, room.visits)
     keep = room.ring.shape[0]
     end = 0
     steps = 0
     while end == 0:
-        look(road, constants, setting.fan, car, world, room.beams, ranges, closing)
-        if eye is None:
-            encode(ranges, closing, car[SPEED], room.scratch)
-            action = decide(packed, layers, room.scratch)
-        else:
-            fill_grid(eye.table, ranges, eye.grid)
-            convnet.push(eye.grid, steps == 0, eye.room)
-            action = convnet.decide(packed, layers, car[SPEED], eye.room)
+        see(setting, car, world, room, closing, eye)
+        action = choose(packed, layers, car, room, eye, steps == 0)
         if action < 0:  # not a number: the genome loses what is left
             end = 2
             break
         if keep > 0:
             _copy(car, room.ring[steps % keep])
-        if world is not None:
-            if keep > 0:
+            if world is not None:
                 _copy_world(world, room.world_ring[steps % keep])
-            flow(setting.network, setting.drivers, world, car)
-        end = drive(road, constants, car, room.visits, world, action)
+        end = advance(setting, bounds, car, room.visits, world, action, steps)
         steps += 1
-        if end == 0:
-            if car[DISTANCE] >= bounds.target:
-                end = 3
-            elif steps >= bounds.steps:
-                end = 4
     return end
+
+
+@leaf
+def note(car, end, row):
+    """Fill a RESULT."""
+    row["distance"] = car[DISTANCE]
+    row["paced"] = car[PACED]
+    row["steps"] = car[STEPS]
+    row["end"] = end
 
 
 @njit(nogil=True)
@@ -223,17 +253,13 @@ def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, co
 
     If rewind > 0 also rewound[:, column] and rewound_worlds[:, column].
     """
-    room = _make_room(setting, layers, rewind, 0 if traffic is None else traffic.shape[0])
+    room = make_room(setting, layers, rewind, 0 if traffic is None else traffic.shape[0])
     car = room.car
     for i in range(genomes.shape[0]):
-        packed = _packed(genomes[i], layers, eye)
+        packed = packed_genome(genomes[i], layers, eye)
         world = None if traffic is None else traffic.copy()
         end = _run(setting, packed, layers, bounds, room, world, closing, eye)
-        row = results[i, column]
-        row["distance"] = car[DISTANCE]
-        row["paced"] = car[PACED]
-        row["steps"] = car[STEPS]
-        row["end"] = end
+        note(car, end, results[i, column])
         if rewind > 0:
             row_back = max(int(car[STEPS]) - rewind, 0) % rewind
             back = room.ring[row_back]
@@ -246,9 +272,34 @@ def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, co
             rewound[i, column, 4] = back[STEERING]
 
 
+def bounds_of(episode: np.void, limits: Limits) -> Bounds:
+    """Where an EPISODE begins and ends."""
+    target, steps = episode["target"] or limits.target, episode["steps"] or limits.steps
+    return Bounds(freeze(episode["start"].copy()), _F(target), int(steps))
+
+
 def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
     """Target of each episode in m: float64 [e]."""
     return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
+
+
+def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | None) -> np.ndarray:
+    """The traffic float32 [e, cars, world.FIELDS] of episodes, nobody for None.
+
+    Raises: ValueError where its shape does not fit or an episode's limit makes no sense.
+    """
+    if not 0 < limits.steps <= MAX_STEPS:
+        raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
+    if worlds is None:
+        worlds = no_traffic(len(episodes))
+    if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
+        raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
+    return worlds
+
+
+def world_of(worlds: np.ndarray, k: int) -> np.ndarray | None:
+    """The k-th of worlds as kernels take it."""
+    return freeze(worlds[k].copy()) if worlds.shape[1] else None
 
 
 def evaluate(
@@ -276,31 +327,21 @@ def evaluate(
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
-    if not 0 < limits.steps <= MAX_STEPS:
-        raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
-    eye = _eye(spec, config)
-    if worlds is None:
-        worlds = no_traffic(len(episodes))
-    if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
-        raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
+    eye, worlds = eye_of(spec, config), checked_worlds(episodes, limits, worlds)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     results = np.zeros((len(genomes), len(episodes)), dtype=RESULT)
     rewound = np.zeros((len(genomes), len(episodes), 5 if rewind else 0), dtype=np.float32)
     cars = worlds.shape[1] if rewind else 0
     rewound_worlds = np.zeros((len(genomes), len(episodes), cars, TRAFFIC_FIELDS), dtype=np.float32)
-    settings = _on(scenarios, config)
+    settings = settings_on(scenarios, config)
     for column, episode in enumerate(episodes):
         _rollout(
             settings[episode["map"]],
             genomes,
             spec.layers,
-            Bounds(
-                freeze(episode["start"].copy()),
-                _F(episode["target"] or limits.target),
-                int(episode["steps"] or limits.steps),
-            ),
-            freeze(worlds[column].copy()) if worlds.shape[1] else None,
-            _closing(spec, config),
+            bounds_of(episode, limits),
+            world_of(worlds, column),
+            closing_of(spec, config),
             eye,
             rewind,
             column,
@@ -332,13 +373,13 @@ def trajectory(
     `gridsim.ego`, and the traffic then, float32 [steps + 1, cars, world.FIELDS]).
     """
     result, states, worlds = _trajectory(
-        _on([scenario], config)[0],
+        settings_on([scenario], config)[0],
         freeze(genome),
         spec.layers,
         Bounds(freeze(start), _F(limits.target), limits.steps),
         None if world is None or not len(world) else freeze(world.copy()),
-        _closing(spec, config),
-        _eye(spec, config),
+        closing_of(spec, config),
+        eye_of(spec, config),
     )
     row = np.zeros((), dtype=RESULT)
     row["distance"], row["paced"], row["steps"], row["end"] = result
@@ -347,10 +388,10 @@ def trajectory(
 
 @njit(nogil=True)
 def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
-    room = _make_room(setting, layers, bounds.steps + 1, 0 if traffic is None else traffic.shape[0])
+    room = make_room(setting, layers, bounds.steps + 1, 0 if traffic is None else traffic.shape[0])
     car = room.car
     world = None if traffic is None else traffic.copy()
-    end = _run(setting, _packed(genome, layers, eye), layers, bounds, room, world, closing, eye)
+    end = _run(setting, packed_genome(genome, layers, eye), layers, bounds, room, world, closing, eye)
     _copy(car, room.ring[int(car[STEPS])])
     if traffic is not None:
         _copy_world(world, room.world_ring[int(car[STEPS])])

@@ -4,12 +4,11 @@ Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and
 for `gymnasium.make("gridsim.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
 
 Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s, and with
-`motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s; or
+`motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s,
+and with `steering` at the end the steering angle as a share of 27 degrees; or
 `grid`, uint8 [80, 80], the occupancy grid of `gridsim.grid`, and with `frames` above 1 [frames, 80, 80], the newest
 last. Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of
-`vehicle.act_continuous`. Reward (the paper's): 0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a
-collision. f(distance) is this step's new ground and f(speed) the forward speed, as shares of what the scenario's upper
-speed gives and no more than 1; min(S) is the shortest of the rays.
+`vehicle.act_continuous`. Reward: the paper's, within [-1, 1], see `gridsim.reward`.
 
 An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
 a single environment meets after `reset(seed=s + i)`, whatever the other cars do.
@@ -29,9 +28,10 @@ from gymnasium.vector.utils import batch_space
 
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
-from gridsim.ego import DISTANCE, SPEED, End
+from gridsim.ego import DISTANCE, SPEED, STEERING, End
 from gridsim.grid import CELLS, grid_table, grids, push_frames
 from gridsim.jit import njit
+from gridsim.reward import reward
 from gridsim.roads import clearance
 from gridsim.scenarios import (
     REGISTRY,
@@ -51,8 +51,6 @@ from gridsim.world import LANE
 if TYPE_CHECKING:
     from gridsim.render import Renderer, Window
 
-DISTANCE_SHARE, SPEED_SHARE, CLEARANCE_SHARE = 0.15, 0.15, 0.7
-CRASH_REWARD = -1.0
 RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture a control period: true speed
 
 _F, _U = np.float32, np.uint64
@@ -76,9 +74,6 @@ def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slo
     """Observations [n, rays + 1], if not None, and rewards [n]; `fastest` m/s: upper speed of each car's scenario."""
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
-        shortest = reach
-        for r in range(rays):
-            shortest = min(shortest, ranges[i, r])
         speed = speeds[i]
         if observations is not None:
             for r in range(rays):
@@ -86,17 +81,12 @@ def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slo
             if closing is not None:
                 for r in range(rays):
                     observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
-            observations[i, observations.shape[1] - 1] = min(max(speed / limit, slowest), _F(1.0))
+            last = rays if closing is None else 2 * rays
+            observations[i, last] = min(max(speed / limit, slowest), _F(1.0))
         if begun[i]:
             rewards[i] = _F(0.0)
-        elif ends[i] == 1:
-            rewards[i] = _F(CRASH_REWARD)
         else:
-            rewards[i] = (
-                _F(DISTANCE_SHARE) * min(progress[i] / (fastest[i] * dt), _F(1.0))
-                + _F(SPEED_SHARE) * min(max(speed / fastest[i], _F(0.0)), _F(1.0))
-                + _F(CLEARANCE_SHARE) * (shortest / reach)
-            )
+            rewards[i] = reward(ranges[i], reach, speed, progress[i], ends[i], fastest[i], dt)
 
 
 class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -125,6 +115,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation: Literal["rays", "grid"] = "rays",
         frames: int = 1,
         motion: bool = False,
+        steering: bool = False,
         actions: Literal["discrete", "continuous"] = "discrete",
         render_mode: Literal["rgb_array", "human"] | None = None,
         max_episode_steps: int | None = None,
@@ -141,6 +132,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             observation: `rays` or `grid`.
             frames: grids that make an observation, 1 to 16.
             motion: whether rays also tell the motion of what they meet.
+            steering: whether the steering angle is told beside them.
             actions: `discrete` or `continuous`.
             render_mode: `rgb_array`, or `human`, a window that follows the first car.
             max_episode_steps: time limit in control steps; None is the configuration's.
@@ -157,8 +149,9 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
         if not 1 <= frames <= 16 or (frames > 1 and observation == "rays"):
             raise ValueError(f"frames must be 1 to 16, and more than 1 only for observation='grid', not {frames}")
-        if motion and observation == "grid":
-            raise ValueError("motion is seen by rays; leave it out with observation='grid'")
+        for name, asked in (("motion", motion), ("steering", steering)):
+            if asked and observation == "grid":
+                raise ValueError(f"{name} is seen beside rays; leave it out with observation='grid'")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         if map_seed < 0:
@@ -179,11 +172,13 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._views: dict[int, Renderer] = {}  # by map
         self._window: Window | None = None
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
-        self._motion = motion
+        self._motion, self._steering = motion, steering
         rays = self.config.sensors.rays
-        low = np.zeros((2 if motion else 1) * rays + 1, dtype=np.float32)
+        self._width = (2 if motion else 1) * rays + 1 + steering
+        low = np.zeros(self._width, dtype=np.float32)
         low[rays:] = -1.0
-        low[-1] = self._slowest = _F(-self.config.vehicle.reverse_limit / self.config.vehicle.speed_limit)
+        self._slowest = _F(-self.config.vehicle.reverse_limit / self.config.vehicle.speed_limit)
+        low[self._width - 1 - steering] = self._slowest
         self._table = grid_table(self.config) if observation == "grid" else None
         self._stack = np.zeros((num_envs, frames, CELLS, CELLS), dtype=np.uint8) if observation == "grid" else None
         self.single_observation_space = Box(low, np.ones_like(low))
@@ -330,10 +325,9 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, ranges: np.ndarray, speeds: np.ndarray, progress: np.ndarray, ends: np.ndarray, begun: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Observations and rewards [n] of a step."""
-        n, rays = ranges.shape
+        n = len(ranges)
         rewards = np.empty(n, dtype=np.float32)
-        width = (2 if self._motion else 1) * rays + 1
-        observations = np.empty((n, width), dtype=np.float32) if self._table is None else None
+        observations = np.empty((n, self._width), dtype=np.float32) if self._table is None else None
         _observe(
             ranges,
             self.simulator.closing if self._motion else None,
@@ -354,6 +348,9 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._remember(begun)
         if observations is None:
             return self._grids(begun), rewards
+        if self._steering:
+            limit = np.radians(self.config.vehicle.steering_limit)
+            observations[:, -1] = np.clip(self.simulator.state.cars[:, STEERING] / limit, -1.0, 1.0)
         return observations, rewards
 
     def _grids(self, begun: np.ndarray) -> np.ndarray:

@@ -54,6 +54,7 @@ def cache_folder() -> Path:
 
 CONFIG: Any = numba.config  # its attributes are made when it is imported
 CACHE_FOLDER = cache_folder()
+FAST_MATH = {"contract", "arcp", "nsz", "reassoc"}
 
 
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable[..., Any]:
@@ -67,9 +68,7 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     before = CONFIG.CACHE_DIR
     CONFIG.CACHE_DIR = str(CACHE_FOLDER)
     try:
-        return numba.njit(cache=True, error_model="numpy", fastmath={"contract", "arcp", "nsz", "reassoc"}, **options)(
-            function
-        )
+        return numba.njit(**{"cache": True, "error_model": "numpy", "fastmath": FAST_MATH, **options})(function)
     finally:
         CONFIG.CACHE_DIR = before
 

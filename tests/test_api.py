@@ -10,6 +10,7 @@ from cluster.checkpoint import CheckpointError, save
 from cluster.settings import SettingsError
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
+from gridsim.ego import STEERING
 from gridsim.scenarios import build
 
 SMALL = EvolveSettings(scenario="curved", population=32, generations=2, elites=2, seed=3)
@@ -51,6 +52,35 @@ def test_environment_and_rollout_drive_alike(champion):
     steps, over, info = 0, False, {}
     while not over:
         observation, _, terminated, truncated, info = env.step(champion.act(observation))
+        steps, over = steps + 1, terminated or truncated
+    assert steps == int(result["steps"])
+    assert info["distance_m"] == pytest.approx(float(result["distance"]), abs=1e-3)
+
+
+@pytest.mark.parametrize("policy", ["mlp:8+steering", "mlp:8+motion+steering"])
+def test_who_sees_the_wheels_drives_alike_in_the_environment_and_the_rollout(policy, champion):
+    scenario, spec = build("curved", 12), PolicySpec.parse(policy)
+    start = np.array([*scenario.lanes.points[3], 0.0, 5.0, 0.0], dtype=np.float32)
+    start[2] = np.arctan2(*(scenario.lanes.points[4] - scenario.lanes.points[3])[::-1])
+    rng = np.random.default_rng(4)
+    for _ in range(500):  # until one drives, whom the wheels concern
+        genome = rng.normal(size=spec.size).astype(np.float32)
+        result, states, _ = trajectory(spec, genome, scenario, start, Limits(2000.0, 400), champion.sim)
+        blind = genome.copy()
+        blind[(spec.inputs - 1) * 8 : spec.inputs * 8] = 0.0
+        without, _, _ = trajectory(spec, blind, scenario, start, Limits(2000.0, 400), champion.sim)
+        if result["steps"] > 40 and without["steps"] != result["steps"] and np.abs(states[:, STEERING]).max() > 0.1:
+            break
+    else:
+        raise AssertionError("nobody drives")
+    driver = Champion(genome, policy, "curved", champion.sim)
+    env = driver.make_env(max_episode_steps=400)
+    observation, _ = env.reset(seed=1, options={"map_seed": 12, "start": start})
+    assert observation.shape == (spec.inputs,)
+    steps, over = 0, False
+    while not over:
+        observation, _, terminated, truncated, info = env.step(driver.act(observation))
+        assert observation[-1] == pytest.approx(states[steps + 1, STEERING] / np.radians(27.0), abs=1e-4)
         steps, over = steps + 1, terminated or truncated
     assert steps == int(result["steps"])
     assert info["distance_m"] == pytest.approx(float(result["distance"]), abs=1e-3)

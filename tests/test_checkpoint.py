@@ -220,6 +220,16 @@ def test_refuses_what_it_would_not_read(tmp_path, monkeypatch):
     assert "too large" in refused(tmp_path / "a.npz")
 
 
+def test_arrays_beyond_what_a_plain_zip_holds(tmp_path, monkeypatch):
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)  # 2 GiB; a replay of grids comes near it
+    content = np.arange(5000, dtype=np.int16)
+    save(tmp_path / "a.npz", {"x": content, "y": content[:3]}, {"k": 1})
+    arrays, meta = load(tmp_path / "a.npz")
+    assert np.array_equal(arrays["x"], content)
+    assert meta == {"k": 1}
+    assert np.array_equal(np.load(tmp_path / "a.npz")["x"], content)
+
+
 # ---------------------------------------------------------------------------------------------- damage
 
 

@@ -1,95 +1,27 @@
 """The commands as a user runs them: installed scripts, real Ray workers, real kills."""
 
-import csv
 import json
 import os
 import re
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import BIN, descendants, finish, ray_workers, rows, start, summary, wait_until
 
-BIN = Path(sys.executable).parent
 # Of all maps these are built fastest.
 ROAD = ["--scenario", "curved", "--traffic", "2"]
 SMALL = [*ROAD, "--population", "48", "--generations", "6", "--seed", "5", "--elites", "4"]
 
 
-def start(*arguments, cwd, **env):
-    """A command, started."""
-    return subprocess.Popen(
-        [str(BIN / arguments[0]), *arguments[1:]],
-        cwd=cwd,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, **env},
-        start_new_session=True,
-    )
-
-
-def evolve(*arguments, cwd, timeout=240, **env):
+def evolve(*arguments, cwd, **env):
     """gridsim-evolve, run to its end."""
-    process = start("gridsim-evolve", *arguments, cwd=cwd, **env)
-    try:
-        out, err = process.communicate(timeout=timeout)
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
-
-
-def summary(folder):
-    return json.loads((folder / "summary.json").read_text())
-
-
-def rows(folder):
-    with (folder / "history.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
-def descendants(pid):
-    """Processes below a process, by /proc."""
-    parents = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            except (OSError, IndexError):
-                continue
-    found, queue = [], [pid]
-    while queue:
-        here = queue.pop()
-        children = [p for p, parent in parents.items() if parent == here]
-        found += children
-        queue += children
-    return found
-
-
-def ray_workers(pid):
-    """Actor processes that belong to a command."""
-    names = {}
-    for child in descendants(pid):
-        try:
-            names[child] = Path(f"/proc/{child}/cmdline").read_bytes()
-        except OSError:
-            continue
-    return [child for child, name in names.items() if name.startswith(b"ray::_Actor")]
-
-
-def wait_until(condition, timeout=120.0):
-    end = time.monotonic() + timeout
-    while time.monotonic() < end:
-        if value := condition():
-            return value
-        time.sleep(0.02)
-    raise AssertionError("it did not happen in time")
+    return finish("gridsim-evolve", *arguments, cwd=cwd, **env)
 
 
 @pytest.fixture(scope="module")
@@ -361,3 +293,4 @@ def test_a_finished_run_can_be_extended(reference, tmp_path):
     done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(rows(tmp_path / "runs/s")) == 6
+    assert summary(tmp_path / "runs/s")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]

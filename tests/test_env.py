@@ -44,7 +44,7 @@ class Driver:
     def __call__(self, ranges: np.ndarray, speeds: np.ndarray) -> np.ndarray:
         actions = []
         for row, speed in zip(ranges, speeds, strict=True):
-            encode(row, None, speed, self.scratch)
+            encode(row, None, speed, np.float32(0.0), self.scratch)
             actions.append(decide(self.packed, self.layers, self.scratch))
         return np.array(actions)
 

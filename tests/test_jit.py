@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from evolution.breeding import FRESH, RECIPE, Mutation, breed
+from evolution.collecting import collect
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, evaluate
 from gridsim import jit
@@ -156,6 +157,16 @@ def roll_out(scenario, start, genomes):
     return {name: results[name] for name in ("distance", "paced", "steps", "end")}
 
 
+def collect_some(scenario, start, genomes):
+    """Half of the actions random."""
+    episodes = np.zeros(2, dtype=EPISODE)
+    episodes["start"] = start
+    epsilons, keys = np.full(2, 0.5, dtype=F), np.array([2**63 + 9, 4], dtype=np.uint64)
+    limits = Limits(1000.0, STEPS)
+    experience, _ = collect(SPEC, genomes[0], [scenario], episodes, epsilons, keys, limits, CONFIG)
+    return experience._asdict()
+
+
 def have_children(parents):
     recipes = np.array([(0, 0, 0), (0, 1, 1), (1, 1, 2), (FRESH, FRESH, 3), (FRESH, FRESH, 4)], dtype=RECIPE)
     return {"children": breed(parents, recipes, 2**62 + 5, SPEC, Mutation(rate=0.2, bump_rate=1.0))}
@@ -174,6 +185,7 @@ def everything(given):
     parts = {
         "drive": lambda: drive_a_while(scenario, given["start"], given["actions"]),
         "rollout": lambda: roll_out(scenario, given["start"], given["genomes"]),
+        "collect": lambda: collect_some(scenario, given["start"], given["genomes"]),
         "breed": lambda: have_children(given["genomes"]),
         "road": lay_a_road,
     }
@@ -210,7 +222,7 @@ def both(root, tmp_path_factory):
     return everything(given), dict(np.load(folder / "plain.npz"))
 
 
-@pytest.mark.parametrize("part", ["drive", "rollout", "breed", "road"])
+@pytest.mark.parametrize("part", ["drive", "rollout", "collect", "breed", "road"])
 def test_every_part_runs_without_numba(both, part):
     compiled, plain = both
     for done in (compiled, plain):
@@ -237,6 +249,16 @@ def test_plain_python_rolls_out_the_same_way(both):
     for name in ("distance", "paced", "steps", "end"):
         assert plain[f"rollout_{name}"] == pytest.approx(compiled[f"rollout_{name}"], abs=1e-3)
     assert compiled["rollout_distance"].max() > 5.0
+
+
+def test_plain_python_collects_the_same(both):
+    compiled, plain = both
+    for name in ("actions", "ends"):
+        assert (plain[f"collect_{name}"] == compiled[f"collect_{name}"]).all()
+    assert plain["collect_rewards"] == pytest.approx(compiled["collect_rewards"], abs=0.01)
+    away = np.abs(plain["collect_observations"].astype(int) - compiled["collect_observations"])
+    assert np.quantile(away, 0.9) < 20  # as of the ranges above
+    assert len(set(compiled["collect_actions"])) > 5
 
 
 def test_plain_python_breeds_the_same_children(both):

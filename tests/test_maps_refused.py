@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import crashes, picture, save, strip
 
-from cluster.settings import SettingsError, from_dict
+from cluster.settings import EvolveSettings, SettingsError, from_dict
 from gridsim.maps import MAX_PIXELS, load_map
 
 
@@ -24,7 +24,7 @@ def refused(name):
     assert "\n" not in message
     assert len(message) < 600
     with pytest.raises(SettingsError):
-        from_dict({"scenario": str(name)})
+        from_dict(EvolveSettings, {"scenario": str(name)})
     return message
 
 

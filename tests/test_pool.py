@@ -11,10 +11,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.pool import METRE_S, WORTH_SENDING_S, Chunk, PoolError, SerialPool, cut, everything, last_line, metres
-from cluster.worker import Task, Worker
+from cluster.pool import (
+    METRE_S,
+    WORTH_SENDING_S,
+    Chunk,
+    PoolError,
+    SerialPool,
+    answer,
+    cut,
+    everything,
+    last_line,
+    metres,
+    new_collected,
+)
+from cluster.worker import CollectTask, Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
 from evolution.episodes import lane_starts
+from evolution.experience import Experience, to_bytes
+from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, RESULT, Limits, no_traffic
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario, build
@@ -33,6 +47,19 @@ class Answering(Worker):
         results["steps"] = sum(m.seed for m in maps)
         return results, time.perf_counter() - started
 
+    def collect(
+        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+    ) -> tuple[Experience, np.ndarray, float]:
+        """Episodes of key % 5 steps whose rows are all marked by their keys."""
+        started = time.perf_counter()
+        keys = task.keys[first:stop]
+        results = np.zeros(len(keys), dtype=RESULT)
+        results["steps"] = keys % 5
+        row = np.repeat(keys, results["steps"] + 1)
+        observations = np.repeat(row[:, None], PolicySpec.parse(task.policy).inputs, axis=1).astype(np.int16)
+        experience = Experience(observations, row.astype(np.uint8), row.astype(np.float32), row.astype(np.uint8))
+        return experience, results, time.perf_counter() - started
+
 
 class Failing(Answering):
     """Answers until it meets a member that it cannot bear."""
@@ -41,6 +68,13 @@ class Failing(Answering):
         if 300 in recipes["seed"]:
             raise ValueError("member 300 is\nnot to be had")
         return super().evaluate(task, maps, recipes)
+
+    def collect(
+        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+    ) -> tuple[Experience, np.ndarray, float]:
+        if 300 in task.keys[first:stop]:
+            raise ValueError("episode 300 is\nnot to be had")
+        return super().collect(task, maps, first, stop)
 
 
 def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | None = None) -> Task:
@@ -59,6 +93,25 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
         Limits(150.0, 300),
         SimConfig(),
     )
+
+
+def make_collect_task(n: int) -> CollectTask:
+    """Episodes that `Answering` marks by their numbers."""
+    policy, keys = "mlp:6,7", np.arange(n, dtype=np.uint64)
+    weights, epsilons = np.zeros(PolicySpec.parse(policy).size, dtype=np.float32), np.zeros(n, dtype=np.float32)
+    episodes = np.zeros(n, dtype=EPISODE)
+    return CollectTask(policy, weights, episodes, no_traffic(n), (), epsilons, keys, Limits(150.0, 300), SimConfig())
+
+
+def collect_drive_task(n: int) -> tuple[CollectTask, list[Scenario]]:
+    """A small real task on two maps, and the maps."""
+    scenarios = [build(*name) for name in MAPS]
+    rng = np.random.default_rng(1)
+    episodes, worlds = lane_starts(scenarios, np.arange(n) % 2, rng, 2)
+    weights = (rng.standard_normal(311) * 0.4).astype(np.float32)
+    keys, epsilons = rng.integers(1 << 63, size=n, dtype=np.uint64), np.full(n, 0.2, dtype=np.float32)
+    limits = Limits(150.0, 300)
+    return CollectTask("mlp:6,7", weights, episodes, worlds, MAPS, epsilons, keys, limits, SimConfig()), scenarios
 
 
 def make_recipes(n: int) -> np.ndarray:
@@ -153,6 +206,56 @@ def test_only_what_is_asked_for_is_driven_while_something_else_is_done() -> None
     assert outcome.whole()
     assert outcome.members() == 20
     assert done == [1]
+
+
+def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
+    """By both calls, also where there is nothing else to do; and what it raises ends the call."""
+    pool = SerialPool(never_built, Answering)
+    for count in (0, 40):
+        for call in (
+            lambda of: pool.evaluate(make_task(), make_recipes(count), meanwhile=of),  # noqa: B023
+            lambda of: pool.collect(make_collect_task(count), meanwhile=of),  # noqa: B023
+        ):
+            left = [1, 2, 3, 4]
+            assert call(lambda: bool(left.pop() and left)).whole()  # noqa: B023
+            assert left == []
+    with pytest.raises(KeyboardInterrupt):
+        pool.collect(make_collect_task(9), meanwhile=interrupted)
+
+
+def interrupted() -> None:
+    raise KeyboardInterrupt
+
+
+def test_experience_is_in_the_episodes_order() -> None:
+    collected = SerialPool(never_built, Answering).collect(make_collect_task(100))
+    wanted = np.repeat(np.arange(100), np.arange(100) % 5 + 1)
+    assert (collected.experience.rewards == wanted).all()
+    assert (collected.experience.observations == wanted[:, None]).all()
+    assert (collected.results["steps"] == np.arange(100) % 5).all()
+    assert len(SerialPool(never_built, Answering).collect(make_collect_task(0)).experience.actions) == 0
+
+
+def test_a_worker_that_fails_to_collect_ends_in_one_line_that_names_the_episodes() -> None:
+    with pytest.raises(
+        PoolError, match=r"^a worker failed on chunk \d+ \(episodes \d+ to \d+\): ValueError: not to be"
+    ):
+        SerialPool(never_built, Failing).collect(make_collect_task(512))
+
+
+def test_an_answer_is_taken_as_it_was_given() -> None:
+    """There and back as bytes, as between a worker and a pool that is elsewhere; its arrays are read-only."""
+    task, scenarios = collect_drive_task(9)
+    whole = SerialPool(lambda *name: scenarios[name[1]]).collect(task)
+    collected = new_collected(task)
+    for first, stop in ((5, 9), (0, 2), (2, 5)):
+        raw = answer(Worker(), task, scenarios, b"", first, stop)
+        collected.take(first, Chunk(slice(0, 1), slice(first, stop)), raw)
+    assert collected.whole()
+    assert to_bytes(collected.experience) == to_bytes(whole.experience)
+    assert collected.results.tobytes() == whole.results.tobytes()
+    assert set(collected.busy_s) == {0, 2, 5}
+    assert all(not array.flags.writeable for array in (task.weights, task.episodes, task.worlds, task.keys))
 
 
 def test_a_failing_worker_ends_in_one_line_that_names_the_chunk() -> None:

@@ -12,17 +12,29 @@ import sysconfig
 import textwrap
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from test_pool import MAPS, Answering, drive_task, make_recipes, make_task, never_built
+from test_pool import (
+    MAPS,
+    Answering,
+    collect_drive_task,
+    drive_task,
+    interrupted,
+    make_collect_task,
+    make_recipes,
+    make_task,
+    never_built,
+)
 
 from cluster.pool import PoolError, SerialPool
 from cluster.ray_pool import RayPool, check_address
-from cluster.worker import Task
+from cluster.worker import CollectTask, Task
+from evolution.experience import Experience, to_bytes
 from gridsim.scenarios import Scenario
 
 pytestmark = pytest.mark.e2e
@@ -37,9 +49,21 @@ class Obeying(Answering):
         self._folder = folder
 
     def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        self._obey(recipes["seed"])
+        return super().evaluate(task, maps, recipes)
+
+    def collect(
+        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+    ) -> tuple[Experience, np.ndarray, float]:
+        with (self._folder / "collected").open("a") as collected:
+            collected.write(f"{first} {stop}\n")
+        self._obey(task.keys[first:stop])
+        return super().collect(task, maps, first, stop)
+
+    def _obey(self, seeds: np.ndarray) -> None:
         for path in sorted(self._folder.glob("*-*")):
             what, seed = path.name.split("-")
-            if int(seed) not in recipes["seed"]:
+            if int(seed) not in seeds:
                 continue
             with (self._folder / "calls").open("a") as calls:
                 calls.write(f"{path.name}\n")
@@ -52,7 +76,6 @@ class Obeying(Answering):
                 raise ValueError("that member\nis not to be had")
             elif what == "sleep":
                 time.sleep(float(path.read_text()))
-        return super().evaluate(task, maps, recipes)
 
 
 class Inspecting(Answering):
@@ -195,6 +218,74 @@ def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayP
     assert outcome.retries == 0
 
 
+@pytest.mark.parametrize("times", [0, 1, 2])
+def test_experience_keeps_its_order_and_a_killed_worker_costs_its_chunk_alone(
+    pool: RayPool, folder: Path, times: int
+) -> None:
+    told: list[tuple[int, int]] = []
+    task = make_collect_task(400)
+    wanted = SerialPool(never_built, Answering).collect(task)
+    pool.collect(task)  # both have been up by now, and know how long it takes
+    (folder / "collected").unlink()
+    (folder / "kill-150").write_text(str(times))
+    collected = pool.collect(task, lambda done, of: told.append((done, of)))
+    assert to_bytes(collected.experience) == to_bytes(wanted.experience)
+    assert collected.results.tobytes() == wanted.results.tobytes()
+    assert told == sorted(told)
+    assert told[-1] == (400, 400)
+    assert len(told) >= 8, "several a worker"
+    begun = [tuple(map(int, line.split())) for line in (folder / "collected").read_text().splitlines()]
+    again = Counter(begun)
+    repeated = sum(again.values()) - len(again)
+    lost = [(first, stop) for first, stop in again if first <= 150 < stop]
+    assert len(lost) == 1
+    assert again[lost[0]] == times + 1
+    assert repeated == times, "what else was sent to the worker had not been begun"
+    assert times <= collected.retries <= 2 * times
+    assert collected.bytes_up == 8 * len(told) + 12 * 400 + len(to_bytes(wanted.experience))
+
+
+def test_an_exception_while_collecting_names_the_episodes(pool: RayPool, folder: Path) -> None:
+    (folder / "raise-100").touch()
+    with pytest.raises(PoolError, match=r"^a worker failed on chunk \d+ \(episodes \d+ to \d+\): ValueError: is not"):
+        pool.collect(make_collect_task(400))
+
+
+def test_something_is_done_again_and_again_while_workers_are_busy(pool: RayPool, folder: Path) -> None:
+    """Answers are taken in between; all of it is done when the call returns, and what it raises comes out."""
+    until = time.perf_counter() + 30
+    while pool.workers() < 2 and time.perf_counter() < until:
+        pool.evaluate(make_task(), make_recipes(8))
+    (folder / "sleep-0").write_text("0.5")  # in the first chunk
+    wanted = to_bytes(SerialPool(never_built, Answering).collect(make_collect_task(400)).experience)
+    for calls in (20, 200):
+        steps: list[float] = []
+        done_by_then: list[int] = []
+        done = [0]
+
+        def learn() -> bool:
+            time.sleep(0.005)
+            steps.append(time.perf_counter())  # noqa: B023
+            done_by_then.append(done[0])  # noqa: B023
+            return len(steps) < calls  # noqa: B023
+
+        def tell(part: int, _: int) -> None:
+            done[0] = part  # noqa: B023
+
+        collected = pool.collect(make_collect_task(400), tell, learn)
+        assert to_bytes(collected.experience) == wanted
+        assert len(steps) == calls
+        assert 0 < done_by_then[19] < 400, "the other worker's answers, not the sleeping one's"
+        if calls == 200:
+            assert done_by_then[-1] == 400
+    outcome = pool.evaluate(make_task(), make_recipes(512), meanwhile=lambda: steps.append(0.0))
+    assert outcome.results.tobytes() == expected(512)
+    assert len(steps) == 201, "who returns None is called once"
+    with pytest.raises(KeyboardInterrupt):
+        pool.collect(make_collect_task(400), meanwhile=interrupted)
+    assert to_bytes(pool.collect(make_collect_task(400)).experience) == wanted, "the pool goes on"
+
+
 def test_only_one_pool_at_a_time(pool: RayPool) -> None:
     pool.evaluate(make_task(), make_recipes(4))
     second = RayPool(1, never_built, worker_factory=Answering)
@@ -232,6 +323,8 @@ def test_any_number_of_workers_gives_the_serial_pools_bits() -> None:
     recipes = make_recipes(200)
     known = dict(zip(MAPS, scenarios, strict=True))
     serial = SerialPool(lambda *name: known[name]).evaluate(task, recipes).results.tobytes()
+    collect_task, _ = collect_drive_task(100)
+    alone = SerialPool(lambda *name: known[name]).collect(collect_task)
     for workers in (1, 2, 4):
         pool = RayPool(workers, lambda *name: known[name])
         try:
@@ -243,6 +336,14 @@ def test_any_number_of_workers_gives_the_serial_pools_bits() -> None:
             again = pool.evaluate(task, recipes)
             assert again.results.tobytes() == serial
             assert again.broadcast_bytes < task.parents.nbytes + 2000, "maps are sent once"
+            pids = pool.pids()
+            killer = threading.Timer(0.001, lambda: os.kill(pids[-1], signal.SIGKILL))  # noqa: B023
+            killer.start()
+            for _ in range(2):
+                collected = pool.collect(collect_task)
+                assert to_bytes(collected.experience) == to_bytes(alone.experience)
+                assert collected.results.tobytes() == alone.results.tobytes()
+            killer.join()
             for pid in pool.pids():
                 assert psutil.Process(pid).memory_full_info().uss <= 220 << 20
         finally:

@@ -194,6 +194,15 @@ def test_it_finishes_inside_the_interval(name, traffic):
             assert np.all(drive.speed[steady] >= low)
 
 
+@pytest.mark.parametrize("name", REGISTRY)
+def test_its_path_keeps_to_the_lane(maps, name):
+    for scenario in maps[name]:
+        start = sample_starts(scenario, 1, np.random.default_rng(7))[0]
+        away = np.abs(lateral(ReferenceDriver([scenario]).drive(scenario, start, NOBODY, 1), scenario))
+        assert away.mean() < 0.25
+        assert away.max() < 0.9  # of lanes 3 m wide and more, by a car that is 2 m wide
+
+
 def test_same_seed_same_drive_other_seed_other_route(seamless):
     rows, worlds = lane_starts([seamless], np.zeros(1, dtype=int), np.random.default_rng(2), 6)
     driver = ReferenceDriver([seamless])

@@ -90,7 +90,7 @@ AMONG = Limits(400.0, 700)
 def _decide(packed, layers, ranges, speeds, actions):
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
     for i in range(len(actions)):
-        encode(ranges[i], None, speeds[i], scratch)
+        encode(ranges[i], None, speeds[i], np.float32(0.0), scratch)
         actions[i] = decide(packed, layers, scratch)
 
 

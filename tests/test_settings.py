@@ -11,7 +11,7 @@ def test_the_policy_follows_the_observation():
     assert EvolveSettings(observation="grid", policy="cnn").policy == "cnn"
     for settings in (EvolveSettings(), EvolveSettings(observation="grid"), EvolveSettings(policy="mlp:3")):
         settings.check()
-        assert from_dict(to_dict(settings)) == settings
+        assert from_dict(EvolveSettings, to_dict(settings)) == settings
 
 
 @pytest.mark.parametrize(
@@ -26,12 +26,12 @@ def test_a_policy_that_sees_something_else_is_refused(observation, policy, hint)
 def test_an_unknown_observation_is_refused():
     values = to_dict(EvolveSettings())
     with pytest.raises(SettingsError, match="rays or grid"):
-        from_dict(values | {"observation": "radar"})
+        from_dict(EvolveSettings, values | {"observation": "radar"})
     with pytest.raises(SettingsError, match="must be str"):
-        from_dict(values | {"observation": 3})
+        from_dict(EvolveSettings, values | {"observation": 3})
 
 
 def test_a_run_from_before_there_were_grids_sees_rays():
     values = to_dict(EvolveSettings(policy="mlp:9"))
     del values["observation"]
-    assert from_dict(values).observation == "rays"
+    assert from_dict(EvolveSettings, values).observation == "rays"

@@ -1,0 +1,383 @@
+"""What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
+
+A learner is a loop of steps between a pool and a run's files; `coordinator` has the genetic algorithm's, `dqn_loop` the
+DQN's. Everything it decides follows from the seed and from what the workers return; nothing follows from the clock or
+from who returned it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from cluster.checkpoint import CheckpointError
+from cluster.pool import Chunk, Meanwhile, Outcome, WorkerPool
+from cluster.settings import RunSettings
+from cluster.worker import Task
+from evolution.breeding import RECIPE, Mutation
+from evolution.curriculum import (
+    HELD_OUT_EPISODES,
+    HELD_OUT_MAPS,
+    TRIED_KEPT,
+    Curriculum,
+    Trials,
+    spread_starts,
+    success_rate,
+)
+from evolution.episodes import Episodes
+from evolution.policy import PolicySpec
+from evolution.rollout import Limits
+from gridsim.config import SimConfig
+from gridsim.ego import End
+from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, map_of
+
+MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
+
+
+class Maps:
+    """Builds maps, each once, and ahead of their use in a thread; keeps the latest."""
+
+    def __init__(self, scenario: str, config: SimConfig):
+        self._scenario, self._config = scenario, config
+        self._built: dict[int, Future[Scenario]] = {}
+        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="maps")
+
+    def ahead(self, seeds: list[int]) -> None:
+        """Begin to build maps that will be needed, in this order."""
+        with self._lock:
+            for seed in seeds:
+                if seed not in self._built:
+                    self._built[seed] = self._thread.submit(build, self._scenario, seed, self._config)
+
+    def get(self, seed: int) -> Scenario:
+        """The map of a seed."""
+        self.ahead([seed])
+        with self._lock:
+            future = self._built.pop(seed)
+            self._built[seed] = future  # the latest used is last
+            while len(self._built) > MAPS_KEPT:
+                del self._built[next(iter(self._built))]
+        return future.result()
+
+    def build(self, scenario: str, seed: int) -> Scenario:
+        """As pools ask for it."""
+        if scenario != self._scenario:
+            raise ValueError(f"a run on {self._scenario} has no map of {scenario}")
+        return self.get(seed)
+
+    def close(self) -> None:
+        """Forget what is not yet begun."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+
+@dataclass
+class Champion:
+    """The best member found so far, by validation.
+
+    Attributes:
+        genome: float32 [genes].
+        score: of all validation episodes (`Curriculum.validation_score`).
+        success_rate: of the same.
+        distance_m: its mean distance there.
+        generation: the step in which it was found.
+    """
+
+    genome: np.ndarray
+    score: float = 0.0
+    success_rate: float = 0.0
+    distance_m: float = 0.0
+    generation: int = -1
+
+
+@dataclass
+class Learning(ABC):
+    """One run of a learner, between pool and files.
+
+    Attributes:
+        settings: what the run was asked to do.
+        pool: who evaluates.
+        maps: who builds maps.
+        initial: a genome to start from, float32 [genes].
+        history: a row of figures for each step (`columns`).
+        elites: the network of each step, float32 [genes].
+    """
+
+    columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
+    step_name: ClassVar[str]  # what a step is called
+    verb: ClassVar[str]  # what is done to a network
+
+    settings: RunSettings
+    pool: WorkerPool
+    maps: Maps
+    initial: np.ndarray | None = None
+    champion: Champion | None = None
+    solved: bool = False
+    history: list[dict[str, float]] = field(default_factory=list)
+    elites: list[np.ndarray] = field(default_factory=list)
+    car_steps: int = 0
+    wall_before_s: float = 0.0
+    on_progress: Callable[[str, int, int], None] | None = None
+    meanwhile: Callable[[], None] | None = None  # called in each step when the workers are busy
+    out_of_time: Callable[[], bool] = lambda: False  # whether a budget of wall time is spent: a long step ends early
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self.sim = SimConfig()
+        self.spec = PolicySpec.parse(s.policy)
+        episode = self.sim.episode
+        self.curriculum = Curriculum(
+            s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period, s.traffic
+        )
+        none = np.zeros((0, self.spec.size), dtype=np.float32)
+        self.trials = Trials(none, none)
+        self.outcomes: list[Outcome] = []  # of the last step, for statistics
+
+    # ------------------------------------------------------------------------------------------------------ the loop
+
+    @abstractmethod
+    def step(self) -> dict[str, float]:
+        """One step. Returns its row of the history, without the wall clock's columns."""
+
+    @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """How far it has come: the settings' `counts`."""
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """What summary.json has of this learner alone."""
+
+    @abstractmethod
+    def way(self) -> tuple[float, float, str]:
+        """How far the run is, how far it goes at most (0: nobody knows), and in what unit."""
+
+    @abstractmethod
+    def describe(self, row: dict[str, float]) -> str:
+        """A row of the history in words."""
+
+    @property
+    def steps(self) -> int:
+        """Steps that are done."""
+        return len(self.history)
+
+    def done(self) -> bool:
+        """Whether there is nothing left to learn."""
+        return self.settings.ended({"solved": self.solved, **self.counts()})
+
+    def conclude(self) -> None:
+        """Find out about who is still on trial when a run ends, and about the last leader where there is no champion.
+
+        What a checkpoint holds is from before: a run that is extended goes on as if it had never ended.
+        """
+        if self.champion is None and not len(self.trials):
+            self.trials.enter(self.elites[-1][None], self.steps - 1)
+        while len(self.trials) and not self.solved:
+            self._validate()
+
+    def _mutation(self) -> Mutation:
+        """How bred members differ from their parents."""
+        return Mutation()
+
+    # ------------------------------------------------------------------------------------------------- evaluating
+
+    def _evaluate(
+        self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, episodes: Episodes, limits: Limits,
+        rewind: int = 0, asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        task = Task(
+            policy=self.settings.policy,
+            parents=parents,
+            key=key,
+            mutation=self._mutation(),
+            episodes=episodes.rows,
+            worlds=episodes.worlds,
+            maps=tuple((self.settings.scenario, map_of(self.settings.scenario, seed)) for seed in episodes.maps),
+            limits=limits,
+            config=self.sim,
+            rewind=rewind,
+        )
+        progress = self.on_progress
+        tell = (lambda k, n: progress(stage, k, n)) if progress else None
+        outcome = self.pool.evaluate(task, recipes, tell, asked, meanwhile)
+        self.outcomes.append(outcome)
+        self.car_steps += int(outcome.results["steps"].sum())
+        return outcome.results
+
+    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, rewind: int = 0) -> np.ndarray:
+        """Results RESULT [n, e] of given genomes [n, genes]: recipes that are plain copies."""
+        return self._evaluate(stage, genomes, copies(len(genomes)), 0, episodes, limits, rewind)
+
+    def _trial(self) -> tuple[Episodes, list[Chunk]]:
+        """Validation's episodes, and who of `trials` drives which of them."""
+        episodes = self.curriculum.validation().within(self.curriculum.goal_limits())
+        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
+        parts = [
+            Chunk(slice(k, len(self.trials)), slice(stage, len(episodes.rows))),
+            Chunk(slice(0, k), slice(0, stage)),
+        ]
+        return episodes, [part for part in parts if part.rows.stop > part.rows.start]
+
+    def _validate(self) -> None:
+        """Go on with the trials, with nothing beside them."""
+        episodes, asked = self._trial()
+        genomes = np.concatenate([self.trials.first, self.trials.last])
+        recipes, limits = copies(len(genomes)), self.curriculum.goal_limits()
+        self._judge(self._evaluate("validate", genomes, recipes, 0, episodes, limits, asked=asked))
+
+    def _judge(self, results: np.ndarray) -> None:
+        """Find out whether `trials.last` beats the champion, and who of `trials.first` is tried next.
+
+        Args: RESULT [members, validation], zero where a member's stage has no such episode.
+        """
+        trials, score = self.trials, self.curriculum.validation_score
+        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
+        if len(trials.last):
+            whole = results[k:, stage:]
+            total, distance = float(score(whole)[0]), float(whole["distance"].mean())
+            if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
+                rate = float(success_rate(whole)[0])
+                self.champion = Champion(trials.last[0].copy(), total, rate, distance, trials.last_generation)
+            self.solved = self.champion.score >= self.settings.until
+        trials.last = trials.first[:0]
+        if k:
+            first = results[:k, :stage]
+            scores = score(first)
+            best = int(np.lexsort((first["distance"].mean(axis=1), scores))[-1])
+            if self.champion is None or scores[best] >= self.champion.score - 0.02:
+                trials.last, trials.last_generation = trials.first[best : best + 1], trials.first_generation
+        trials.first = trials.first[:0]
+
+    def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
+        """Add the wall clock's columns to a row."""
+        row["wall_s"] = wall_s
+        steps, seconds = row["car_steps"], wall_s
+        if previous is not None:
+            steps, seconds = steps - previous["car_steps"], wall_s - previous["wall_s"]
+        row["car_steps_per_s"] = steps / max(seconds, 1e-9)
+
+    def held_out(self) -> dict[str, float]:
+        """The champion on roads nobody was trained or chosen on: the same 64 episodes for every run of a scenario."""
+        assert self.champion is not None
+        before = self.car_steps
+        episodes = held_out_episodes(self.maps, self.settings.traffic)
+        results = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
+        self.car_steps = before  # not part of learning
+        return summarise(results[0], self.sim.episode.control_period)
+
+    # ------------------------------------------------------------------------------------------------------- state
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All that an exact resume needs: arrays and plain numbers."""
+        rows = [[row[name] for name in self.columns] for row in self.history]
+        champion = self.champion
+        arrays: dict[str, np.ndarray] = {
+            "history": np.array(rows, dtype=np.float64).reshape(-1, len(self.columns)),
+            "elites": np.array(self.elites, dtype=np.float32).reshape(-1, self.spec.size),
+            "trials_first": self.trials.first,
+            "trials_last": self.trials.last,
+            "trials_tried": self.trials.tried,
+            "champion": champion.genome if champion else np.zeros(0, dtype=np.float32),
+        }
+        meta: dict[str, Any] = {
+            "solved": self.solved,
+            **self.counts(),
+            "columns": list(self.columns),
+            "trials": [self.trials.first_generation, self.trials.last_generation],
+            "champion": [champion.score, champion.success_rate, champion.distance_m, champion.generation]
+            if champion
+            else [],
+        }
+        return arrays, meta
+
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        """Take up a state. Raises CheckpointError with one line where it does not fit this run."""
+        try:
+            self._restore(arrays, meta)
+            if self.solved and self.champion is None:
+                raise ValueError("it is solved, and has no champion")
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
+
+    def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        """`restore`; what does not fit raises any of the errors that it names."""
+        genes = self.spec.size
+        history, elites, champion = arrays["history"], arrays["elites"], arrays["champion"]
+        first, last, tried = arrays["trials_first"], arrays["trials_last"], arrays["trials_tried"]
+        fits = (
+            meta["columns"] == list(self.columns)
+            and history.shape == (len(elites), len(self.columns))
+            and elites.shape == (len(elites), genes)
+            and elites.dtype == np.float32
+            and champion.shape == (genes if meta["champion"] else 0,)
+            and champion.dtype == np.float32
+            and np.isfinite(meta["champion"]).all()
+            and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
+            and len(first) <= self.curriculum.config.contenders
+            and len(last) <= 1
+            and tried.ndim == 1
+            and len(tried) <= TRIED_KEPT
+            and tried.dtype == np.uint64
+        )
+        if not fits or not np.isfinite(history).all():
+            raise ValueError("its parts do not fit each other")
+        self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
+        self.history = [dict(zip(self.columns, row.tolist(), strict=True)) for row in history]
+        self.elites = list(elites)
+        first_generation, last_generation = (int(k) for k in meta["trials"])
+        self.trials = Trials(first, last, first_generation, last_generation, tried)
+        if meta["champion"]:
+            score, rate, distance, found = meta["champion"]
+            self.champion = Champion(champion, float(score), float(rate), float(distance), int(found))
+        self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
+
+    def history_csv(self) -> bytes:
+        """history.csv: a row a step."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([self.step_name, *self.columns])
+        for k, row in enumerate(self.history):
+            writer.writerow([k, *(repr(row[name]) for name in self.columns)])
+        return text.getvalue().encode()
+
+
+def copies(n: int, first: int = 0) -> np.ndarray:
+    """Recipes [n] that are plain copies of the parents from `first` on."""
+    recipes = np.zeros(n, dtype=RECIPE)
+    recipes["a"] = recipes["b"] = np.arange(first, first + n)
+    return recipes
+
+
+def held_out_episodes(maps: Maps, traffic: int) -> Episodes:
+    """The 64 episodes that are reported on and never chosen on."""
+    return spread_starts(maps.get, HELD_OUT_SEED, HELD_OUT_MAPS, HELD_OUT_EPISODES, traffic)
+
+
+def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
+    """Means over the episodes of one member: RESULT [e]."""
+    return {
+        "episodes": len(results),
+        "success_rate": float((results["end"] == End.SUCCESS).mean()),
+        "distance_m": float(results["distance"].mean()),
+        "speed_mps": made_good(results, period_s),
+        "collision_rate": float((results["end"] == End.COLLISION).mean()),
+    }
+
+
+def made_good(results: np.ndarray, period_s: float) -> float:
+    """Mean over episodes of the speed made good: new ground over time, in m/s."""
+    seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
+    return float((results["distance"] / seconds).mean())
+
+
+def now() -> float:
+    """The clock that durations are taken with; nothing is decided by it."""
+    return time.perf_counter()

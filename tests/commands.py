@@ -1,0 +1,83 @@
+"""What tests of whole commands share: the installed scripts, run as a user runs them, and their workers."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+BIN = Path(sys.executable).parent
+
+
+def start(*arguments, cwd, **env):
+    """A command, started."""
+    return subprocess.Popen(
+        [str(BIN / arguments[0]), *arguments[1:]],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **env},
+        start_new_session=True,
+    )
+
+
+def finish(*arguments, cwd, timeout=240, **env):
+    """A command, run to its end."""
+    process = start(*arguments, cwd=cwd, **env)
+    try:
+        out, err = process.communicate(timeout=timeout)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def summary(folder):
+    return json.loads((folder / "summary.json").read_text())
+
+
+def rows(folder):
+    with (folder / "history.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def descendants(pid):
+    """Processes below a process, by /proc."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            except (OSError, IndexError):
+                continue
+    found, queue = [], [pid]
+    while queue:
+        here = queue.pop()
+        children = [p for p, parent in parents.items() if parent == here]
+        found += children
+        queue += children
+    return found
+
+
+def ray_workers(pid):
+    """Actor processes that belong to a command."""
+    names = {}
+    for child in descendants(pid):
+        try:
+            names[child] = Path(f"/proc/{child}/cmdline").read_bytes()
+        except OSError:
+            continue
+    return [child for child, name in names.items() if name.startswith(b"ray::_Actor")]
+
+
+def wait_until(condition, timeout=120.0):
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        time.sleep(0.02)
+    raise AssertionError("it did not happen in time")

@@ -1,0 +1,401 @@
+"""Collecting: the fused loop against `Simulator` and the environment, step by step; nothing lost, nothing mixed up."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from cluster.champion import load_champion
+from cluster.pool import SerialPool
+from cluster.worker import CollectTask, Worker
+from evolution import convnet
+from evolution.collecting import collect
+from evolution.episodes import lane_starts
+from evolution.experience import NO_ACTION, Experience, ages, join, to_bytes, unpack
+from evolution.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
+from evolution.rollout import Limits, evaluate, no_traffic
+from gridsim.config import EpisodeConfig, SimConfig
+from gridsim.ego import STEERING, End
+from gridsim.env import GridSimVectorEnv
+from gridsim.grid import CELLS, grid_table, grids, push_frames
+from gridsim.jit import njit
+from gridsim.scenarios import Scenario, build
+from gridsim.simulator import Simulator
+
+F = np.float32
+CONFIG = SimConfig()
+CARS = 8
+LIMITS = Limits(120.0, 150)
+POLICIES = ["mlp:6,7", "mlp:9+motion", "mlp:5+steering", "mlp:5+motion+steering", "cnn:8,8,16@3"]
+
+
+class Asked(NamedTuple):
+    """The arguments of `collect`, in its order."""
+
+    spec: PolicySpec
+    weights: np.ndarray
+    scenarios: list[Scenario]
+    episodes: np.ndarray
+    epsilons: np.ndarray
+    keys: np.ndarray
+    limits: Limits
+    config: SimConfig
+    worlds: np.ndarray
+
+    def only(self, which: list[int]) -> "Asked":
+        """The same for some episodes."""
+        rows = np.array(which, dtype=int)
+        return self._replace(
+            episodes=self.episodes[rows],
+            epsilons=self.epsilons[rows],
+            keys=self.keys[rows],
+            worlds=self.worlds[rows],
+        )
+
+
+@pytest.fixture(scope="module")
+def scenarios() -> list[Scenario]:
+    return [build("seamless", 3), build("highway", 4)]
+
+
+@pytest.fixture(scope="module")
+def driver(root: Path) -> np.ndarray:
+    """The weights of a trained `mlp:6,7`."""
+    return load_champion(root / "benchmarks" / "champion_traffic.npz").genome
+
+
+def asked(
+    policy: str, scenarios: list[Scenario], driver: np.ndarray, n: int, epsilon: float, cars: int, seed: int = 5
+) -> Asked:
+    rng = np.random.default_rng(seed)
+    spec = PolicySpec.parse(policy)
+    weights = driver if policy == "mlp:6,7" else (rng.normal(size=spec.size) * 0.3).astype(F)
+    episodes, worlds = lane_starts(scenarios, np.arange(n) % len(scenarios), rng, cars)
+    keys = rng.integers(1 << 63, size=n, dtype=np.uint64)
+    return Asked(spec, weights, scenarios, episodes, np.full(n, epsilon, F), keys, LIMITS, CONFIG, worlds)
+
+
+def cut_up(experience: Experience) -> Iterator[Experience]:
+    """Its episodes."""
+    first = 0
+    for last in np.flatnonzero(experience.actions == NO_ACTION).tolist():
+        yield Experience(*(array[first : last + 1] for array in experience))
+        first = last + 1
+    assert first == len(experience.actions)
+
+
+# --- An independent slow loop ----------------------------------------------------------------------------------------
+
+MASK = (1 << 64) - 1
+
+
+def draw(key: int, place: int) -> int:
+    """SplitMix64 in whole numbers."""
+    x = (key + place * 0x9E3779B97F4A7C15) & MASK
+    x = ((x ^ x >> 30) * 0xBF58476D1CE4E5B9) & MASK
+    x = ((x ^ x >> 27) * 0x94D049BB133111EB) & MASK
+    return x ^ x >> 31
+
+
+@njit
+def _greedy(packed, layers, ranges, closing, speed, steering, scratch):
+    encode(ranges, closing, speed, steering, scratch)
+    return decide(packed, layers, scratch)
+
+
+class Slow:
+    """One episode by `Simulator.step`, the network called from outside, all the rest in plain Python."""
+
+    def __init__(self, of: Asked):
+        """Drive the one episode that is asked for."""
+        ((episode,), (world,)), spec = (of.episodes, of.worlds), of.spec
+        self.scenario = of.scenarios[episode["map"]]
+        simulator = Simulator([self.scenario], 1, CONFIG, of.limits.target, of.limits.steps, traffic=len(world))
+        ranges, speeds = simulator.reset(episode["start"][None], worlds=world[None] if len(world) else None)
+        stack = np.zeros((1, spec.frames if isinstance(spec, CnnSpec) else 1, CELLS, CELLS), dtype=np.uint8)
+        packed = np.zeros(packed_size(spec.layers), dtype=F)
+        if isinstance(spec, MlpSpec):
+            pack(of.weights, spec.layers, packed)
+        scratch, base = np.zeros(scratch_size(spec.layers), dtype=F), draw(int(of.keys[0]), 0)
+        motion = isinstance(spec, MlpSpec) and spec.motion
+        self.inputs: list[np.ndarray] = []
+        self.actions: list[int] = []
+        self.rewards: list[float] = []
+        self.greedy = 0
+        end = 0
+        while True:
+            if isinstance(spec, CnnSpec):
+                push_frames(stack, grids(grid_table(CONFIG), ranges), np.array([not self.inputs]))
+                self.inputs.append(np.append(stack.reshape(-1) / 255.0, speeds[0] / 10.0 - 1.0))
+                seen = stack[0] if spec.frames > 1 else stack[0, 0]
+                action = convnet.act_on(spec, of.weights, seen, speeds[0])
+            else:
+                near = 2.0 * ranges[0].astype(float) / (ranges[0] + 8.0) - 1.0
+                closing = simulator.closing[0].copy() if motion else None
+                fast = closing.astype(float) / 10.0 if closing is not None else []
+                wheels = simulator.state.cars[0, STEERING]
+                turned = [wheels / 0.5] if isinstance(spec, MlpSpec) and spec.steering else []
+                self.inputs.append(np.concatenate([near, fast, speeds / 10.0 - 1.0, turned]))
+                action = _greedy(packed, spec.layers, ranges[0], closing, speeds[0], wheels, scratch)
+            if end:
+                break
+            bits = draw(base, len(self.actions))
+            if (bits >> 40) / 2**24 < of.epsilons[0]:
+                action = (bits & 0xFFFFFFFF) * 8 >> 32
+            else:
+                self.greedy += 1
+            ranges, speeds, progress, ends = simulator.step(np.array([action]))
+            end = int(ends[0])
+            self.actions.append(int(action))
+            self.rewards.append(self.reward(ranges[0], speeds[0], progress[0], end))
+        self.end = end
+
+    def reward(self, ranges: np.ndarray, speed: float, progress: float, end: int) -> float:
+        """As the paper has it, in float64."""
+        if end == End.COLLISION:
+            return -1.0
+        fastest = float(self.scenario.road.speed_high)
+        return (
+            0.15 * min(float(progress) / (fastest * 0.1), 1.0)
+            + 0.15 * min(max(float(speed) / fastest, 0.0), 1.0)
+            + 0.7 * float(ranges.min()) / 50.0
+        )
+
+
+@pytest.mark.parametrize("cars", [0, CARS])
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_row_is_what_a_slow_loop_sees_does_and_gains(
+    scenarios: list[Scenario], driver: np.ndarray, policy: str, cars: int
+) -> None:
+    of = asked(policy, scenarios, driver, 8, 0.3, cars)
+    experience, results = collect(*of)
+    episodes = list(cut_up(experience))
+    assert len(episodes) == 8
+    rows, greedy = np.arange(len(experience.actions)), 0
+    inputs = unpack(of.spec, experience.observations, rows, ages(experience))
+    first = 0
+    for k, (episode, result) in enumerate(zip(episodes, results, strict=True)):
+        slow = Slow(of.only([k]))
+        steps = len(slow.actions)
+        assert (int(result["steps"]), int(result["end"])) == (steps, slow.end)
+        assert episode.actions.tolist() == [*slow.actions, NO_ACTION]
+        assert episode.rewards == pytest.approx([*slow.rewards, 0.0], abs=2e-6)
+        assert episode.ends.tolist() == [0] * (steps - 1) + [slow.end, 0]
+        seen = inputs[first : first + steps + 1]
+        assert np.abs(seen - np.array(slow.inputs)).max() < 0.6 / 4096
+        first += steps + 1
+        greedy += slow.greedy
+    assert results["steps"].sum() > 150
+    assert 0.6 < greedy / results["steps"].sum() < 0.8
+    if cars and policy == "mlp:9+motion":
+        assert np.abs(inputs[:, 31:62]).max() > 0.1, "nobody was met"
+
+
+@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
+def test_the_environment_pays_and_shows_the_same(scenarios: list[Scenario], driver: np.ndarray, policy: str) -> None:
+    """Bit for bit, stepped with the same actions: rewards, ends, the frames, and the ranges' fixed point."""
+    of = asked(policy, scenarios, driver, 12, 0.0, 0)
+    of.epsilons[:] = np.linspace(0.1, 0.9, 12)
+    config = SimConfig(episode=EpisodeConfig(target=LIMITS.target))
+    frames = of.spec.frames if isinstance(of.spec, CnnSpec) else 1
+    grid = isinstance(of.spec, CnnSpec)
+    experience, results = collect(*of)
+    inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
+    row = 0
+    for k, episode in enumerate(of.episodes):
+        scenario = scenarios[episode["map"]]
+        env = GridSimVectorEnv(
+            1,
+            scenario=scenario.name,
+            maps=[scenario],
+            traffic=0,
+            observation="grid" if grid else "rays",
+            frames=frames,
+            max_episode_steps=LIMITS.steps,
+            config=config,
+        )
+        observation, info = env.reset(seed=0, options={"start": episode["start"]})
+        for step in range(int(results[k]["steps"]) + 1):
+            if grid:
+                assert (np.rint(inputs[row, :-1] * 255) == observation[0].reshape(-1)).all()
+                assert inputs[row, -1] == math.floor((info["speed_mps"][0] / F(10) - F(1)) * F(4096) + F(0.5)) / 4096
+            else:
+                ranges = env.ranges[0]
+                near = F(2.0) * ranges / (ranges + F(8.0)) - F(1.0)
+                assert (experience.observations[row, :31] - np.floor(near * F(4096) + F(0.5)) <= 1).all()
+            if step == int(results[k]["steps"]):
+                assert experience.actions[row] == NO_ACTION
+                row += 1
+                break
+            observation, rewards, terminations, truncations, info = env.step(experience.actions[row : row + 1])
+            assert rewards.tobytes() == experience.rewards[row : row + 1].tobytes()
+            assert (int(experience.ends[row]) == End.TIME) == truncations[0]
+            assert (int(experience.ends[row]) not in (0, End.TIME)) == terminations[0]
+            row += 1
+    assert row == len(experience.actions)
+    assert End.COLLISION in results["end"]
+    assert len(set(results["end"])) > 1
+
+
+@pytest.mark.parametrize("cars", [0, CARS])
+@pytest.mark.parametrize("policy", POLICIES)
+def test_without_exploring_it_is_evaluate(
+    scenarios: list[Scenario], driver: np.ndarray, policy: str, cars: int
+) -> None:
+    of = asked(policy, scenarios, driver, 12, 0.0, cars)
+    _, results = collect(*of)
+    wanted, _, _ = evaluate(of.spec, of.weights[None], scenarios, of.episodes, LIMITS, CONFIG, worlds=of.worlds)
+    assert results.tobytes() == wanted[0].tobytes()
+    assert results["steps"].sum() > 100
+
+
+# --- Rows ------------------------------------------------------------------------------------------------------------
+
+
+def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(
+    scenarios: list[Scenario], driver: np.ndarray
+) -> None:
+    of = asked("mlp:6,7", scenarios, driver, 60, 0.1, 0)
+    of.epsilons[1::2] = 0.8
+    of.episodes["steps"][::3] = 40
+    of.episodes["target"][::5] = 25.0
+    experience, results = collect(*of)
+    seen = set()
+    for episode, row, result in zip(cut_up(experience), of.episodes, results, strict=True):
+        steps = len(episode.actions) - 1
+        assert steps == result["steps"] <= (row["steps"] or LIMITS.steps)
+        assert episode.ends.tolist() == [0] * (steps - 1) + [int(result["end"]), 0]
+        assert (episode.actions[:-1] < 8).all()
+        assert episode.rewards[-1] == 0.0
+        assert (episode.rewards[:-1] >= -1.0).all()
+        assert (episode.rewards <= 1.0).all()
+        assert (episode.rewards[:-1] == -1.0).tolist() == [False] * (steps - 1) + [result["end"] == End.COLLISION]
+        if result["end"] == End.TIME:
+            assert steps == (row["steps"] or LIMITS.steps)
+        if result["end"] == End.SUCCESS:
+            assert result["distance"] >= (row["target"] or LIMITS.target)
+        seen.add(End(int(result["end"])))
+    assert seen == {End.COLLISION, End.IDLE, End.SUCCESS, End.TIME}
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
+def test_a_network_without_numbers_leaves_whole_rows(
+    scenarios: list[Scenario], driver: np.ndarray, policy: str, poison: float
+) -> None:
+    of = asked(policy, scenarios, driver, 6, 0.5, 0)
+    weights = of.weights.copy()
+    weights[-1] = poison
+    for spoilt in (weights, np.full_like(weights, math.nan)):
+        experience, results = collect(*of._replace(weights=spoilt))
+        assert len(list(cut_up(experience))) == 6
+        assert len(experience.actions) == results["steps"].sum() + 6
+        assert np.isfinite(experience.rewards).all()
+    assert (results["end"] == End.IDLE).all()
+    assert (results["distance"] == 0.0).all()
+    assert experience.actions.tolist() == [NO_ACTION] * 6
+    assert not experience.ends.any()
+
+
+def test_a_network_that_loses_its_numbers_on_the_way(scenarios: list[Scenario], driver: np.ndarray) -> None:
+    """Speeding up until 5 m/s, where infinities meet: the episode ends IDLE there, in its last step's row too."""
+    spec = MlpSpec((2,))
+    weights = np.zeros(spec.size, dtype=F)
+    hidden, outputs = weights[:66], weights[66:]
+    hidden[2 * 31] = 10.0  # the speed to the first unit, which is above 0 from 5 m/s on
+    hidden[64:] = 5.0, 1.0
+    outputs[1], outputs[8 + 1], outputs[16] = math.inf, -math.inf, 1.0  # of the second action, and of the first
+    of = asked("mlp:2", scenarios, driver, 8, 0.0, 0)._replace(spec=spec, weights=weights)
+    experience, results = collect(*of)
+    wanted, _, _ = evaluate(spec, weights[None], scenarios, of.episodes, LIMITS, CONFIG)
+    assert results.tobytes() == wanted[0].tobytes()
+    lost = [(x, r) for x, r in zip(cut_up(experience), results, strict=True) if r["end"] == End.IDLE]
+    assert len(lost) > 3
+    for episode, result in lost:
+        assert result["steps"] == 17
+        assert episode.actions.tolist() == [0] * 17 + [NO_ACTION]
+        assert episode.ends.tolist() == [0] * 16 + [End.IDLE, 0]
+
+
+# --- Exploring -------------------------------------------------------------------------------------------------------
+
+
+def test_random_actions_are_uniform_and_as_many_as_asked_for(scenarios: list[Scenario], driver: np.ndarray) -> None:
+    of = asked("mlp:6,7", scenarios, driver, 600, 1.0, 0)
+    counts = np.bincount(collect(*of)[0].actions, minlength=256)
+    n, counts = counts[:8].sum(), counts[:8]
+    assert n > 8000
+    assert ((counts - n / 8) ** 2 / (n / 8)).sum() < 29.9  # chi-square of 7 degrees of freedom at 1e-4
+    still = np.zeros_like(of.weights)
+    still[-8 + 4] = 1.0  # always action 4
+    mixed, _ = collect(*of._replace(weights=still, epsilons=np.full(600, 0.25, F)))
+    driven = mixed.actions[mixed.actions != NO_ACTION]
+    assert np.mean(driven != 4) == pytest.approx(0.25 * 7 / 8, abs=5 * math.sqrt(0.22 * 0.78 / len(driven)))
+
+
+def test_an_episode_depends_on_itself_alone(scenarios: list[Scenario], driver: np.ndarray) -> None:
+    """In any order, alone or in company, and with epsilons of its own; another key, another episode."""
+    of = asked("mlp:6,7", scenarios, driver, 12, 0.0, CARS)
+    of.epsilons[:] = np.linspace(0.0, 1.0, 12)
+    whole, results = collect(*of)
+    singles = [collect(*of.only([k])) for k in range(12)]
+    assert to_bytes(join(of.spec, [x for x, _ in singles])) == to_bytes(whole)
+    assert np.concatenate([r for _, r in singles]).tobytes() == results.tobytes()
+    order = np.random.default_rng(0).permutation(12).tolist()
+    turned, _ = collect(*of.only(order))
+    assert to_bytes(turned) == to_bytes(join(of.spec, [singles[k][0] for k in order]))
+    others = collect(*of._replace(keys=of.keys + np.uint64(1)))[0]
+    changed = [to_bytes(a) != to_bytes(b) for a, b in zip(cut_up(whole), cut_up(others), strict=True)]
+    assert not changed[0], "nothing is drawn for epsilon 0"
+    assert all(changed[3:])
+
+
+# --- Pools -----------------------------------------------------------------------------------------------------------
+
+
+def as_task(of: Asked) -> CollectTask:
+    names = tuple((scenario.name, scenario.seed) for scenario in of.scenarios)
+    arrays = (of.episodes.copy(), of.worlds.copy(), names, of.epsilons.copy(), of.keys.copy())
+    return CollectTask(str(of.spec), of.weights.copy(), *arrays, of.limits, of.config)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_the_serial_pool_keeps_the_order_whatever_the_cut(
+    scenarios: list[Scenario], driver: np.ndarray, policy: str
+) -> None:
+    of = asked(policy, scenarios, driver, 40, 0.2, CARS)
+    whole, results = collect(*of)
+    known = {(s.name, s.seed): s for s in scenarios}
+    told: list[tuple[int, int]] = []
+    collected = SerialPool(lambda *name: known[name]).collect(as_task(of), lambda *done: told.append(done))
+    assert to_bytes(collected.experience) == to_bytes(whole)
+    assert collected.results.tobytes() == results.tobytes()
+    assert told == sorted(told)
+    assert told[-1] == (40, 40)
+    assert len(told) > 3
+    assert 0 < sum(collected.busy_s.values()) <= collected.wall_s
+    parts = [Worker().collect(as_task(of), scenarios, a, b) for a, b in ((0, 1), (1, 17), (17, 17), (17, 40))]
+    assert to_bytes(join(of.spec, [x for x, _, _ in parts])) == to_bytes(whole)
+    assert np.concatenate([r for _, r, _ in parts]).tobytes() == results.tobytes()
+
+
+def test_what_does_not_fit_is_refused(scenarios: list[Scenario], driver: np.ndarray) -> None:
+    of = asked("mlp:6,7", scenarios, driver, 4, 0.5, 0)
+    for change, text in (
+        ({"weights": driver[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
+        ({"epsilons": of.epsilons[:2]}, r"epsilons are one for each of 4 episodes, not \(2,\)"),
+        ({"keys": of.keys[None]}, r"keys are one for each of 4 episodes"),
+        ({"epsilons": np.full(4, math.nan, F)}, "epsilons are shares, from 0 to 1"),
+        ({"worlds": no_traffic(3)}, "traffic of 4 episodes is"),
+        ({"limits": Limits(100.0, 0)}, "1 to 65535 steps, not 0"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            collect(*of._replace(**change))
+
+
+def test_no_episodes_no_rows(scenarios: list[Scenario], driver: np.ndarray) -> None:
+    experience, results = collect(*asked("mlp:6,7", scenarios, driver, 4, 0.5, 0).only([]))
+    assert len(results) == len(experience.actions) == 0

@@ -1,0 +1,119 @@
+"""The DQN's loop in this process: what it does where nothing is learned, where learning diverges, where time is up."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cluster import dqn_loop
+from cluster.dqn_loop import Dqn
+from cluster.learning import Maps
+from cluster.pool import SerialPool
+from cluster.settings import DqnSettings, SettingsError
+from gridsim.config import SimConfig
+
+pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+
+
+@pytest.fixture(scope="module")
+def maps():
+    kept = Maps("curved", SimConfig())
+    yield kept
+    kept.close()
+
+
+@pytest.fixture
+def loop(maps, monkeypatch):
+    """Makes a small run, its batches smaller than they are."""
+    monkeypatch.setattr(dqn_loop, "BATCH_STEPS", 2048)
+    monkeypatch.setattr(dqn_loop, "WARM_UP", 3000)
+
+    def make(**changes):
+        settings: dict[str, Any] = {
+            "scenario": "curved",
+            "policy": "mlp:4",
+            "replay": 4000,
+            "evaluate_every": 1000,
+            "batch": 32,
+        }
+        return Dqn(DqnSettings(**settings | changes), SerialPool(maps.build), maps)
+
+    return make
+
+
+def test_a_replay_smaller_than_the_warm_up_is_learned_from(loop):
+    learning = loop(replay=1000)
+    learning.step()
+    learning.step()
+    assert learning.learner.updates > 0
+
+
+def test_a_network_that_learned_nothing_is_evaluated_again_and_has_not_converged(loop):
+    learning = loop(updates=1e-6)
+    evaluated = [learning.step() for _ in range(dqn_loop.CALM + 2)]
+    assert learning.learner.updates == 0
+    assert len({row["distance_m/best"] for row in evaluated}) == 1  # the network's own figures, each time
+    assert not learning.converged
+    assert not learning.done()
+
+
+def test_values_that_stand_still_while_they_are_trained_have_converged(loop):
+    learning = loop(learning_rate=1e-12)
+    trained = 0
+    while trained < dqn_loop.CALM:
+        assert not learning.converged
+        before = learning.learner.updates
+        learning.step()
+        trained += learning.steps > 1 and learning.learner.updates > before
+    assert learning.converged
+    assert learning.done()
+
+
+def test_large_values_can_be_saved_and_taken_up_again(loop):
+    learning = loop(learning_rate=1e30)
+    for _ in range(4):
+        learning.step()
+        learning.timed(learning.history[-1], 1.0, None)
+    assert learning.history[-1]["q/mean"] != 0.0
+    assert np.isfinite([list(row.values()) for row in learning.history]).all()
+    again = loop(learning_rate=1e30)
+    again.restore(*learning.state())
+    assert again.counts() == learning.counts()
+
+
+@pytest.mark.parametrize("gene", [np.nan, np.inf])
+def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop, gene):
+    learning = loop()
+    learning.step()
+    learning.learner.online.genome.data[3] = gene
+    with pytest.raises(FloatingPointError, match=r"^the Q network diverged at update \d+: try a lower learning rate$"):
+        learning.step()
+    assert len(learning.history) == 1
+
+
+def test_a_step_ends_early_when_time_is_up(loop):
+    learning = loop(evaluate_every=10**9)
+    learning.out_of_time = lambda: True
+    learning.step()
+    assert learning.batches == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"n_step": 256}, "--n-step must be 255 or less, not 256"),
+        ({"updates": 1e308}, "--updates must be 1,000,000 or less"),
+        ({"updates": float("nan")}, "--updates must be above 0, not nan"),
+        ({"anneal": 10**400}, "--anneal must be 1,000,000,000,000,000 or less"),
+        ({"car_steps": 10**400}, "--car-steps must be 0 to 1,000,000,000,000,000"),
+        ({"observation": "grid", "replay": 3_000_000}, r"--replay must be 1,9\d\d,\d\d\d or less for cnn:16,32,256@4"),
+    ],
+)
+def test_settings_that_no_run_can_have(changes, words):
+    with pytest.raises(SettingsError, match=f"^{words}"):
+        DqnSettings(**changes).check()
+
+
+def test_the_default_replay_fits_a_checkpoint():
+    for observation in ("rays", "grid"):
+        DqnSettings(observation=observation).check()

@@ -1,0 +1,187 @@
+"""gridsim-dqn as a user runs it: the same network whatever the workers do, exact resume, and a run's contracts."""
+
+import json
+import os
+import re
+import signal
+import time
+
+import numpy as np
+import pytest
+from commands import finish, ray_workers, rows, start, summary, wait_until
+
+from cluster.checkpoint import load, save
+
+SMALL = [
+    *("--scenario", "curved", "--traffic", "2", "--policy", "mlp:12", "--seed", "5"),
+    *("--car-steps", "330000", "--evaluate-every", "60000", "--replay", "50000"),
+]
+NOT_OF_THE_CLOCK = ("distance_m/best", "distance_m/mean", "loss", "q/mean", "q/change", "updates", "car_steps")
+
+pytestmark = pytest.mark.e2e
+
+
+def dqn(*arguments, cwd, **env):
+    """gridsim-dqn, run to its end."""
+    return finish("gridsim-dqn", *arguments, cwd=cwd, **env)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """The undisturbed run, in one process."""
+    cwd = tmp_path_factory.mktemp("reference")
+    done = dqn("--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return cwd / "runs/ref"
+
+
+def same(run, reference):
+    """Whether two runs did and found the same: the champion, and every network on the way to it."""
+    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
+    mine, theirs = load(run / "checkpoint.npz")[0], load(reference / "checkpoint.npz")[0]
+    assert {name for name in theirs if not np.array_equal(mine[name], theirs[name])} <= {"history"}  # it has the clock
+    for row, other in zip(rows(run), rows(reference), strict=True):
+        assert {name: row[name] for name in NOT_OF_THE_CLOCK} == {name: other[name] for name in NOT_OF_THE_CLOCK}
+    return True
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_network_is_the_same_for_any_number_of_workers(reference, tmp_path, workers):
+    done = dqn("--workers", str(workers), "--name", "w", *SMALL, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert same(tmp_path / "runs/w", reference)
+
+
+def test_killed_workers_and_a_killed_process_change_nothing(reference, tmp_path):
+    run = tmp_path / "runs/k"
+    process = start("gridsim-dqn", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)
+    try:
+        wait_until(lambda: (run / "history.csv").exists() and len(rows(run)) >= 1)
+        victims = ray_workers(process.pid)
+        os.kill(victims[0], signal.SIGKILL)
+        wait_until(lambda: len(rows(run)) >= 3)
+    finally:
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+    assert not (run / "summary.json").exists()
+    done = dqn("--resume", str(run), "--workers", "1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert same(run, reference)
+    again = dqn("--resume", str(run), cwd=tmp_path)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert "is finished" in again.stdout
+
+
+def test_ctrl_c_saves(reference, tmp_path):
+    run = tmp_path / "runs/c"
+    process = start("gridsim-dqn", "--workers", "1", "--name", "c", *SMALL, cwd=tmp_path)
+    wait_until(lambda: (run / "history.csv").exists() and len(rows(run)) >= 2)
+    time.sleep(0.3)
+    os.kill(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "continue with: gridsim-dqn --resume runs/c" in err
+    done = dqn("--resume", "runs/c", "--workers", "0", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert same(run, reference)
+
+
+def test_run_keeps_the_contracts(reference):
+    for name in ("config.json", "checkpoint.npz", "champion.npz", "history.csv", "summary.json", "curves.png",
+                 "trajectory.png", "champion.mp4"):  # fmt: skip
+        assert (reference / name).stat().st_size > 0
+    found = summary(reference)
+    assert found["evaluations"] == len(rows(reference)) >= 5
+    assert found["updates"] == int(float(rows(reference)[-1]["updates"])) > 300
+    assert found["car_steps"] >= 330_000
+    assert set(found["held_out"]) == {"episodes", "success_rate", "distance_m", "speed_mps", "collision_rate"}
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient(tracking_uri=f"sqlite:///{reference.parent.parent}/mlflow.db")
+    logged = client.get_run(found["mlflow_run_id"])
+    assert logged.info.status == "FINISHED"
+    assert logged.data.tags["algorithm"] == "dqn"
+    assert not [name for name in logged.data.metrics if name.startswith("fitness")]
+    for name in ("distance_m/best", "speed_mps/mean", "car_steps", "wall_s", "car_steps_per_s", "loss"):
+        history = client.get_metric_history(found["mlflow_run_id"], name)
+        assert [m.step for m in history] == list(range(found["evaluations"]))
+    assert logged.data.params["discount"]
+
+
+def test_the_champion_is_one_like_any_other(reference):
+    done = finish("gridsim-evaluate", str(reference), "--json", cwd=reference.parent)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == summary(reference)["held_out"]
+
+
+def test_a_run_of_the_other_learner_is_refused(reference, tmp_path):
+    for flag, value in (("--resume", str(reference)), ("--config", str(reference / "config.json"))):
+        done = finish("gridsim-evolve", flag, value, cwd=tmp_path)
+        assert done.returncode == 2
+        assert "is a run of gridsim-dqn; give it to that command" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--device", "cuda"], "--device cuda"),
+        (["--device", "abacus"], "--device"),
+        (["--discount", "1.5"], "--discount must be 0 to 1, not 1.5"),
+        (["--batch", "0"], "--batch must be 1 or more, not 0"),
+        (["--replay", "10"], "--replay must be 256"),
+        (["--learning-rate", "nan"], "--learning-rate must be above 0, not nan"),
+        (["--policy", "cnn"], "policy cnn sees the grid"),
+        (["--n-step", "300"], "--n-step must be 255 or less, not 300"),
+        (["--observation", "grid", "--replay", "9000000"], "--replay must be 1,9"),
+        (["--generations", "3"], "--generations"),
+    ],
+)
+def test_wrong_use_is_one_clear_line(flags, words, tmp_path):
+    done = dqn(*flags, "--name", "x", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("gridsim-dqn: error: ")
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) <= 3
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_that_diverges_says_so(tmp_path):
+    done = dqn("--workers", "0", "--name", "d", *SMALL, "--learning-rate", "1e38", cwd=tmp_path)
+    assert done.returncode == 1
+    assert re.fullmatch(r"gridsim-dqn: error: the Q network diverged at update \d+: [^\n]*\n", done.stderr)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_champion_without_numbers_is_no_start(reference, tmp_path):
+    arrays, meta = load(reference / "champion.npz")
+    arrays["genome"][7] = np.nan
+    save(tmp_path / "c.npz", arrays, meta)
+    done = dqn("--init", "c.npz", *SMALL, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("gridsim-dqn: error: --init c.npz: some of its genes are no numbers")
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("replay_actions", lambda a: a[:-1]),
+        ("replay_observations", lambda a: a.astype(np.int32)),
+        ("learner_weights", lambda a: a * np.nan),
+        ("probe", lambda a: a[:, :-1]),
+        ("elites", lambda a: a[1:]),
+    ],
+)
+def test_resume_refuses_hostile_checkpoints(reference, tmp_path, name, change):
+    run = tmp_path / "runs/h"
+    run.mkdir(parents=True)
+    (run / "config.json").write_bytes((reference / "config.json").read_bytes())
+    arrays, meta = load(reference / "checkpoint.npz")
+    assert name in arrays
+    meta["car_steps"] = 100_000  # not done
+    arrays[name] = change(arrays[name])
+    save(run / "checkpoint.npz", arrays, meta)
+    done = dqn("--resume", str(run), "--workers", "0", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "the checkpoint does not belong to this run" in done.stderr
+    assert "Traceback" not in done.stderr

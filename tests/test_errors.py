@@ -1,0 +1,358 @@
+"""Velocity and steering errors: closed forms on a straight and a circle, zero for the reference, recorded drives."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cluster import cli
+from cluster.champion import Champion, load_champion
+from cluster.errors import errors, series
+from evolution.policy import PolicySpec
+from evolution.rollout import Limits, trajectory
+from gridsim.config import SimConfig
+from gridsim.drive import DriveError, Recorder
+from gridsim.errors import APART, TURN, Errors, Series, combine, driven, error_series, error_series_beside, poses_of
+from gridsim.reference import ReferenceDriver
+from gridsim.routes import ReferenceConfig, plan, profile, top_speed
+from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build, sample_starts
+from gridsim.world import FIELDS
+
+INTERVAL = REGISTRY["seamless"].speed_interval
+TOP = top_speed(INTERVAL, ReferenceConfig())
+NOBODY = np.zeros((0, FIELDS), dtype=np.float32)
+CHAMPION = Path(__file__).parents[1] / "benchmarks" / "champion.npz"
+
+
+@pytest.fixture(scope="module")
+def road():
+    return build("seamless", HELD_OUT_SEED)
+
+
+@pytest.fixture(scope="module")
+def champion():
+    return load_champion(CHAMPION)
+
+
+def along(points, speed, steering=0.0):
+    """Poses [n, 5] along points [n, 2] at a speed (m/s) and steering (rad), or arrays of them."""
+    ahead = np.diff(points, axis=0, append=2 * points[-1:] - points[-2:-1])
+    rows = np.empty((len(points), 5))
+    rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4] = points, np.arctan2(ahead[:, 1], ahead[:, 0]), speed, steering
+    return rows
+
+
+def straight(length, step=0.5):
+    s = np.arange(0.0, length + step / 2, step)
+    return np.stack([10.0 + s, np.full_like(s, 20.0)], axis=1)
+
+
+def circle(radius, length, step=0.25):
+    turn = np.arange(0.0, length / radius, step / radius)
+    return 100.0 + radius * np.stack([np.sin(turn), -np.cos(turn)], axis=1)
+
+
+def of(poses, road):
+    return error_series(driven(poses, road), road)
+
+
+# ------------------------------------------------------------------------------------------------ closed forms
+
+
+def test_constant_offsets_on_a_straight_are_the_errors(road):
+    found = of(along(straight(300.0), TOP + 2.0, math.radians(-3.0)), road).errors()
+    assert found.velocity_mean_mps == pytest.approx(2.0)
+    assert found.velocity_max_mps == pytest.approx(2.0)
+    assert found.reference_mps == pytest.approx(TOP)
+    assert found.velocity_mean_percent == pytest.approx(100 * 2.0 / TOP)
+    assert (found.steering_mean_deg, found.steering_max_deg) == (pytest.approx(3.0), pytest.approx(3.0))
+    assert found.steering_max_percent == pytest.approx(100 * 3.0 / 27.0)
+    braking = TOP**2 / (2 * ReferenceConfig().braking)  # of the end, and 5 m of the beginning, nothing is known
+    assert found.metres == pytest.approx(300.0 - 5.0 - braking, abs=0.51)
+
+
+def test_who_keeps_the_speed_that_it_starts_with_is_left_behind(road):
+    """The reference speeds up at 3 m/s2 from the agent's own speed: v_ref^2 = v0^2 + 2 a s."""
+    found = of(along(straight(200.0), 4.0), road)
+    expected = np.minimum(np.sqrt(16.0 + 6.0 * found.arc), TOP)
+    assert found.velocity_error == pytest.approx(4.0 - expected, abs=1e-9)
+    assert found.errors().velocity_max_mps == pytest.approx(TOP - 4.0)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_circle_wants_the_bicycles_steering(road, side):
+    radius = 20.0
+    points = circle(radius, 100.0) * [1.0, side]
+    speed = math.sqrt(ReferenceConfig().lateral * radius)
+    wheels = side * math.atan(2.0 * math.tan(math.asin(1.25 / radius)))
+    right = of(along(points, speed, wheels), road).errors()
+    assert right.velocity_max_mps < 0.02
+    assert right.steering_max_deg < 0.05
+    none = of(along(points, speed, 0.0), road).errors()
+    assert none.steering_mean_deg == pytest.approx(math.degrees(abs(wheels)), rel=5e-3)
+    wrong = of(along(points, speed - 1.5, -wheels), road).errors()
+    assert wrong.steering_max_deg == pytest.approx(2 * math.degrees(abs(wheels)), rel=5e-3)
+    assert wrong.velocity_max_mps == pytest.approx(1.5, abs=0.02)
+
+
+def test_it_is_metres_that_count_and_not_seconds(road):
+    """Slow on half of the metres, for most of the time, and then a stand of a minute."""
+    points = np.stack([np.append(np.arange(0.0, 200.0, 0.2), np.arange(200.0, 400.0, 1.0)), np.zeros(1200)], axis=1)
+    speed = np.where(points[:, 0] < 200.0, 2.0, 10.0)
+    found = Series(points[:, 0], speed, np.full(1200, 10.0), np.zeros(1200), np.where(speed > 2.0, 0.1, 0.0)).errors()
+    assert found.velocity_mean_mps == pytest.approx(8.0 * 199.9 / 399.0 + 4.0 * 0.2 / 399.0, abs=0.02)
+    assert found.steering_mean_deg == pytest.approx(math.degrees(0.1) / 2, abs=0.02)
+    poses = along(points, np.full(1200, TOP))
+    waits = np.concatenate([poses[:300], np.repeat(poses[300:301] * [1, 1, 1, 0, 1], 600, axis=0), poses[300:]])
+    waits[300:900, 4] = 0.4
+    one, two = of(poses, road), of(waits, road)
+    assert two.arc.tolist() == one.arc.tolist()
+    assert two.errors().velocity_mean_mps == pytest.approx(one.errors().velocity_mean_mps, abs=0.05)
+    assert two.errors().steering_mean_deg < 0.05
+
+
+def test_twice_as_many_samples_say_the_same(road):
+    route = plan(road, sample_starts(road, 1, np.random.default_rng(1))[0], 800.0, 1)
+    arc, rail = route.arc[0].astype(float), route.points[0].astype(float)
+    said = []
+    for step in (1.0, 0.5):
+        s = np.arange(2.0, 780.0, step)
+        points = np.stack([np.interp(s, arc, axis) for axis in rail.T], axis=1)
+        said.append(of(along(points, 7.0 + np.sin(s / 9.0), 0.1 * np.cos(s / 7.0)), road).errors().figures())
+    for name, value in said[0].items():
+        assert said[1][name] == pytest.approx(value, rel=0.02), name
+
+
+def test_what_was_reversed_and_driven_again_is_left_out(road):
+    ahead, back = along(straight(100.0), 6.0), along(straight(100.0)[180:140:-1], -2.0)
+    poses = np.concatenate([ahead[:181], back, ahead[141:]])
+    path = driven(poses, road)
+    assert path.arc[-1] == pytest.approx(100.0)
+    assert np.all(path.speed == 6.0)
+    assert np.array_equal(poses[path.rows, 0], ahead[:, 0])
+
+
+def test_over_the_edge_of_the_torus(road):
+    width = float(road.road.width)
+    poses = along(straight(300.0), TOP + 1.0)
+    poses[:, 0] += width - 100.0
+    beyond = poses.copy()
+    beyond[:, 0] %= width
+    assert of(beyond, road).errors().figures() == pytest.approx(of(poses, road).errors().figures())
+
+
+@pytest.mark.parametrize(
+    "poses", [along(straight(50.0), 0.0)[:1], np.repeat(along(straight(1.0), 0.0)[:1], 9, axis=0), np.zeros((4, 3))]
+)
+def test_who_came_nowhere_cannot_be_compared(road, poses):
+    with pytest.raises(ValueError, match="drive"):
+        driven(poses, road)
+
+
+def test_a_few_metres_are_nothing_to_compare(road):
+    with pytest.raises(ValueError, match="nothing was driven"):
+        of(along(straight(4.0), 3.0), road).errors()
+
+
+def test_episodes_are_weighted_by_metres():
+    long = Errors(1.0, 2.0, 10.0, 3.0, 4.0, 27.0, 300.0)
+    short = Errors(3.0, 9.0, 6.0, 7.0, 8.0, 27.0, 100.0)
+    both = combine([long, short])
+    assert both == Errors(1.5, 9.0, 9.0, 4.0, 8.0, 27.0, 400.0)
+    assert both.velocity_mean_percent == pytest.approx(100 * 1.5 / 9.0)
+    with pytest.raises(ValueError, match="nothing was driven"):
+        combine([])
+    with pytest.raises(ValueError, match="limits"):
+        combine([long, replace(short, steering_limit_deg=30.0)])
+
+
+# ------------------------------------------------------------------------------------------------ the reference
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_the_reference_itself_has_no_error(maps, name):
+    road, interval = maps[name][0], REGISTRY[name].speed_interval
+    start = sample_starts(road, 1, np.random.default_rng(4))[0]
+    route = plan(road, start, 900.0, 3)
+    points = route.points[0].astype(float)
+    wanted = profile(points, interval, start_speed=3.0)
+    poses = along(points, wanted.speed, wanted.steering)
+    poses[:, :2] %= [road.road.width, road.road.height]
+    found = of(poses, road).errors()
+    assert found.metres > 600.0
+    assert (found.velocity_max_mps, found.steering_max_deg) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_the_reference_driver_has_small_ones(maps, name):
+    """It has eight actions: its wheels go by steps of six degrees."""
+    road = maps[name][0]
+    start = sample_starts(road, 1, np.random.default_rng(4))[0]
+    drive = ReferenceDriver([road]).drive(road, start, NOBODY, 3)
+    poses = np.concatenate([drive.pose, drive.speed[:, None], drive.steering[:, None]], axis=1)
+    found = of(poses, road).errors()
+    assert found.metres > 1800.0
+    assert found.velocity_mean_mps < 0.7
+    assert found.velocity_max_mps < 4.6
+    assert found.steering_mean_deg < 4.0
+    assert found.steering_max_deg < 16.5
+
+
+# --------------------------------------------------------------------------------------------- a recorded drive
+
+
+def test_recorded_drive_against_itself_is_zero(road):
+    start = sample_starts(road, 1, np.random.default_rng(6))[0]
+    drive = ReferenceDriver([road]).drive(road, start, NOBODY, 5, target=600.0)
+    poses = np.concatenate([drive.pose, drive.speed[:, None], drive.steering[:, None]], axis=1)
+    path = driven(poses, road)
+    found, reached = error_series_beside(path, path, road)
+    assert reached == pytest.approx(path.arc[-1])
+    assert found.errors().metres == pytest.approx(path.arc[-1])
+    assert (found.errors().velocity_max_mps, found.errors().steering_max_deg) == pytest.approx((0.0, 0.0), abs=1e-6)
+    later = path.rows[400]  # begun within it, and on another turn of the torus
+    moved = poses[later:] + np.array([road.road.width, -road.road.height, 0, 0, 0])
+    part, reached = error_series_beside(driven(moved, road), path, road, 400)
+    assert reached == pytest.approx(path.arc[-1])
+    assert part.errors().metres == pytest.approx(path.arc[-1] - path.arc[400])
+    assert part.errors().velocity_max_mps == pytest.approx(0.0, abs=1e-4)
+
+
+def test_recorded_drive_is_compared_at_the_same_place(road):
+    """Beside the recording, in steps of another size: what counts is how far along it the agent is."""
+    recorded = driven(along(straight(200.0), 4.0 + straight(200.0)[:, 0] / 50.0, 0.02), road)
+    points = straight(230.0, 0.7) + np.array([0.0, 1.0])
+    path = driven(along(points, 3.0 + points[:, 0] / 50.0, 0.02), road)
+    found, reached = error_series_beside(path, recorded, road)
+    assert reached == pytest.approx(200.0, abs=0.7)
+    assert found.velocity_error == pytest.approx(-1.0, abs=1e-9)
+    assert found.steering_error == pytest.approx(0.0, abs=1e-9)
+
+
+def test_who_leaves_the_recorded_path_is_compared_up_to_there(road):
+    recorded = driven(along(straight(200.0), 8.0), road)
+    turn = np.arange(0.25, 20.0, 0.25) / 12.0
+    bend = [60.0, 20.0] + 12.0 * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=1)
+    path = driven(along(np.concatenate([straight(50.0), bend]), 6.0, 0.3), road)
+    found, reached = error_series_beside(path, recorded, road)
+    lateral = 50.0 + 12.0 * math.sin(math.acos(1.0 - APART / 12.0))
+    assert reached == pytest.approx(min(lateral, 50.0 + 12.0 * math.sin(math.radians(45.0))), abs=0.3)
+    assert found.arc[-1] == pytest.approx(50.0, abs=TURN / 4)
+    assert found.errors().velocity_mean_mps == pytest.approx(2.0)
+    other, reached = error_series_beside(
+        driven(along(straight(50.0) + np.array([0.0, 5.0]), 6.0), road), recorded, road
+    )
+    assert (len(other.arc), reached) == (0, 0.0)
+
+
+# -------------------------------------------------------------------------------------------------- a champion
+
+
+def record(path, champion, road, start, target):
+    """A champion's own drive, written as a person's: bit for bit what its rollout does."""
+    spec = PolicySpec.parse(champion.policy)
+    _, states, _ = trajectory(spec, champion.genome, road, start, Limits(target, 4000), champion.sim)
+    poses = poses_of(states)
+    poses[0] = start
+    env = champion.make_env()
+    observation, _ = env.reset(seed=1, options={"map_seed": road.seed, "start": start})
+    with Recorder(path, road, 0.1) as recorder:
+        for step, pose in enumerate(poses[:-1]):
+            action = int(champion.act(observation))
+            recorder.write(step, pose, action, 0)
+            observation, *_ = env.step(action)
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def recorded(champion, tmp_path_factory):
+    """A drive of the champion's own, and one of the reference driver."""
+    folder, road = tmp_path_factory.mktemp("drives"), build("seamless", 11)
+    start = sample_starts(road, 1, np.random.default_rng(0))[0]
+    record(folder / "own.csv", champion, road, start, 300.0)
+    drive = ReferenceDriver([road]).drive(road, start, NOBODY, 2, target=500.0)
+    with Recorder(folder / "drive.csv", road, 0.1) as recorder:
+        for step, (pose, speed, wheels) in enumerate(zip(drive.pose, drive.speed, drive.steering, strict=True)):
+            recorder.write(step, np.array([*pose, speed, wheels]), int(drive.action[step]), 0)
+    return folder
+
+
+def test_champion_against_its_own_recording_is_zero(champion, recorded):
+    found = errors(champion, reference=recorded / "own.csv")
+    assert found.metres > 290.0
+    assert (found.velocity_max_mps, found.steering_max_deg) == pytest.approx((0.0, 0.0), abs=1e-4)
+
+
+def test_champion_begins_anew_where_it_leaves_the_recording(champion, recorded):
+    parts = series(champion, reference=recorded / "drive.csv")
+    found = combine([part.errors() for part in parts])
+    assert 250.0 < found.metres < 510.0
+    assert len(parts) > 1
+    assert all(abs(part.velocity_error[0]) < 0.5 for part in parts)
+    assert 1.0 < found.velocity_mean_mps < 5.0  # it dawdles
+
+
+def test_recording_of_elsewhere_is_refused(champion, recorded, tmp_path):
+    with pytest.raises(DriveError, match="driven on seamless, not on city"):
+        errors(champion, "city", reference=recorded / "own.csv")
+    with pytest.raises(DriveError, match="among 0 cars, not 3"):
+        errors(champion, traffic=3, reference=recorded / "own.csv")
+    text = (recorded / "own.csv").read_text().replace(",11\n", ",12\n")
+    (tmp_path / "moved.csv").write_text(text)
+    with pytest.raises(DriveError, match="another map"):
+        errors(champion, reference=tmp_path / "moved.csv")
+    lines = (recorded / "own.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "still.csv").write_text("".join(lines[:2]))
+    with pytest.raises(ValueError, match="nothing was driven"):
+        errors(champion, reference=tmp_path / "still.csv")
+
+
+def test_champion_against_the_reference_driver(champion):
+    found = errors(champion, episodes=4)
+    assert found.metres > 4 * 1900.0
+    assert 0.5 < found.velocity_mean_mps < 4.0
+    assert 1.0 < found.steering_mean_deg < 6.0
+    assert found != errors(champion, episodes=4, traffic=6)
+    for wrong in ({"episodes": 0}, {"scenario": "moon"}, {"traffic": -1}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            errors(champion, **wrong)
+
+
+def test_champion_of_the_grid(champion):
+    """Its last layer's biases alone: it accelerates, and crashes in the end."""
+    spec = PolicySpec.parse("cnn")
+    genome = np.zeros(spec.size, dtype=np.float32)
+    genome[-8] = 1.0
+    found = errors(Champion(genome, "cnn", "curved", SimConfig()), episodes=4)
+    assert found.metres > 4.0
+    assert found.steering_mean_deg > 0.0
+
+
+def test_champion_that_never_moves_is_one_clear_line(champion):
+    still = replace(champion, genome=np.zeros_like(champion.genome))
+    still.genome[-4] = 1.0
+    with pytest.raises(ValueError, match="nothing was driven"):
+        errors(still, episodes=2)
+
+
+def test_command_prints_them(champion, recorded, monkeypatch, capsys):
+    def run(*arguments):
+        monkeypatch.setattr("sys.argv", ["gridsim-evaluate", str(CHAMPION), "--episodes", "2", *map(str, arguments)])
+        cli.evaluate_main()
+        return capsys.readouterr().out
+
+    said = json.loads(run("--json", "--errors"))
+    assert said.pop("errors") == errors(champion, episodes=2).figures()
+    assert said["episodes"] == 2
+    shown = run("--reference", recorded / "own.csv")
+    assert "velocity error, m/s" in shown
+    assert "steering error, degrees" in shown
+    with pytest.raises(SystemExit) as stop:
+        run("--scenario", "city", "--reference", recorded / "own.csv")
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("gridsim-evaluate: error: ")
+    assert "driven on seamless, not on city" in said
