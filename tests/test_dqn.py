@@ -404,7 +404,7 @@ def test_a_network_that_diverged_says_so():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("updates", None), ("updates", True), ("updates", -1), ("updates", 1.0), ("updates", 1 << 40),
+        ("updates", None), ("updates", True), ("updates", -1), ("updates", 1.0), ("updates", 1 << 62),
         ("weights", None), ("weights", np.zeros(3, dtype=F)), ("weights", np.zeros(SPEC.size)),
         ("target", np.full(SPEC.size, np.nan, dtype=F)), ("adam_mean", np.full(SPEC.size, np.inf, dtype=F)),
         ("adam_variance", np.full(SPEC.size, -1, dtype=F)), ("adam_variance", [0.0] * SPEC.size),

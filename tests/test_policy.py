@@ -131,12 +131,13 @@ def test_squash_never_falls():
 
 
 def test_what_the_network_sees():
-    inputs = np.zeros(INPUTS, dtype=F)
+    inputs = np.zeros(INPUTS + 1, dtype=F)
     ranges = np.linspace(0, 50, 31).astype(F)
-    encode(ranges, None, F(12.5), inputs)
+    encode(ranges, None, F(12.5), F(-0.1), inputs)
     r = ranges.astype(float)
     assert inputs[:31] == pytest.approx(2 * r / (r + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
+    assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see
     assert inputs.min() == -1.0
 
 
