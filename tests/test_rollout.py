@@ -83,7 +83,7 @@ def test_results_do_not_depend_on_the_company(scenarios, task):
 # --- Among traffic ---------------------------------------------------------------------------------------------------
 
 CARS = 8
-AMONG = Limits(400.0, 700)
+AMONG = Limits(1000.0, 1700)
 
 
 @njit
@@ -113,7 +113,7 @@ def among(root):
     champion = load_champion(root / "benchmarks" / "champion_traffic.npz")
     spec = PolicySpec.parse(champion.policy)
     maps = [build("seamless", 3), build("highway", 4), build("city", 5)]
-    episodes, worlds = lane_starts(maps, np.arange(9) % 3, np.random.default_rng(8), CARS)
+    episodes, worlds = lane_starts(maps, np.arange(9) % 3, np.random.default_rng(18), CARS)
     paths = [
         trajectory(spec, champion.genome, maps[e["map"]], e["start"].copy(), AMONG, CONFIG, w)
         for e, w in zip(episodes, worlds, strict=True)
