@@ -208,15 +208,15 @@ class DqnSettings(RunSettings):
     """Draw transitions by their errors (Schaul et al. 2016) in place of uniformly."""
     double: bool = True
     """Double DQN (van Hasselt et al. 2016)."""
-    n_step: int = 3
+    n_step: int = 1
     """Steps of rewards in a target."""
     discount: float = 0.99
     """Discount factor of a step."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     """Of Adam, at the start; it falls to a twentieth over --anneal."""
     anneal: int = 30_000_000
     """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth."""
-    target_period: int = 500
+    target_period: int = 200
     """Updates from one copy of the target network to the next."""
     epsilon: float = 0.4
     """Share of random actions of the episode that explores most; others of a batch explore less (Horgan et al.
