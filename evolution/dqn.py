@@ -52,8 +52,8 @@ class DqnConfig:
     target_period: int = 500  # updates after which the target becomes the network
     average: int = 2000  # updates that the average of the weights goes back (Polyak and Juditsky 1992), exponentially
     double: bool = True  # Double DQN
-    # Size of an error from which the loss grows linearly: as large as returns are. With 1 (Mnih et al. 2015) a rare crash
-    # weighs no more than any small error, values become medians instead of means, and drivers reckless.
+    # Size of an error from which the loss grows linearly: as large as returns are. With 1 (Mnih et al. 2015) a rare
+    # crash weighs no more than any small error, values become medians instead of means, and drivers reckless.
     huber_delta: float = 30.0
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
     priorities: PriorityConfig | None = None  # None draws all transitions alike
