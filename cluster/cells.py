@@ -137,6 +137,8 @@ def settings_of(cell: Cell) -> RunSettings:
     if cell.learner == "dqn":
         steps = plan.budget.car_steps or UNBOUND
         every = min(DqnSettings.evaluate_every, max(steps // EVALUATIONS, 1))
+        # What evolution sees, and not how the wheels stand.
+        common["policy"] = "mlp:64,64" if plan.observation == "rays" else ""
         return DqnSettings(**common, observation=plan.observation, car_steps=steps, evaluate_every=every)
     if plan.population:
         common["population"] = plan.population

@@ -211,6 +211,19 @@ def test_finished_runs_are_never_trained_again(tmp_path):
     assert len(done) == len(cells)
 
 
+@pytest.mark.parametrize("observation", ["rays", "grid"])
+def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation):
+    plan = dataclasses.replace(PLAN, observation=observation)
+    specs = []
+    for cell in plan.cells(tmp_path):
+        settings = settings_of(cell)
+        settings.check()
+        specs.append(PolicySpec.parse(settings.policy))
+    assert {spec.observation for spec in specs} == {observation}
+    if observation == "rays":
+        assert {spec.inputs for spec in specs} == {32}
+
+
 def stop_after(done, count):
     if len(done) == count:
         raise KeyboardInterrupt
