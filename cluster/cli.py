@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import math
 import os
 import re
 import signal
@@ -254,9 +255,11 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         raise UsageError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
     if resume:
         for f in dataclasses.fields(kind):
-            if f.name in ("workers", "address", "tracking_uri", "experiment", *kind.unbound):
+            if f.name in ("workers", "address", "tracking_uri", "experiment"):
                 continue
             now, then = getattr(flags, f.name), getattr(base, f.name)
+            if f.name in kind.unbound and (now or math.inf) >= (then or math.inf):  # 0: any number
+                continue
             if f.name == "output":
                 now, then = Path(now).resolve(), Path(then).resolve()
             if now != then:

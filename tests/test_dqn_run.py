@@ -115,6 +115,13 @@ def test_the_champion_is_one_like_any_other(reference):
     assert json.loads(done.stdout) == summary(reference)["held_out"]
 
 
+@pytest.mark.parametrize("change", [["--car-steps", "1000"], ["--episodes", "5"], ["--discount", "0.9"]])
+def test_resume_refuses_contradictions(reference, tmp_path, change):
+    done = dqn("--resume", str(reference), "--workers", "0", *change, cwd=tmp_path)
+    assert done.returncode == 2
+    assert f"{change[0]} {change[1]} contradicts the run's" in done.stderr
+
+
 def test_a_run_of_the_other_learner_is_refused(reference, tmp_path):
     for flag, value in (("--resume", str(reference)), ("--config", str(reference / "config.json"))):
         done = finish("gridsim-evolve", flag, value, cwd=tmp_path)
