@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import shutil
@@ -18,7 +17,7 @@ from cluster.learning import Maps
 from cluster.pool import PoolError, SerialPool, WorkerPool
 from cluster.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_tracker, new_run, open_run
 from cluster.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
-from cluster.tracking import Status, TrackingError
+from cluster.tracking import Status
 from evolution.curriculum import CrashError
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario
@@ -98,13 +97,7 @@ class Cells:
             run.write_config()
             session.process_started = time.perf_counter()  # a budget is of learning, not of what is loaded for it
             session.learn()
-            self.note("measuring the champion on held-out roads")
-            summary = session.finish(self.workers)
-            if not summary["mlflow_run_id"]:
-                with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
-                    summary["mlflow_run_id"] = tracker.wait_ready(30.0)
-            tracker.log_artifacts(run.path)
-            session.write_summary(summary)
+            summary = session.complete(self.workers, self.note)
             status = "FINISHED"
             return summary
         except Exception:

@@ -408,7 +408,6 @@ def _run(
     from cluster import progress, report, warm
     from cluster.champion import load_champion
     from cluster.run import Session
-    from cluster.tracking import TrackingError
 
     initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
     session = Session(run, pool, maps, tracker, started, initial)
@@ -422,14 +421,7 @@ def _run(
         session.on_row = shown.row
         session.learning.on_progress = shown.members
         session.learn()
-        shown.note("measuring and filming the champion on held-out roads")
-        summary = session.finish(flags.workers)
-        shown.note("logging to MLflow")
-        if not summary["mlflow_run_id"]:
-            with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
-                summary["mlflow_run_id"] = tracker.wait_ready(30.0)
-        session.write_summary(summary)
-        tracker.log_artifacts(run.path)
+        summary = session.complete(flags.workers, shown.note)
     if session.lost:
         print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
     console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))

@@ -62,10 +62,9 @@ class Dqn(Learning):
         super().__post_init__()
         s = self.settings
         config = DqnConfig(
-            discount=s.discount, n_step=s.n_step, capacity=s.replay, batch=s.batch, learning_rate=s.learning_rate,
-            final_learning_rate=LAST_SHARE, learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1),
-            target_period=s.target_period, double=s.double,
-            priorities=PriorityConfig() if s.prioritised else None,
+            batch=s.batch, learning_rate=s.learning_rate, final_learning_rate=LAST_SHARE,
+            learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1), target_period=s.target_period,
+            double=s.double, priorities=PriorityConfig() if s.prioritised else None,
         )  # fmt: skip
         self.learner = DqnLearner(self.spec, config, s.seed, s.device)
         self.replay = Replay(self.spec, s.replay, s.n_step, s.discount, config.priorities)

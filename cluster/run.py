@@ -7,6 +7,7 @@ process, the folder holds a whole step, the last or the one before, and a resume
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -31,7 +32,7 @@ from cluster.coordinator import Evolution
 from cluster.learning import Learning, Maps, held_out_episodes, now
 from cluster.pool import WorkerPool
 from cluster.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
-from cluster.tracking import Tracker, git_commit
+from cluster.tracking import Tracker, TrackingError, git_commit
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
 from gridsim.maps import map_digest
@@ -339,6 +340,18 @@ class Session:
         }
         self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
         self.write_summary(summary)
+        return summary
+
+    def complete(self, workers: int, note: Callable[[str], None]) -> dict[str, Any]:
+        """`finish`, and hand all that there is to MLflow; `note` is told what is going on. Returns the summary."""
+        note(f"measuring {'and filming ' if self.film else ''}the champion on held-out roads")
+        summary = self.finish(workers)
+        note("logging to MLflow")
+        if not summary["mlflow_run_id"]:
+            with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
+                summary["mlflow_run_id"] = self.tracker.wait_ready(30.0)
+        self.write_summary(summary)
+        self.tracker.log_artifacts(self.run.path)
         return summary
 
     def _film(self, champion: Champion, scenario: Scenario, start: np.ndarray, world: np.ndarray) -> None:

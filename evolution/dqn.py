@@ -37,18 +37,13 @@ _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 
 @dataclass(frozen=True)
 class DqnConfig:
-    """The learner's parameters, beside the network's shape."""
+    """The learner's parameters, beside the network's shape and those of the `Replay`, which makes the returns."""
 
-    discount: float = 0.98  # of a control step of 0.1 s: half is left after 3.4 s
-    n_step: int = 3  # steps of a return (Hessel et al. 2018, "Rainbow")
-    capacity: int = 1_000_000  # rows of the replay (Mnih et al. 2015)
     batch: int = 256  # transitions of an update
     learning_rate: float = 1e-3  # Adam's, when training begins
     final_learning_rate: float = 0.1  # the share of it that is left at the end
     learning_rate_updates: int = 50_000  # after which that is reached, linearly
-    adam_epsilon: float = (
-        1e-5  # Adam's; greater than its authors' 1e-8, as in Rainbow, since squared gradients are small
-    )
+    adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates after which the target becomes the network
     average: int = 2000  # updates that the average of the weights goes back (Polyak and Juditsky 1992), exponentially
     double: bool = True  # Double DQN

@@ -58,9 +58,13 @@ def experience(episodes, spec=SPEC, seed=0):
     return Experience(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def replay_of(config, spec=SPEC, rows=400):
-    replay = Replay(spec, rows, config.n_step, config.discount, config.priorities)
-    replay.add(experience(60, spec))
+def empty_replay(config):
+    return Replay(SPEC, 400, 3, 0.98, config.priorities)
+
+
+def replay_of(config):
+    replay = empty_replay(config)
+    replay.add(experience(60, SPEC))
     return replay
 
 
@@ -300,9 +304,8 @@ def test_a_chain_of_two_states_is_learned(n_step, priorities):
     seen = np.zeros((len(actions), 32), dtype=np.int16)
     seen[np.arange(len(actions)), observations] = 4096
     config = DqnConfig(
-        discount=discount, n_step=n_step, batch=64, learning_rate=0.01, target_period=40, learning_rate_updates=1_000,
-        priorities=priorities,
-    )  # fmt: skip
+        batch=64, learning_rate=0.01, target_period=40, learning_rate_updates=1_000, priorities=priorities
+    )
     replay = Replay(SPEC, 10_000, n_step, discount, priorities)
     replay.add(
         Experience(seen, np.array(actions, dtype=np.uint8), np.array(rewards, dtype=F), np.array(ends, dtype=np.uint8))
@@ -334,7 +337,7 @@ def test_training_may_be_cut_and_resumed_anywhere(priorities):
     resumed = DqnLearner(SPEC, config, seed=5)
     resumed.train(replay_of(config), 3)  # whatever it was before
     resumed.restore(*saved)
-    replay_resumed = Replay(SPEC, 400, config.n_step, config.discount, priorities)
+    replay_resumed = empty_replay(config)
     replay_resumed.restore(*saved_replay)
     resumed.train(replay_resumed, 50)
     assert resumed.state()[1] == whole.state()[1] == {"updates": 100}
