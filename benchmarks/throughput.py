@@ -82,7 +82,7 @@ def _actions(packed, layers, ranges, speeds, actions):
     """What one network does in many cars."""
     scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
     for i in range(len(actions)):
-        encode(ranges[i], None, speeds[i], scratch)
+        encode(ranges[i], None, speeds[i], np.float32(0.0), scratch)
         actions[i] = decide(packed, layers, scratch)
 
 
