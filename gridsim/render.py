@@ -18,182 +18,23 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.ndimage import minimum_filter
 
+from gridsim import paint
 from gridsim.config import SimConfig, constants
 from gridsim.ego import COS, SIN, STEERING, X, Y
-from gridsim.jit import leaf, njit
 from gridsim.marks import lane_marks
-from gridsim.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, freeze
+from gridsim.roads import CELLS_PER_M, freeze
 from gridsim.scenarios import Scenario
 
 if TYPE_CHECKING:
     import pygame
 
-GROUND = (226, 231, 218)
-GROUND_OTHER = (220, 226, 211)  # of every other square, so that the ground is seen to move
-VERGE = (190, 197, 178)
-ASPHALT = (66, 70, 79)
-EDGE_LINE = (236, 238, 240)
-MARK, MARK_OPPOSITE = (214, 217, 222), (240, 205, 112)
-EGO, OTHER, PARKED = (255, 92, 43), (96, 168, 232), (152, 160, 171)
-GLASS, TYRE, LIGHT = (28, 32, 40), (24, 25, 29), (255, 246, 214)
-RAY, PATH = (92, 225, 200), (233, 172, 86)
-FREE, OCCUPIED, UNKNOWN = (92, 225, 200), (255, 70, 90), (16, 18, 24)
-HUD = (20, 22, 28)
-
-BLOCK = 8  # pixels, side of the blocks that are looked at together
-SQUARE = 32  # cells of the field, side of the ground's squares
-EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and half that line's width
-VERGE_WIDTH = 0.7  # m
-DIP = 1.0  # m from any edge, from where on all is asphalt
 CAR_AT = 0.74  # of the picture's height where the car is, where the view follows it
 GRID_CELL = 0.5  # m, of the occupancy grid
-
-_F, _I, _U = np.float32, np.int32, np.uint32
-_SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, corner radius, red, green, blue, opacity
 
 
 class NoDisplayError(RuntimeError):
     """There is nowhere to open a window; the message is one line that says what to do."""
-
-
-@leaf
-def _clear(field, columns, rows, wrap, turn, x, y):
-    """Clearance (m) at a place in cells of the field, from `turn` tiles before the first; off the map, a wall."""
-    ix, iy = _I(x), _I(y)
-    mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
-    if not wrap and (_U(ix - _I(turn) * _I(columns)) > mask_x or _U(iy - _I(turn) * _I(rows)) > mask_y):
-        return _F(FIELD_FLOOR)
-    ux, uy = x - _F(ix), y - _F(iy)
-    word = field[_U((_U(iy) & mask_y) * _U(columns) + (_U(ix) & mask_x))]
-    q00, q10 = _F(_I(word & _U(255))), _F(_I((word >> _U(8)) & _U(255)))
-    q01, q11 = _F(_I((word >> _U(16)) & _U(255))), _F(_I(word >> _U(24)))
-    low, high = q00 + ux * (q10 - q00), q01 + ux * (q11 - q01)
-    return (low + uy * (high - low)) * _F(1.0 / FIELD_UNITS) + _F(FIELD_FLOOR)
-
-
-@njit(nogil=True)
-def _draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels_per_m, colours, image):
-    """Ground and road.
-
-    Args: packed field with its sides; whether it repeats; position of the first pixel's centre and the steps to the
-    next pixel to the right and below, float64 [2], in cells of the field from `turn` tiles before the first, so that
-    none is below 0; pixels_per_m; colours float32 [5, 3]: ground, its other squares, verge, asphalt, edge line.
-    Writes: image uint8 [h, w, 3].
-    """
-    zero, half, one = _F(0.0), _F(0.5), _F(1.0)
-    scale = _F(pixels_per_m)
-    line_half = _F(EDGE_HALF) * scale
-    inner = _F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge where there is nothing but asphalt
-    outer = -max(_F(VERGE_WIDTH), one / scale)  # ... and nothing but ground
-    reach = _F(0.75 * BLOCK) / scale  # m from a block's middle to its corners; clearance changes no faster than that
-    ax, ay, bx, by = _F(step_x[0]), _F(step_x[1]), _F(step_y[0]), _F(step_y[1])
-    for top in range(0, image.shape[0], BLOCK):
-        for left in range(0, image.shape[1], BLOCK):
-            x0 = _F(origin[0] + left * step_x[0] + top * step_y[0])
-            y0 = _F(origin[1] + left * step_x[1] + top * step_y[1])
-            middle = _F((BLOCK - 1) / 2)
-            clear = _clear(field, columns, rows, wrap, turn, x0 + middle * (ax + bx), y0 + middle * (ay + by))
-            known = clear > inner + reach or clear < outer - reach
-            for j in range(top, min(top + BLOCK, image.shape[0])):
-                for i in range(left, min(left + BLOCK, image.shape[1])):
-                    across, down = _F(i - left), _F(j - top)
-                    x, y = x0 + across * ax + down * bx, y0 + across * ay + down * by
-                    if not known:
-                        clear = _clear(field, columns, rows, wrap, turn, x, y)
-                    if clear > inner:
-                        for c in range(3):
-                            image[j, i, c] = np.uint8(colours[3, c])
-                        continue
-                    base = (_I(x) // _I(SQUARE) + _I(y) // _I(SQUARE)) & 1
-                    if clear < outer:
-                        for c in range(3):
-                            image[j, i, c] = np.uint8(colours[base, c])
-                        continue
-                    edge = clear * scale  # pixels from the road's edge, positive on it
-                    road = min(max(edge + half, zero), one)
-                    verge = min(max(one + clear * _F(1.0 / VERGE_WIDTH), zero), one)
-                    off = abs(edge - _F(EDGE_AT) * scale)
-                    line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * _F(0.85)
-                    for c in range(3):
-                        value = colours[base, c]
-                        value += verge * (colours[2, c] - value)
-                        value += road * (colours[3, c] - value)
-                        value += line * (colours[4, c] - value)
-                        image[j, i, c] = np.uint8(value + half)
-
-
-def _smoothed(scenario: Scenario) -> np.ndarray:
-    """The map's clearance field without the dips where strips meet, away from any edge: packed as in `Road`.
-
-    Such a dip, down to a point of clearance 0 in the middle of a junction, would be drawn as an edge.
-    """
-    road = scenario.road
-    nodes = (road.field & np.uint32(255)).astype(np.uint8).reshape(int(road.rows), int(road.columns))
-    least = minimum_filter(nodes, 2 * round(DIP * CELLS_PER_M) + 1, mode="wrap")
-    inside = least > round((-FIELD_FLOOR - 0.1) * FIELD_UNITS)
-    shown = np.where(inside, np.maximum(nodes, round((DIP - FIELD_FLOOR) * FIELD_UNITS)), nodes).astype(np.uint32)
-    right = np.roll(shown, -1, axis=1)
-    low, high = shown | right << 8, np.roll(shown, -1, axis=0) | np.roll(right, -1, axis=0) << 8
-    return freeze((low | high << 16).ravel())
-
-
-@njit(nogil=True)
-def _draw_shapes(shapes, image):
-    """Blend rounded boxes float32 [n, 11] in pixels, in this order, into image uint8 [h, w, 3]."""
-    height, width = image.shape[0], image.shape[1]
-    half, zero, one = _F(0.5), _F(0.0), _F(1.0)
-    for k in range(shapes.shape[0]):
-        x0, y0, dx, dy, length, across, radius = shapes[k, :7]
-        red, green, blue, opacity = shapes[k, 7:]
-        tall = abs(dy) * length + abs(dx) * across + one
-        wide = abs(dx) * length + abs(dy) * across + one
-        if not (tall < 32768.0 and wide < 32768.0 and abs(x0) < 32768.0 and abs(y0) < 32768.0):
-            continue
-        top, bottom = max(int(y0 - tall) - 1, 0), min(int(y0 + tall) + 2, height)
-        for j in range(top, bottom):
-            y = _F(j) - y0
-            first, last = x0 - wide, x0 + wide
-            if abs(dy) > _F(0.01):  # of a slanted shape, only the stretch that this line of pixels crosses
-                middle, reach = x0 + y * dx / dy, (across + one) / abs(dy)
-                first, last = max(first, middle - reach), min(last, middle + reach)
-            for i in range(max(int(first) - 1, 0), min(int(last) + 2, width)):
-                x = _F(i) - x0
-                u = abs(x * dx + y * dy) - length + radius
-                v = abs(y * dx - x * dy) - across + radius
-                outside = math.sqrt(max(u, zero) ** 2 + max(v, zero) ** 2) + min(max(u, v), zero) - radius
-                cover = min(max(half - outside, zero), one) * opacity
-                if cover > zero:
-                    image[j, i, 0] = np.uint8(_F(image[j, i, 0]) + cover * (red - _F(image[j, i, 0])) + half)
-                    image[j, i, 1] = np.uint8(_F(image[j, i, 1]) + cover * (green - _F(image[j, i, 1])) + half)
-                    image[j, i, 2] = np.uint8(_F(image[j, i, 2]) + cover * (blue - _F(image[j, i, 2])) + half)
-
-
-def _car_parts(
-    length: float, width: float, front_axle: float, rear_axle: float, steering: float, colour: Sequence[int]
-) -> np.ndarray:
-    """Shapes [k, 11] of a car at the origin heading along +x, in m."""
-    a, b = length / 2, width / 2
-    c, s = math.cos(steering), math.sin(steering)
-    light = [min(255, v + (255 - v) // 4) for v in colour]
-    dark = [v * 7 // 10 for v in colour]
-    tyre = (0.19 * a, 0.12, 0.08, *TYRE, 1.0)
-    return np.array(
-        [
-            (0.0, 0.0, 1, 0, a + 0.35, b + 0.35, 0.7, 0, 0, 0, 0.16),  # shadow
-            *((front_axle, side * (b - 0.08), c, s, *tyre) for side in (-1, 1)),
-            *((-rear_axle, side * (b - 0.08), 1, 0, *tyre) for side in (-1, 1)),
-            (0.0, 0.0, 1, 0, a, b - 0.04, 0.42 * b, *dark, 1.0),
-            (0.0, 0.0, 1, 0, a - 0.08, b - 0.13, 0.36 * b, *colour, 1.0),
-            (0.30 * a, 0.0, 1, 0, 0.15 * a, 0.76 * b, 0.16, *GLASS, 1.0),
-            (-0.66 * a, 0.0, 1, 0, 0.09 * a, 0.68 * b, 0.12, *GLASS, 1.0),
-            (-0.20 * a, 0.0, 1, 0, 0.36 * a, 0.70 * b, 0.18, *light, 1.0),  # roof
-            *((0.93 * a, side * 0.62 * b, 1, 0, 0.05 * a, 0.20 * b, 0.09, *LIGHT, 1.0) for side in (-1, 1)),
-            *((-0.95 * a, side * 0.64 * b, 1, 0, 0.03 * a, 0.20 * b, 0.05, 196, 30, 42, 1.0) for side in (-1, 1)),
-        ],
-        dtype=np.float32,
-    )
 
 
 class Renderer:
@@ -225,7 +66,7 @@ class Renderer:
         self.config = config or SimConfig()
         self._constants = constants(self.config)
         road = scenario.road
-        self._field = _smoothed(scenario)
+        self._field = paint.smoothed(scenario)
         self._world = np.array([road.width, road.height], dtype=np.float64)
         self.pixels_per_m = height / metres if follow else min(width / self._world[0], height / self._world[1])
         self._anchor = np.array([width / 2, height * (CAR_AT if follow else 0.5)])
@@ -234,10 +75,12 @@ class Renderer:
         # Parked cars: boxes that are part of the map, where it has any.
         blocks = getattr(scenario.strips, "blocks", None)
         self._blocks = np.zeros((0, 5)) if blocks is None else np.asarray(blocks, dtype=np.float64)
-        self._colours = freeze(np.array([GROUND, GROUND_OTHER, VERGE, ASPHALT, EDGE_LINE], dtype=np.float32))
+        self._colours = freeze(
+            np.array([paint.GROUND, paint.GROUND_OTHER, paint.VERGE, paint.ASPHALT, paint.EDGE_LINE], dtype=np.float32)
+        )
         vehicle, k = self.config.vehicle, self._constants
         self._outline = (vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle))
-        self._other = _car_parts(*self._outline, 0.0, OTHER)
+        self._other = paint.car_parts(*self._outline, 0.0, paint.OTHER)
 
     # ------------------------------------------------------------------------------------------------- the view
 
@@ -293,7 +136,7 @@ class Renderer:
         road = self.scenario.road
         # Float32 positions stay exact to a millimetre or two: tiles enough to be above 0, and no more.
         turn = 1 + math.ceil(math.hypot(width, height) * metre / self._world.min())
-        _draw_ground(
+        paint.draw_ground(
             self._field, road.columns, road.rows, self.scenario.torus and self.follow, turn,
             (origin + turn * self._world) * CELLS_PER_M, right * metre * CELLS_PER_M, -self._up * metre * CELLS_PER_M,
             self.pixels_per_m, self._colours, image,
@@ -308,9 +151,9 @@ class Renderer:
         if boxes is not None and len(boxes):
             boxes = np.asarray(boxes, dtype=np.float64)
             shapes.append(self._placed(self._other, boxes[:, :2], boxes[:, 2:4]))
-        own = _car_parts(*self._outline, float(car[STEERING]), EGO)
+        own = paint.car_parts(*self._outline, float(car[STEERING]), paint.EGO)
         shapes.append(self._placed(own, position[None], heading[None]))
-        _draw_shapes(freeze(np.concatenate(shapes)), image)
+        paint.draw_shapes(freeze(np.concatenate(shapes)), image)
         lines = (text,) if isinstance(text, str) else text
         for line, corner in zip(lines, ("lower", "upper"), strict=False):
             if line:
@@ -333,7 +176,7 @@ class Renderer:
         What is thinner than `least` pixels (half) is drawn so wide, and fainter.
         """
         scale = self.pixels_per_m
-        shapes = np.empty((len(centre), _SHAPE), dtype=np.float32)
+        shapes = np.empty((len(centre), paint.SHAPE), dtype=np.float32)
         shapes[:, 0:2], shapes[:, 2:4] = centre - 0.5, direction  # pixel (0, 0) has its centre at (0.5, 0.5)
         drawn = max(across * scale, least)
         shapes[:, 4] = np.maximum(length * scale, drawn)
@@ -347,24 +190,24 @@ class Renderer:
         at = self.pixel(marks[:, :2])
         seen = self._near(at, 2.0 * self.pixels_per_m)
         marks, at = marks[seen], at[seen]
-        colour = np.where(marks[:, 5:6] > 0, np.array(MARK_OPPOSITE), np.array(MARK))
+        colour = np.where(marks[:, 5:6] > 0, np.array(paint.MARK_OPPOSITE), np.array(paint.MARK))
         return self._shapes(at, self._turn(marks[:, 2:4]), marks[:, 4], 0.07, 0.02, colour, 0.9)
 
     def _block_shapes(self) -> np.ndarray:
         """Parked cars: as cars of their own length and width."""
         blocks = self._blocks
         if not len(blocks):
-            return np.zeros((0, _SHAPE), dtype=np.float32)
+            return np.zeros((0, paint.SHAPE), dtype=np.float32)
         blocks = blocks[self._near(self.pixel(blocks[:, :2]), 8.0 * self.pixels_per_m)]
         shapes = [
             self._placed(
-                _car_parts(2 * a, 2 * b, 0.62 * a, 0.62 * a, 0.0, PARKED),
+                paint.car_parts(2 * a, 2 * b, 0.62 * a, 0.62 * a, 0.0, paint.PARKED),
                 np.array([[x, y]]),
                 np.array([[math.cos(turn), math.sin(turn)]]),
             )
             for x, y, turn, a, b in blocks
         ]
-        return np.concatenate(shapes) if shapes else np.zeros((0, _SHAPE), dtype=np.float32)
+        return np.concatenate(shapes) if shapes else np.zeros((0, paint.SHAPE), dtype=np.float32)
 
     def _placed(self, parts: np.ndarray, positions: np.ndarray, headings: np.ndarray) -> np.ndarray:
         """A car's parts [k, 11] in m, put at positions [n, 2] with headings [n, 2]: shapes [n * k, 11] in pixels."""
@@ -381,11 +224,11 @@ class Renderer:
             )
         # Far away, a car is still a visible dot.
         shapes[:, :, 4:7] *= max(scale, 2.0)
-        return shapes.reshape(-1, _SHAPE)
+        return shapes.reshape(-1, paint.SHAPE)
 
     def _path_shapes(self, path: np.ndarray) -> np.ndarray:
         if len(path) < 2:
-            return np.zeros((0, _SHAPE), dtype=np.float32)
+            return np.zeros((0, paint.SHAPE), dtype=np.float32)
         at = self.pixel(path)
         step = at[1:] - at[:-1]
         length = np.hypot(step[:, 0], step[:, 1])
@@ -395,7 +238,7 @@ class Renderer:
         seen &= self._near(middle, 20.0 * self.pixels_per_m)
         middle, length = middle[seen], length[seen]
         half = length / 2 / self.pixels_per_m + 0.12
-        return self._shapes(middle, step[seen] / length[:, None], half, 0.12, 0.12, PATH, 1.0, 0.7)
+        return self._shapes(middle, step[seen] / length[:, None], half, 0.12, 0.12, paint.PATH, 1.0, 0.7)
 
     def _ray_shapes(self, position: np.ndarray, heading: np.ndarray, ranges: np.ndarray) -> np.ndarray:
         k = self._constants
@@ -405,11 +248,11 @@ class Renderer:
         origin = position + k.front_axle * heading
         half = ranges / 2
         at = self.pixel(origin[None]) + self._turn(direction * half[:, None]) * self.pixels_per_m
-        rays = self._shapes(at, self._turn(direction), half, 0.04, 0.0, RAY, 0.5, 0.5)
+        rays = self._shapes(at, self._turn(direction), half, 0.04, 0.0, paint.RAY, 0.5, 0.5)
         rays[:, 10] = np.maximum(rays[:, 10], 0.3)
         hit = ranges < float(k.ray_range) - 1e-3
         ends = self.pixel(origin[None]) + self._turn(direction * ranges[:, None])[hit] * self.pixels_per_m
-        dots = self._shapes(ends, self._turn(direction[hit]), 0.22, 0.22, 0.22, RAY, 1.0, 1.5)
+        dots = self._shapes(ends, self._turn(direction[hit]), 0.22, 0.22, 0.22, paint.RAY, 1.0, 1.5)
         return np.concatenate([rays, dots])
 
     def _grid_shapes(self, position: np.ndarray, heading: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -422,7 +265,9 @@ class Renderer:
             self.pixel(position[None]) + self._turn(ahead[:, None] * heading + left[:, None] * side) * self.pixels_per_m
         )
         value = grid.ravel()[:, None]
-        colour = np.where(value == 0, np.array(UNKNOWN), np.where(value == 255, np.array(OCCUPIED), np.array(FREE)))
+        colour = np.where(
+            value == 0, np.array(paint.UNKNOWN), np.where(value == 255, np.array(paint.OCCUPIED), np.array(paint.FREE))
+        )
         shapes = self._shapes(at, self._turn(heading[None]), 0.23, 0.23, 0.0, colour, 0.34, 0.5)
         shapes[value[:, 0] == 0, 10] = 0.16
         shapes[value[:, 0] == 255, 10] = 0.75
@@ -438,9 +283,10 @@ class Renderer:
         x = edge + inner
         y = edge + inner // 2 if corner == "upper" else height - edge - h - inner // 2
         pill = np.array(
-            [[x + w / 2 - 0.5, y + h / 2 - 0.5, 1, 0, w / 2 + inner, h / 2 + inner / 2, h / 2, *HUD, 0.72]], np.float32
+            [[x + w / 2 - 0.5, y + h / 2 - 0.5, 1, 0, w / 2 + inner, h / 2 + inner / 2, h / 2, *paint.HUD, 0.72]],
+            np.float32,
         )
-        _draw_shapes(freeze(pill), image)
+        paint.draw_shapes(freeze(pill), image)
         under = image[y : y + h, x : x + w]
         cover = glyphs[: under.shape[0], : under.shape[1], None].astype(np.uint16)
         under[:] = (under * (255 - cover) + 245 * cover) // 255

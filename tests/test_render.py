@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from gridsim import render
+from gridsim import paint, render
 from gridsim.config import SimConfig
 from gridsim.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
 from gridsim.render import Renderer, between
@@ -63,17 +63,17 @@ def test_every_pixel_is_road_where_the_map_has_road(scenario):
         x, y = world(renderer, car, column, row)
         clear = np.array([clearance(scenario.road, a, b) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
         clear = clear.reshape(x.shape)
-        wall = clear < -render.VERGE_WIDTH - 0.3
+        wall = clear < -paint.VERGE_WIDTH - 0.3
         assert wall.sum() > 10_000
-        ground = np.minimum(distance(image, render.GROUND), distance(image, render.GROUND_OTHER))
+        ground = np.minimum(distance(image, paint.GROUND), distance(image, paint.GROUND_OTHER))
         assert ground[wall].max() <= 1
         # Well inside, there is asphalt but for the car and the marks.
         inside = clear > 0.8
-        off = distance(image, render.ASPHALT) > 1
+        off = distance(image, paint.ASPHALT) > 1
         near = np.hypot(x - car[X], y - car[Y]) < 3.5
         assert off[inside & ~near].mean() < 0.05
         # The white line runs along the inner side of the edge.
-        line = (np.abs(clear - render.EDGE_AT) < 0.04) & ~near
+        line = (np.abs(clear - paint.EDGE_AT) < 0.04) & ~near
         assert np.median(image[line].min(axis=-1)) > 130
 
 
@@ -83,7 +83,7 @@ def test_car_covers_its_own_outline(scenario, state):
     without = renderer.draw(car_at(car[X] + 100.0, car[Y], 0.0))  # moves the view; drawn again below with the car
     image = renderer.draw(car)
     assert (image != without).any()
-    red = distance(image, render.EGO) < 25
+    red = distance(image, paint.EGO) < 25
     row, column = np.nonzero(red)
     x, y = world(renderer, car, column, row)
     along = (x - car[X]) * car[COS] + (y - car[Y]) * car[SIN]
@@ -91,7 +91,7 @@ def test_car_covers_its_own_outline(scenario, state):
     assert np.abs(along).max() == pytest.approx(2.0, abs=0.25)
     assert np.abs(across).max() == pytest.approx(1.0, abs=0.25)
     # Its front is told by the headlights: pale pixels ahead of the centre, none behind.
-    row, column = np.nonzero(distance(image, render.LIGHT) < 12)
+    row, column = np.nonzero(distance(image, paint.LIGHT) < 12)
     x, y = world(renderer, car, column, row)
     ahead = (x - car[X]) * car[COS] + (y - car[Y]) * car[SIN]
     near = np.hypot(x - car[X], y - car[Y]) < 2.2
@@ -104,8 +104,8 @@ def test_other_cars_are_where_the_boxes_are_also_over_the_seam(scenario):
     width = float(scenario.road.width)
     car = car_at(width - 2.0, 128.0)
     box = np.array([[8.0, 130.0, 1.0, 0.0]])  # 10 m ahead, beyond the edge of the torus, and 2 m to the left
-    blue = distance(renderer.draw(car, boxes=box), render.OTHER) < 25
-    blue &= ~(distance(renderer.draw(car), render.OTHER) < 25)
+    blue = distance(renderer.draw(car, boxes=box), paint.OTHER) < 25
+    blue &= ~(distance(renderer.draw(car), paint.OTHER) < 25)
     row, column = np.nonzero(blue)
     assert blue.sum() > 30
     assert 240 * render.CAR_AT - row.mean() == pytest.approx(10.0 * renderer.pixels_per_m, abs=2.5)
@@ -126,7 +126,7 @@ def test_rays_end_where_the_ranges_say(scenario, state):
         row = 480 * render.CAR_AT - ahead * renderer.pixels_per_m
         if reach < 49.0 and 0 <= column < 639 and 0 <= row < 479:
             seen += 1
-            assert distance(image[int(row), int(column)], render.RAY) < 40
+            assert distance(image[int(row), int(column)], paint.RAY) < 40
     assert seen > 15
 
 
@@ -151,13 +151,13 @@ def test_path_text_and_map_view(scenario, state):
     path = np.array([car[[X, Y]] - k * 0.5 * car[[COS, SIN]] for k in range(16)])
     plain, image = renderer.draw(car), renderer.draw(car, path=path, text=("7.0 m/s", "above"))
     behind = round(480 * render.CAR_AT + 5.0 * renderer.pixels_per_m)
-    assert distance(image[behind, 318:322], render.PATH).min() < 30
-    assert distance(plain[behind, 318:322], render.PATH).min() > 60
+    assert distance(image[behind, 318:322], paint.PATH).min() < 30
+    assert distance(plain[behind, 318:322], paint.PATH).min() > 60
     assert (image[450:, 16:120].max(axis=-1) > 230).sum() > 40  # bright letters
     assert (image[6:40, 16:120].max(axis=-1) > 230).sum() > 40
     whole = Renderer(scenario, (256, 256), follow=False)
     image = whole.draw(car)
-    row, column = np.nonzero(distance(image, render.EGO) < 60)
+    row, column = np.nonzero(distance(image, paint.EGO) < 60)
     assert column.mean() == pytest.approx(car[X] * whole.pixels_per_m, abs=2.5)
     assert 256 - row.mean() == pytest.approx(car[Y] * whole.pixels_per_m, abs=2.5)
 
@@ -175,7 +175,7 @@ def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
     flat = dataclasses.replace(scenario, torus=False)
     image = Renderer(flat, (320, 240)).draw(car_at(0.0, 100.0, np.pi))  # heading out of the map
     ahead = image[: int(240 * render.CAR_AT) - 25]
-    ground = np.minimum(distance(ahead, render.GROUND), distance(ahead, render.GROUND_OTHER))
+    ground = np.minimum(distance(ahead, paint.GROUND), distance(ahead, paint.GROUND_OTHER))
     assert ground.max() <= 1
 
 

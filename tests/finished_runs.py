@@ -1,0 +1,43 @@
+"""Runs for the tests of what is made of finished runs: folders as small as one can be, and figures."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from cluster.champion import Champion
+from cluster.finished import ERROR_FIGURES, RUN_FIGURES, Run
+from evolution.policy import PolicySpec
+from gridsim.config import SimConfig
+
+HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 900.0, "speed_mps": 7.0, "collision_rate": 0.5}
+
+
+def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, **more):
+    """A finished run's folder, as small as one can be. Returns its summary."""
+    folder.mkdir(parents=True)
+    genes = PolicySpec.parse("mlp:6,7").size
+    rng = np.random.default_rng(np.random.SeedSequence(list(f"{learner} {scenario} {seed}".encode())))
+    genome = rng.standard_normal(genes).astype(np.float32)
+    champion = Champion(genome, "mlp:6,7", scenario, SimConfig(), traffic)
+    champion.save(folder / "champion.npz")
+    settings = {"scenario": scenario, "seed": seed, "traffic": traffic, "observation": "rays", "population": 512}
+    config = {"command": "gridsim-dqn" if learner == "dqn" else "gridsim-evolve", "settings": settings}
+    if learner != "dqn":
+        settings["search"] = learner
+    summary = {
+        "scenario": scenario, "seed": seed, "car_steps": 5000, "wall_s": 12.5, "champion_generation": 1,
+        "champion_sha256": champion.sha256, "held_out": HELD_OUT, **more,
+    }  # fmt: skip
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "history.csv").write_text("generation,car_steps,wall_s\n0,1000,2.0\n1,3000,4.0\n2,5000,6.0\n")
+    (folder / "summary.json").write_text(json.dumps(summary))
+    return summary
+
+
+def run(learner, scenario, seed, percent, training_s=10.0, success=0.9, traffic=0, observation="rays"):
+    """A finished run with its errors."""
+    figures = dict.fromkeys([*RUN_FIGURES, *ERROR_FIGURES], 1.0)
+    figures |= {"velocity_error_percent": percent, "training_s": training_s, "success_rate": success}
+    name = f"{scenario}-{learner}-s{seed}"
+    return Run(Path(name), learner, scenario, seed, traffic, observation, name, figures)
