@@ -19,6 +19,7 @@ from cluster.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_t
 from cluster.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
 from cluster.tracking import Status
 from evolution.curriculum import CrashError
+from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario
 
@@ -130,8 +131,9 @@ def settings_of(cell: Cell) -> RunSettings:
     if cell.learner == "dqn":
         steps = plan.budget.car_steps or UNBOUND
         every = min(DqnSettings.evaluate_every, max(steps // EVALUATIONS, 1))
-        # What evolution sees, and not how the wheels stand.
-        common["policy"] = "mlp:64,64" if plan.observation == "rays" else ""
+        if plan.observation == "rays":  # what evolution sees there, and not how the wheels stand
+            seen = PolicySpec.parse(EvolveSettings(**common).policy)
+            common["policy"] = "mlp:64,64" + "+motion" * getattr(seen, "motion", False)
         return DqnSettings(**common, observation=plan.observation, car_steps=steps, evaluate_every=every)
     if plan.population:
         common["population"] = plan.population

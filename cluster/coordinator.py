@@ -74,6 +74,7 @@ class Evolution(Learning):
         s, curriculum = self.settings, self.curriculum
         self.outcomes.clear()
         generation, limits = self.generation, curriculum.limits()
+        mean = self.genetic.mean()
         episodes = curriculum.episodes(generation)
         self.maps.ahead(curriculum.map_seeds[: generation + 4])
         results = self._evaluate_all(episodes, limits)
@@ -99,7 +100,8 @@ class Evolution(Learning):
             self.genetic.readmit(self.champion.genome)
 
         if limits.target >= curriculum.config.validation_target:
-            self.trials.enter(racers[order[: curriculum.config.contenders]], generation)
+            contenders = racers[order[: curriculum.config.contenders - len(mean)]]
+            self.trials.enter(np.concatenate([mean, contenders]), generation)
         self.elites.append(racers[order[0]])
         top = order[0]
         seconds = results["steps"] * self.sim.episode.control_period

@@ -66,7 +66,11 @@ class RunSettings:
         if self.traffic == -1:
             object.__setattr__(self, "traffic", default_traffic(self.scenario))
         if not self.policy:
-            object.__setattr__(self, "policy", self.default_policies.get(self.observation, ""))
+            object.__setattr__(self, "policy", self.default_policy())
+
+    def default_policy(self) -> str:
+        """The network that suits the observation."""
+        return self.default_policies.get(self.observation, "")
 
     @property
     def algorithm(self) -> str:
@@ -114,7 +118,7 @@ class RunSettings:
         if spec.observation != self.observation:
             raise SettingsError(
                 f"policy {self.policy} sees the {spec.observation}; "
-                f"give --observation {spec.observation}, or a policy such as {self.default_policies[self.observation]}"
+                f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
             )
 
 
@@ -124,12 +128,14 @@ class EvolveSettings(RunSettings):
 
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
+    policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"
     unbound: ClassVar[tuple[str, ...]] = ("generations",)
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
-    """Network: mlp: and the sizes of its hidden layers, by default mlp:6,7; on the grid cnn: with the channels of two
-    convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
+    closer, by default mlp:6,7, in traffic mlp:16,16+motion; on the grid cnn: with the channels of two convolutions, the
+    units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 120
@@ -152,6 +158,9 @@ class EvolveSettings(RunSettings):
     """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
+
+    def default_policy(self) -> str:
+        return self.policy_in_traffic if self.traffic and self.observation == "rays" else super().default_policy()
 
     @property
     def algorithm(self) -> str:

@@ -54,7 +54,7 @@ class CurriculumConfig:
     pace: float = 7.0  # m/s that the time limit of a training episode allows for; this and champion_pace: seamless
     slack: float = 3.0  # s, added to it
     validation_target: float = 300.0  # m, from which on champions are looked for
-    contenders: int = 4  # racers that are validated each generation
+    contenders: int = 4  # who is validated each generation: the parents' mean, and racers
     first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less

@@ -87,6 +87,17 @@ class Genetic:
         self._asked = recipes, key, mutation
         return recipes, key
 
+    def mean(self) -> np.ndarray:
+        """The mating pool's mean, float32 [1, genes]; [0, genes] where there is none.
+
+        The parents share what they were selected for; what chance put into one of them averages out (genetic repair,
+        Beyer 1995).
+        """
+        pool = self.parents[self.elites :]
+        if not len(pool) or self.random_search:
+            return pool[:0]
+        return pool.mean(axis=0, dtype=np.float64, keepdims=True).astype(np.float32)
+
     def genomes(self, members: np.ndarray) -> np.ndarray:
         """Genomes [k, genes] of some members of the generation that was asked for."""
         if self._asked is None:

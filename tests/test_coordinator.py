@@ -102,6 +102,17 @@ def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     assert len(episodes.worlds) == len(episodes.rows)
 
 
+def test_the_parents_mean_is_on_trial_beside_the_best(maps):
+    evolution = begin(maps)
+    go_on(evolution)
+    evolution.curriculum.target = evolution.curriculum.config.validation_target
+    mean = evolution.genetic.mean()
+    go_on(evolution)
+    assert len(evolution.trials.first) == evolution.curriculum.config.contenders == 2
+    assert evolution.trials.first[0].tobytes() == mean[0].tobytes()
+    assert evolution.trials.first[1].tobytes() == evolution.elites[-1].tobytes()
+
+
 def test_training_is_among_more_cars_than_validation(maps):
     """Twice as many as were asked for; champions are chosen, and measured, among those that were."""
     curriculum = begin(maps).curriculum

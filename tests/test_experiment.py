@@ -105,9 +105,9 @@ def test_finished_runs_are_never_trained_again(tmp_path):
     assert len(done) == len(cells)
 
 
-@pytest.mark.parametrize("observation", ["rays", "grid"])
-def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation):
-    plan = dataclasses.replace(PLAN, observation=observation)
+@pytest.mark.parametrize(("observation", "traffic"), [("rays", 0), ("rays", 4), ("grid", 4)])
+def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation, traffic):
+    plan = dataclasses.replace(PLAN, observation=observation, traffic=traffic, learners=LEARNERS)
     specs = []
     for cell in plan.cells(tmp_path):
         settings = settings_of(cell)
@@ -115,7 +115,7 @@ def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation):
         specs.append(PolicySpec.parse(settings.policy))
     assert {spec.observation for spec in specs} == {observation}
     if observation == "rays":
-        assert {spec.inputs for spec in specs} == {32}
+        assert {spec.inputs for spec in specs} == {63 if traffic else 32}
 
 
 def stop_after(done, count):

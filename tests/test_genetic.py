@@ -218,6 +218,19 @@ def test_random_search_learns_nothing_but_keeps_its_best():
         before = now
 
 
+def test_the_mean_is_that_of_the_pool_alone():
+    genetic = Genetic(SPEC, CONFIG, seed=12)
+    assert genetic.mean().shape == (0, SPEC.size)
+    told(genetic, first_gene)
+    mean = genetic.mean()
+    assert (mean.shape, mean.dtype) == ((1, SPEC.size), F)
+    wanted = [float(np.mean([float(parent[i]) for parent in genetic.parents[-CONFIG.parents :]])) for i in range(5)]
+    np.testing.assert_allclose(mean[0, :5], wanted, rtol=1e-6)
+    search = Genetic(SPEC, CONFIG, seed=12, random_search=True)
+    told(search, first_gene)
+    assert search.mean().shape == (0, SPEC.size), "random search averages nothing"
+
+
 def test_a_run_may_begin_with_a_genome():
     genome = np.random.default_rng(1).normal(size=SPEC.size).astype(F)
     genetic = Genetic(SPEC, CONFIG, seed=12)
