@@ -223,7 +223,8 @@ def test_the_mean_is_that_of_the_pool_alone():
     assert genetic.mean().shape == (0, SPEC.size)
     told(genetic, first_gene)
     mean = genetic.mean()
-    assert (mean.shape, mean.dtype) == ((1, SPEC.size), F)
+    assert mean.shape == (1, SPEC.size)
+    assert mean.dtype == F
     wanted = [float(np.mean([float(parent[i]) for parent in genetic.parents[-CONFIG.parents :]])) for i in range(5)]
     np.testing.assert_allclose(mean[0, :5], wanted, rtol=1e-6)
     search = Genetic(SPEC, CONFIG, seed=12, random_search=True)
