@@ -11,8 +11,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import RECIPE
 from evolution.experience import Experience, from_bytes, join, to_bytes
+from evolution.packing import pack_results, result_widths, unpack_recipes, unpack_results
 from evolution.policy import PolicySpec
 from evolution.rollout import RESULT, targets
 from gridsim.roads import freeze
@@ -27,6 +27,7 @@ METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it i
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to take in its results
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
+PLAIN, PACKED = 0, 1  # how results travel
 FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
 
 
@@ -74,10 +75,12 @@ class Outcome(Cost):
     Attributes:
         results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
         asked: episodes of members that were asked for.
+        widths: int64 [episodes, fields], bits of each number of a RESULT as workers pack it.
     """
 
     results: np.ndarray
     asked: int
+    widths: np.ndarray
 
     def members(self) -> int:
         """Members that are done, counting the parts of those that are done in part."""
@@ -98,9 +101,12 @@ class Outcome(Cost):
 
     def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
         """The same of what `answer` made."""
-        results = np.frombuffer(raw, self.results.dtype, offset=8)
-        columns = chunk.columns.stop - chunk.columns.start
-        self.add(worker, chunk, results.reshape(-1, columns), float(np.frombuffer(raw, np.float64, 1)[0]))
+        body, widths = memoryview(raw)[9:], self.widths[chunk.columns]
+        if raw[8] == PACKED:
+            results = unpack_results(body, widths)
+        else:
+            results = np.frombuffer(body, self.results.dtype).reshape(-1, len(widths))
+        self.add(worker, chunk, results, float(np.frombuffer(raw, np.float64, 1)[0]))
         self.bytes_up += len(raw)
 
 
@@ -149,14 +155,20 @@ def answer(
 ) -> bytes:
     """What a worker says to a chunk: its seconds as float64, its results, its experience if that is what is asked for.
 
-    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is recipes; `first` and `stop` say which of
-    the task's episodes.
+    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is packed recipes; `first` and `stop` say
+    which of the task's episodes. A byte says whether its results are packed: rewound states are not, nor is what a
+    worker of another kind returns if it does not fit.
     """
     if isinstance(task, CollectTask):
         experience, results, seconds = worker.collect(task, maps, first, stop)
         return b"".join([np.float64(seconds).tobytes(), results.tobytes(), to_bytes(experience)])
-    results, seconds = worker.evaluate(of_episodes(task, first, stop), maps, np.frombuffer(payload, RECIPE))
-    return np.float64(seconds).tobytes() + results.tobytes()
+    part = of_episodes(task, first, stop)
+    results, seconds = worker.evaluate(part, maps, unpack_recipes(payload))
+    packed = None
+    if results.dtype == RESULT:
+        packed = pack_results(results, result_widths(part.episodes, task.limits, task.config))
+    head = np.float64(seconds).tobytes()
+    return head + bytes([PLAIN]) + results.tobytes() if packed is None else head + bytes([PACKED]) + packed
 
 
 class WorkerPool(Protocol):
@@ -285,7 +297,8 @@ def size(chunk: Chunk) -> int:
 def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outcome:
     """An outcome to be filled, its results all zero."""
     results = np.zeros((len(recipes), len(task.episodes)), dtype=task.row)
-    return Outcome(results, sum(size(chunk) for chunk in asked))
+    widths = result_widths(task.episodes, task.limits, task.config)
+    return Outcome(results, sum(size(chunk) for chunk in asked), widths)
 
 
 def new_collected(task: CollectTask) -> Collected:

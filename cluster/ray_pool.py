@@ -63,6 +63,7 @@ from cluster.ray_address import (
     store_bytes,
 )
 from cluster.worker import CollectTask, Task, Worker
+from evolution.packing import pack_recipes
 from evolution.rollout import Limits
 from gridsim.scenarios import Scenario
 
@@ -189,7 +190,7 @@ class RayPool:
     ) -> Outcome:
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
-        self._work(task, asked, 1, lambda chunk: recipes[chunk.rows].tobytes(), outcome, on_progress, meanwhile)
+        self._work(task, asked, 1, lambda chunk: pack_recipes(recipes[chunk.rows]), outcome, on_progress, meanwhile)
         return outcome
 
     def collect(

@@ -18,9 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from cluster.pool import answer, everything, new_outcome
 from cluster.settings import DqnSettings, RunSettings
 from cluster.worker import CollectTask, Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
+from evolution.packing import pack_recipes
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, trajectory
 from gridsim.config import SimConfig
@@ -105,9 +107,10 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
         maps=(),
         limits=Limits(1.0, STEPS),
         config=config,
-        rewind=1,
     )
-    Worker().evaluate(task, [blank(config)], recipes)
+    everyone = everything(task, recipes)
+    raw = answer(Worker(), task, [blank(config)], pack_recipes(recipes), 0, 1)
+    new_outcome(task, recipes, everyone).take(0, everyone[0], raw)
     if command == DqnSettings.command:
         Worker().collect(
             CollectTask(
