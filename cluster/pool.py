@@ -25,7 +25,9 @@ Meanwhile = Callable[[], bool | None]  # something to do; called until it return
 PARTS = 4  # as many workers' chunks are a pool's that has one worker and nothing to send: for progress alone
 METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it is known better
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to take in its results
+CHUNK_S = 0.0005  # of the coordinator's time, for a chunk and its results: who has many workers sends larger ones
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
+LARGER = 4  # times what is worth sending, where that is more
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
 PLAIN, PACKED = 0, 1  # how results travel
 FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
@@ -327,13 +329,15 @@ def cut(task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s:
     """
     chunks: list[Chunk] = []
     left = sum(metres(task, block) for block in asked)
-    least = min(WORTH_SENDING_S / metre_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    worth_s = max(WORTH_SENDING_S, CHUNK_S * workers)  # while one is at its chunk, all others get theirs
+    least = min(worth_s / metre_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    largest = max(LARGEST_S, LARGER * worth_s) / metre_s
     goals = targets(task.episodes, task.limits)
     for rows, columns in asked:
         mileage = np.concatenate([[0.0], np.cumsum(goals[columns])])  # m, of one member
         row, column = rows.start, 0
         while row < rows.stop and columns.stop > columns.start:
-            share = min(max(SHARE * left / workers, least), LARGEST_S / metre_s)
+            share = min(max(SHARE * left / workers, least), largest)
             if column == 0 and share >= mileage[-1]:
                 stop = min(row + int(share / mileage[-1]), rows.stop)
                 chunks.append(Chunk(slice(row, stop), columns))
