@@ -34,7 +34,7 @@ def _share(distance: np.ndarray, target: np.ndarray | float) -> np.ndarray:
 
 
 def pareto(values: np.ndarray) -> np.ndarray:
-    """Rank key float64 [n] of two elements [n, 2], greater is better: front first, crowding within it (Deb et al. 2002).
+    """Rank key float64 [n] of elements [n, 2], greater is better: front first, crowding within it (Deb et al. 2002).
 
     Members of a better front have a greater key; within a front the lonelier one has.
     """
