@@ -8,7 +8,6 @@ import json
 import os
 import re
 import shlex
-import signal
 import socket
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+import psutil  # type: ignore[import-untyped]
 import pytest
 import yaml
 from commands import BIN, finish, wait_until
@@ -251,24 +251,28 @@ class Services:
 
     def __init__(self, folder: Path):
         self.folder, self.services = folder, compose()["services"]
+        ray, mlflow = free_port(), free_port()
         self.changes = {
-            "head:6379": f"127.0.0.1:{(ray := free_port())}",
-            "--port=6379": f"--port={ray} --node-ip-address=127.0.0.1",
-            "--host 0.0.0.0": "--host 127.0.0.1",
-            "/home/gridsim/mlflow": str(folder / "mlflow"),
-            "5000": str(free_port()),
-            "mlflow:": "127.0.0.1:",
+            r"head:6379": f"127.0.0.1:{ray}",
+            r"--port=6379": f"--port={ray} --node-ip-address=127.0.0.1",
+            r"--object-store-memory=\d+": "--object-store-memory=100000000",
+            r"--host 0\.0\.0\.0": "--host 127.0.0.1",
+            r"/home/gridsim/mlflow": str(folder / "mlflow"),
+            r"\bmlflow:5000": "127.0.0.1:5000",
+            r"\b5000\b": str(mlflow),
         }
         self.started: dict[str, subprocess.Popen[bytes]] = {}
 
     def here(self, text: str) -> str:
         for old, new in self.changes.items():
-            text = text.replace(old, new)
+            text = re.sub(old, new, text)
         return text
 
     def environment(self, name: str) -> dict[str, str]:
+        image = dict(re.findall(r"((?:RAY|MLFLOW|GIT)_\w+)=(\S+)", "".join(rest for _, rest in final_stage())))
         given = {k: self.here(v) for k, v in self.services[name].get("environment", {}).items()}
-        return {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT), **given}
+        path = f"{BIN}:{os.environ['PATH']}"
+        return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "HOME": str(self.folder), **image, **given}
 
     def start(self, name: str) -> None:
         log = (self.folder / f"{name}.log").open("wb")
@@ -289,14 +293,12 @@ class Services:
         return subprocess.run(check, env=self.environment(name), capture_output=True, timeout=60).returncode == 0
 
     def stop(self) -> None:
-        for process in reversed(self.started.values()):
-            process.send_signal(signal.SIGTERM)
-        for process in self.started.values():
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
+        for started in reversed(self.started.values()):
+            processes = [psutil.Process(started.pid), *psutil.Process(started.pid).children(recursive=True)]
+            started.terminate()
+            for process in psutil.wait_procs(processes, 20)[1]:
+                process.kill()
+            started.wait()
 
 
 @pytest.fixture
