@@ -272,7 +272,7 @@ class Services:
         image = dict(re.findall(r"((?:RAY|MLFLOW|GIT)_\w+)=(\S+)", "".join(rest for _, rest in final_stage())))
         given = {k: self.here(v) for k, v in self.services[name].get("environment", {}).items()}
         path = f"{BIN}:{os.environ['PATH']}"
-        return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), "HOME": str(self.folder), **image, **given}
+        return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), **image, **given}
 
     def start(self, name: str) -> None:
         log = (self.folder / f"{name}.log").open("wb")
