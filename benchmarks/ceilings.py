@@ -203,7 +203,7 @@ def memory(population: int) -> dict[str, float]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def coordinate(population: int, generations: int = 4) -> dict[str, float]:
+def coordinate(population: int, generations: int = 12) -> dict[str, float]:
     """Run some generations of InstantWorkers in the longest episodes, saved and logged as always."""
     settings = EvolveSettings(population=population, generations=generations, until=2.0)
     with tempfile.TemporaryDirectory() as folder:
