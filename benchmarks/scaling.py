@@ -13,7 +13,7 @@ The coordinator's ceilings, with workers that answer at once (`ceilings.py`):
     children_per_s                  selection, recipes, dispatch and collection
     coordinator_mib_100k            peak memory of its process at population 100,000, everything in it
     broadcast_bytes_100k            as above, at that population
-    chunk_us, look_us, ...          what the simulation is fed with
+    chunk_us, look_us, ...          what the simulation is fed with: the coordinator's own time
 
 On more machines: a simulation (`simulation.py`) of a generation of 10,000 members on 1 to 10,000 workers, as a table
 and, with --picture, a picture; and what it says of 1 to 8 workers beside real Ray actors. Those share this machine's
