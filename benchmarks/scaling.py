@@ -53,7 +53,7 @@ from ceilings import (  # beside this file
     sleeping_efficiency,
     step_s,
 )
-from simulation import WORKERS, Call, Costs, Load, at, draw, efficiency, episodes_of, table
+from simulation import WORKERS, Call, Costs, Load, at, draw, episodes_of, table
 
 from cluster.learning import Maps
 from cluster.ray_pool import RayPool
@@ -242,7 +242,7 @@ def main() -> None:
         "coordinator_mib_100k": large["coordinator_mib"],
         "broadcast_bytes_100k": large["broadcast_bytes"],
         "generation_s_100k": large["generation_s"],
-        "efficiency_1000_workers": efficiency(costs, next(iter(loads.values())), 1_000),
+        "efficiency_1000_workers": next(iter(efficiencies.values()))[workers.index(1_000)],
         **checked(costs, ACTORS[:2] if options.quick else ACTORS),
     }
     if options.picture:

@@ -29,7 +29,7 @@ from gridsim.config import SimConfig
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POPULATION = 10_000
 QUEUE = 2  # chunks that a worker holds, as in the pool
-GENERATIONS = 3  # simulated for each figure
+GENERATIONS = 1  # simulated for each figure: with so many members they are all alike
 TASK_BYTES = 4_000  # of a broadcast, beside genomes: episodes, settings, and how they are pickled
 RECIPE_BYTES = 6  # of a packed one at such populations
 CHUNK_BYTES = 300  # around what is sent, either way: Ray's own description of a call
