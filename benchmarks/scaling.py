@@ -28,6 +28,7 @@ cores, so that they sleep in place of evaluating: what is checked is the dispatc
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import statistics
 import sys
@@ -44,7 +45,7 @@ from ceilings import (  # beside this file
     EPISODES,
     InstantWorker,
     children_per_s,
-    chunk_s,
+    chunk_costs,
     gene_s,
     memory,
     naps,
@@ -154,15 +155,16 @@ def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
     pool = RayPool(2, maps.build, worker_factory=InstantWorker)
     try:
         children = children_per_s(pool, CHILDREN // 10 if quick else CHILDREN)
-        chunk = chunk_s(pool, CHUNKS // 10 if quick else CHUNKS)
-        look, byte = ray_costs()
+        chunk, look = chunk_costs(pool, CHUNKS // 10 if quick else CHUNKS)
+        busy, byte = ray_costs()
     finally:
         pool.close()
-    costs = Costs(child_s=1.0 / children, chunk_s=chunk, look_s=look, byte_s=byte, gene_s=gene_s(MLP))
+    costs = Costs(1.0 / children, chunk, look, busy, byte, gene_s(MLP))
     figures = {
         "children_per_s": children,
         "chunk_us": 1e6 * chunk,
         "look_us": 1e6 * look,
+        "look_us_per_worker": 1e6 * busy,
         "sent_mib_per_s": 1.0 / max(byte, 1e-12) / 2**20,
         "gene_ns": 1e9 * costs.gene_s,
     }
@@ -194,7 +196,7 @@ def checked(costs: Costs, actors: tuple[int, ...]) -> dict[str, float]:
         members = NAPPING * workers
         figures[f"real_efficiency_{workers}"] = sleeping_efficiency(workers, members)
         drives = naps()[:members]
-        local = Costs(costs.child_s, costs.chunk_s, costs.look_s, costs.byte_s, costs.gene_s, latency_s=0.0)
+        local = dataclasses.replace(costs, latency_s=0.0)
         goals = np.full(EPISODES, 150.0)
         call = Call(local, workers, drives, episodes_of(goals), 6.0, 0.0, 72 * 1244 + 4_000)
         figures[f"simulated_efficiency_{workers}"] = float(drives.sum() / (workers * call.run()))

@@ -41,7 +41,8 @@ class Costs:
 
     child_s: float  # of the coordinator's, a member: to select, to score
     chunk_s: float  # of the coordinator's, a chunk: to send it and to take in what it brought
-    look_s: float  # of the coordinator's, each worker that is busy, at every look for what has come
+    look_s: float  # of the coordinator's, a look for what has come
+    look_worker_s: float  # and as much again for each worker that is busy
     byte_s: float  # of the coordinator's, a byte that is sent
     gene_s: float  # to breed a gene
     latency_s: float = 0.3e-3  # from one machine to another
@@ -139,7 +140,7 @@ class Call:
                 worker = single.popleft()
                 if 0 < held[worker] < QUEUE:
                     send(worker)
-            looked = now = max(now + k.look_s * (self.workers - len(idle)), coming[0][0])
+            looked = now = max(now + k.look_s + k.look_worker_s * (self.workers - len(idle)), coming[0][0])
             while coming and coming[0][0] <= looked:
                 _, worker, up = heapq.heappop(coming)
                 now += k.chunk_s / 2 + up * k.byte_s

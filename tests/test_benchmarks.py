@@ -74,7 +74,15 @@ def load_of(simulation: Any, **changes: Any) -> Any:
 
 
 def costs_of(simulation: Any, **costs: float) -> Any:
-    nothing = {"child_s": 0.0, "chunk_s": 0.0, "look_s": 0.0, "byte_s": 0.0, "gene_s": 0.0, "latency_s": 0.0}
+    nothing = {
+        "child_s": 0.0,
+        "chunk_s": 0.0,
+        "look_s": 0.0,
+        "look_worker_s": 0.0,
+        "byte_s": 0.0,
+        "gene_s": 0.0,
+        "latency_s": 0.0,
+    }
     return simulation.Costs(**{**nothing, "bandwidth": 1e30, **costs})
 
 
@@ -97,9 +105,15 @@ def test_each_cost_lowers_efficiency_and_recipes_are_cheaper_than_genomes(simula
     load = load_of(simulation)
     best = simulation.efficiency(costs_of(simulation), load, 100, 1000)
     assert 0.85 < best < 1.0, "the last ones are waited for, and the race has fewer pieces than there are workers"
-    for cost in ({"child_s": 1e-3}, {"chunk_s": 1e-3}, {"look_s": 1e-4}, {"latency_s": 0.05}, {"bandwidth": 1e5}):
+    for cost in (
+        {"child_s": 1e-3},
+        {"chunk_s": 1e-3},
+        {"look_worker_s": 1e-4},
+        {"latency_s": 0.05},
+        {"bandwidth": 1e5},
+    ):
         assert simulation.efficiency(costs_of(simulation, **cost), load, 100, 1000) < best
-    real = simulation.Costs(child_s=1e-6, chunk_s=3e-4, look_s=1e-6, byte_s=1e-9, gene_s=2e-9)
+    real = simulation.Costs(child_s=1e-6, chunk_s=3e-4, look_s=1e-4, look_worker_s=1e-6, byte_s=1e-9, gene_s=2e-9)
     large = load_of(simulation, genes=100_000)
     genomes = load_of(simulation, genes=100_000, recipes=False)
     assert simulation.efficiency(real, genomes, 1000, 2000) < simulation.efficiency(real, large, 1000, 2000)
