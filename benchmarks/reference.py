@@ -1,12 +1,13 @@
-"""The reference driver on the held-out episodes of each scenario: `python benchmarks/reference.py [SCENARIO ...]`."""
+"""The reference driver on the held-out episodes: `python benchmarks/reference.py [SCENARIO ...] [--episodes 64]`."""
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import numpy as np
 
 from cluster.learning import Maps, held_out_episodes
+from evolution.curriculum import HELD_OUT_EPISODES
 from gridsim.config import SimConfig
 from gridsim.ego import DISTANCE, PACED, End
 from gridsim.reference import ReferenceDriver
@@ -17,8 +18,14 @@ TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default
 
 def main() -> None:
     """Print a line for each scenario, without and with traffic; failures as (episode, end, steps)."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenarios", nargs="*", choices=[[], *REGISTRY], metavar="SCENARIO", help="all, by default")
+    parser.add_argument("--episodes", type=int, default=HELD_OUT_EPISODES, help="of each (64)")
+    options = parser.parse_args()
+    if not 1 <= options.episodes <= HELD_OUT_EPISODES:
+        parser.error(f"--episodes must be 1 to {HELD_OUT_EPISODES}")
     print(f"{'scenario':>10} {'traffic':>7} {'success':>7} {'m/s':>6} {'paced':>5}  interval  ends")
-    for name in sys.argv[1:] or REGISTRY:
+    for name in options.scenarios or REGISTRY:
         spec = REGISTRY[name]
         maps = Maps(name, SimConfig())
         for cars in (0, spec.traffic or TRAFFIC[name]):
@@ -27,7 +34,9 @@ def main() -> None:
             driver = ReferenceDriver(scenarios)
             drives = [
                 driver.drive(scenarios[row["map"]], row["start"], world, k)
-                for k, (row, world) in enumerate(zip(episodes.rows, episodes.worlds, strict=True))
+                for k, (row, world) in enumerate(
+                    zip(episodes.rows[: options.episodes], episodes.worlds[: options.episodes], strict=True)
+                )
             ]
             speeds = [drive.car[DISTANCE] / drive.time[-1] for drive in drives]
             paced = np.mean([drive.car[PACED] / drive.car[DISTANCE] for drive in drives])

@@ -1,18 +1,34 @@
-"""How the service scales on this machine: python benchmarks/scaling.py [--json] [--generations N]
+"""How the service scales: python benchmarks/scaling.py [--json] [--quick] [--picture FILE] [--generations N] [--seed N]
 
-Runs the default job to its end with 2 workers and keeps the state ten generations before it; then evolves those ten
-generations again, with 1 worker and with 2, saving and logging as always. Figures are medians over the generations.
+On this machine: runs the default job to its end with 2 workers and keeps the state ten generations before it; then
+evolves those ten generations again, with 1 worker and with 2, saving and logging as always. Medians over them:
 
     speedup_2_workers               wall clock of a generation with 1 worker over that with 2
     overhead_ms_per_generation      wall clock less the busiest worker's evaluation, 2 workers, population 512
-    bytes_per_child                 sent per member and generation, both ways
-    broadcast_bytes_per_generation  put into the object store per generation: parents, episodes, new maps aside
-    children_per_s                  selection, recipes, dispatch and collection alone: workers that answer at once
+    bytes_per_child                 sent per member and generation, both ways, validation beside it included
+    broadcast_bytes_per_generation  put into the object store per generation: parents, racers, episodes
+
+The coordinator's ceilings, with workers that answer at once (`ceilings.py`):
+
+    children_per_s                  selection, recipes, dispatch and collection
+    coordinator_mib_100k            peak memory of its process at population 100,000, everything in it
+    broadcast_bytes_100k            as above, at that population
+    chunk_us, look_us, ...          what the simulation is fed with: the coordinator's own time
+
+On more machines: a simulation (`simulation.py`) of a generation of 10,000 members on 1 to 10,000 workers, as a table
+and, with --picture, a picture; and what it says of 1 to 8 workers beside real Ray actors. Those share this machine's
+cores, so that they sleep in place of evaluating: what is checked is the dispatch, not the cores.
+
+    efficiency_1000_workers         1 s of evaluation a member, mlp:6,7; evaluation over what the workers had
+    real_efficiency_<n>, simulated_efficiency_<n>
+
+--json prints one flat object of numbers and nothing else. --quick takes a minute, with figures that mean little.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import statistics
 import sys
@@ -20,41 +36,46 @@ import tempfile
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from ceilings import (  # beside this file
+    CHILDREN,
+    CHUNKS,
+    EPISODES,
+    InstantWorker,
+    children_per_s,
+    chunk_costs,
+    gene_s,
+    memory,
+    naps,
+    ray_costs,
+    session,
+    sleeping_efficiency,
+    step_s,
+)
+from simulation import WORKERS, Call, Costs, Load, at, draw, episodes_of, table
 
 from cluster.learning import Maps
-from cluster.pool import WorkerPool
 from cluster.ray_pool import RayPool
-from cluster.run import Session, make_tracker, new_run
 from cluster.settings import EvolveSettings
-from cluster.tracking import check_uri
 from cluster.warm import compile_kernels
-from cluster.worker import Task, Worker
-from evolution.breeding import Mutation
-from evolution.genetic import Genetic, GeneticConfig
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits, no_traffic
+from evolution.rollout import targets
 from gridsim.config import SimConfig
 
 LAST = 10  # generations that are measured
-CHILDREN = 100_000  # members that the coordinator alone is timed with
+MLP, CNN = "mlp:6,7", "cnn:8,16,32@1"
+ACTORS = (1, 2, 4, 8)  # real ones, that the simulation is checked with
+NAPPING = 40  # members for each of them
+MEMBER_S = 1.0  # of evaluation, in the simulation
 
 
-class InstantWorker(Worker):
-    """Answers at once."""
+class Last(NamedTuple):
+    """The last generations of the default run: figures of each, and how the last one's episodes went."""
 
-    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, float]:
-        return np.zeros((len(recipes), len(task.episodes)), dtype=task.row), 0.0
-
-
-def session(folder: Path, name: str, settings: EvolveSettings, pool: WorkerPool, maps: Maps) -> Session:
-    """A run as the command makes it, in a folder of its own."""
-    run = new_run(folder, name, settings)
-    run.path.mkdir(parents=True)
-    tracker = make_tracker(run, check_uri(f"sqlite:///{folder}/mlflow.db"), "scaling")
-    return Session(run, pool, maps, tracker, time.perf_counter())
+    figures: dict[str, list[float]]
+    load: Load
 
 
 def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -85,8 +106,8 @@ def last_generations(
     maps: Maps,
     state: tuple[dict[str, np.ndarray], dict[str, Any]],
     workers: int,
-) -> dict[str, list[float]]:
-    """Evolve LAST generations from a state. Returns figures of each."""
+) -> Last:
+    """Evolve LAST generations from a state."""
     pool = RayPool(workers, maps.build)
     this = session(folder, f"last-{workers}", settings, pool, maps)
     this.learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
@@ -114,72 +135,129 @@ def last_generations(
     finally:
         pool.close()
         this.tracker.close("FINISHED")
-    return {name: values[1:] for name, values in figures.items()}  # the first one waits for Ray
+    curriculum = this.learning.curriculum
+    generation = this.learning.steps - 1
+    main, race = this.learning.outcomes[0].results, this.learning.outcomes[1].results
+    rows = curriculum.episodes(generation).rows
+    step = curriculum.period  # in the unit of the car's clock; `at` makes it seconds of evaluation
+    load = Load(
+        targets(rows, curriculum.limits()),
+        main["steps"][: settings.population, : len(rows)] * step,
+        np.full(race.shape[1], curriculum.race_limits().target),
+        race["steps"] * step,
+        PolicySpec.parse(settings.policy).size,
+    )
+    return Last({name: values[1:] for name, values in figures.items()}, load)  # the first one waits for Ray
 
 
-def children_per_s(maps: Maps) -> float:
-    """Members a second that the coordinator selects, writes recipes for, sends and collects."""
-    spec, sim = PolicySpec.parse("mlp:6,7"), SimConfig()
-    genetic = Genetic(spec, GeneticConfig(population=CHILDREN), 0)
+def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
+    """What the simulation is fed with, and the figures of it."""
     pool = RayPool(2, maps.build, worker_factory=InstantWorker)
-    rng = np.random.default_rng(0)
-    rates = []
     try:
-        for _ in range(6):
-            begun = time.perf_counter()
-            recipes, key = genetic.ask(Mutation())
-            task = Task(
-                "mlp:6,7",
-                genetic.parents,
-                key,
-                Mutation(),
-                np.zeros(4, EPISODE),
-                no_traffic(4),
-                (),
-                Limits(150.0, 100),
-                sim,
-            )
-            results = pool.evaluate(task, recipes).results
-            genetic.tell(results["distance"].sum(axis=1) + rng.random(CHILDREN))
-            rates.append(CHILDREN / (time.perf_counter() - begun))
+        children = children_per_s(pool, CHILDREN // 10 if quick else CHILDREN)
+        chunk, look = chunk_costs(pool, CHUNKS // 10 if quick else CHUNKS)
+        busy, byte = ray_costs()
     finally:
         pool.close()
-    return statistics.median(rates[1:])
+    costs = Costs(1.0 / children, chunk, look, busy, byte, gene_s(MLP))
+    figures = {
+        "children_per_s": children,
+        "chunk_us": 1e6 * chunk,
+        "look_us": 1e6 * look,
+        "look_us_per_worker": 1e6 * busy,
+        "sent_mib_per_s": 1.0 / max(byte, 1e-12) / 2**20,
+        "gene_ns": 1e9 * costs.gene_s,
+    }
+    return costs, figures
+
+
+def cases(load: Load) -> dict[str, Load]:
+    """What is simulated, by name."""
+    cnn = PolicySpec.parse(CNN).size
+    steps = load.drives.sum(axis=1).mean() / SimConfig().episode.control_period
+    own_s = {policy: float(steps * step_s(policy)) for policy in (MLP, CNN)}
+    second = f"{MEMBER_S:g} s a member"
+    return {
+        f"{MLP}, {second}": at(load, MEMBER_S),
+        f"{MLP}, {second}, genomes": at(load, MEMBER_S, recipes=False),
+        f"{CNN}, {second}": at(load, MEMBER_S, genes=cnn),
+        f"{CNN}, {second}, genomes": at(load, MEMBER_S, genes=cnn, recipes=False),
+        f"{MLP}, {1e3 * own_s[MLP]:.1f} ms": at(load, own_s[MLP]),
+        f"{MLP}, {1e3 * own_s[MLP]:.1f} ms, genomes": at(load, own_s[MLP], recipes=False),
+        f"{CNN}, {1e3 * own_s[CNN]:.0f} ms": at(load, own_s[CNN], genes=cnn),
+        f"{CNN}, {1e3 * own_s[CNN]:.0f} ms, genomes": at(load, own_s[CNN], genes=cnn, recipes=False),
+    }
+
+
+def checked(costs: Costs, actors: tuple[int, ...]) -> dict[str, float]:
+    """Efficiency of real actors that sleep, and what the simulation says of them."""
+    figures = {}
+    for workers in actors:
+        members = NAPPING * workers
+        figures[f"real_efficiency_{workers}"] = sleeping_efficiency(workers, members)
+        drives = naps()[:members]
+        local = dataclasses.replace(costs, latency_s=0.0)
+        goals = np.full(EPISODES, 150.0)
+        call = Call(local, workers, drives, episodes_of(goals), 6.0, 0.0, 72 * 1244 + 4_000)
+        figures[f"simulated_efficiency_{workers}"] = float(drives.sum() / (workers * call.run()))
+    return figures
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
+    parser.add_argument("--quick", action="store_true", help="all of it, on a small scale")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the simulated efficiency")
     parser.add_argument(
         "--generations", type=int, default=EvolveSettings().generations, help="of the default run, at most"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the default run")
     options = parser.parse_args()
-    settings = EvolveSettings(generations=options.generations, seed=options.seed)
-    longer = EvolveSettings(generations=options.generations + LAST + 2, seed=options.seed, until=2.0)
+    if options.generations < 1:
+        parser.error("--generations must be 1 or more")
+    count, population = options.generations, EvolveSettings().population
+    if options.quick:
+        count, population = min(count, 3), 64
+    settings = EvolveSettings(generations=count, seed=options.seed, population=population)
+    longer = EvolveSettings(generations=count + LAST + 2, seed=options.seed, population=population, until=2.0)
     with tempfile.TemporaryDirectory() as folder:
         maps = Maps(settings.scenario, SimConfig())
         state = default_run(Path(folder), settings, maps)
         one = last_generations(Path(folder), longer, maps, state, 1)
         two = last_generations(Path(folder), longer, maps, state, 2)
-        rate = children_per_s(maps)
+        costs, ceilings = measured_costs(maps, options.quick)
         maps.close()
+    large = memory(2_000 if options.quick else 100_000)
+    loads = cases(two.load)
+    workers = (1, 10, 1_000) if options.quick else WORKERS
+    efficiencies = table(costs, loads, workers)
     median = statistics.median
     figures = {
-        "speedup_2_workers": sum(one["wall"]) / sum(two["wall"]),
-        "overhead_ms_per_generation": 1e3 * median(two["overhead"]),
-        "bytes_per_child": median(two["bytes"]),
-        "broadcast_bytes_per_generation": median(two["broadcast"]),
-        "children_per_s": rate,
-        "generation_ms_1_worker": 1e3 * median(one["wall"]),
-        "generation_ms_2_workers": 1e3 * median(two["wall"]),
+        "speedup_2_workers": sum(one.figures["wall"]) / sum(two.figures["wall"]),
+        "overhead_ms_per_generation": 1e3 * median(two.figures["overhead"]),
+        "bytes_per_child": median(two.figures["bytes"]),
+        "broadcast_bytes_per_generation": median(two.figures["broadcast"]),
+        "generation_ms_1_worker": 1e3 * median(one.figures["wall"]),
+        "generation_ms_2_workers": 1e3 * median(two.figures["wall"]),
+        **ceilings,
+        "coordinator_mib_100k": large["coordinator_mib"],
+        "broadcast_bytes_100k": large["broadcast_bytes"],
+        "generation_s_100k": large["generation_s"],
+        "efficiency_1000_workers": next(iter(efficiencies.values()))[workers.index(1_000)],
+        **checked(costs, ACTORS[:2] if options.quick else ACTORS),
     }
+    if options.picture:
+        draw(efficiencies, options.picture, workers)
     if options.json:
         print(json.dumps({name: round(value, 3) for name, value in figures.items()}))
-    else:
-        for name, value in figures.items():
-            print(f"{name:32} {value:14,.2f}")
+        return
+    for name, value in figures.items():
+        print(f"{name:32} {value:14,.2f}")
+    print("\nSimulated efficiency of a generation of 10,000 members\n")
+    print(f"{'workers':34}" + "".join(f"{w:>7}" for w in workers))
+    for name, values in efficiencies.items():
+        print(f"{name:34}" + "".join(f"{value:7.2f}" for value in values))
 
 
 if __name__ == "__main__":

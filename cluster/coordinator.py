@@ -145,7 +145,7 @@ class Evolution(Learning):
             meanwhile=self.meanwhile,
         )
         self._judge(results[n:, e:])
-        return results[:n, :e]
+        return np.ascontiguousarray(results[:n, :e])  # the rest is not kept, and sums do not depend on the layout
 
     # ------------------------------------------------------------------------------------------------------- state
 

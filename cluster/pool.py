@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,8 +12,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import RECIPE
 from evolution.experience import Experience, from_bytes, join, to_bytes
+from evolution.packing import pack_results, result_widths, unpack_recipes, unpack_results
 from evolution.policy import PolicySpec
 from evolution.rollout import RESULT, targets
 from gridsim.roads import freeze
@@ -25,8 +26,12 @@ Meanwhile = Callable[[], bool | None]  # something to do; called until it return
 PARTS = 4  # as many workers' chunks are a pool's that has one worker and nothing to send: for progress alone
 METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it is known better
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to take in its results
+CHUNK_S = 0.0005  # of the coordinator's time, for a chunk and its results: who has many workers sends larger ones
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
+LARGER = 4  # times what is worth sending, where that is more
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
+LARGE_BYTES = 16 << 20  # of results, that are kept column by column
+PLAIN, PACKED = 0, 1  # how results travel
 FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
 
 
@@ -74,10 +79,12 @@ class Outcome(Cost):
     Attributes:
         results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
         asked: episodes of members that were asked for.
+        widths: int64 [episodes, fields], bits of each number of a RESULT as workers pack it.
     """
 
     results: np.ndarray
     asked: int
+    widths: np.ndarray
 
     def members(self) -> int:
         """Members that are done, counting the parts of those that are done in part."""
@@ -98,9 +105,12 @@ class Outcome(Cost):
 
     def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
         """The same of what `answer` made."""
-        results = np.frombuffer(raw, self.results.dtype, offset=8)
-        columns = chunk.columns.stop - chunk.columns.start
-        self.add(worker, chunk, results.reshape(-1, columns), float(np.frombuffer(raw, np.float64, 1)[0]))
+        body, widths = memoryview(raw)[9:], self.widths[chunk.columns]
+        if raw[8] == PACKED:
+            results = unpack_results(body, widths)
+        else:
+            results = np.frombuffer(body, self.results.dtype).reshape(-1, len(widths))
+        self.add(worker, chunk, results, float(np.frombuffer(raw, np.float64, 1)[0]))
         self.bytes_up += len(raw)
 
 
@@ -149,14 +159,20 @@ def answer(
 ) -> bytes:
     """What a worker says to a chunk: its seconds as float64, its results, its experience if that is what is asked for.
 
-    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is recipes; `first` and `stop` say which of
-    the task's episodes.
+    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is packed recipes; `first` and `stop` say
+    which of the task's episodes. A byte says whether its results are packed: rewound states are not, nor is what a
+    worker of another kind returns if it does not fit.
     """
     if isinstance(task, CollectTask):
         experience, results, seconds = worker.collect(task, maps, first, stop)
         return b"".join([np.float64(seconds).tobytes(), results.tobytes(), to_bytes(experience)])
-    results, seconds = worker.evaluate(of_episodes(task, first, stop), maps, np.frombuffer(payload, RECIPE))
-    return np.float64(seconds).tobytes() + results.tobytes()
+    part = of_episodes(task, first, stop)
+    results, seconds = worker.evaluate(part, maps, unpack_recipes(payload))
+    packed = None
+    if results.dtype == RESULT:
+        packed = pack_results(results, result_widths(part.episodes, task.limits, task.config))
+    head = np.float64(seconds).tobytes()
+    return head + bytes([PLAIN]) + results.tobytes() if packed is None else head + bytes([PACKED]) + packed
 
 
 class WorkerPool(Protocol):
@@ -284,8 +300,24 @@ def size(chunk: Chunk) -> int:
 
 def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outcome:
     """An outcome to be filled, its results all zero."""
-    results = np.zeros((len(recipes), len(task.episodes)), dtype=task.row)
-    return Outcome(results, sum(size(chunk) for chunk in asked))
+    results = _zeros((len(recipes), len(task.episodes)), task.row)
+    widths = result_widths(task.episodes, task.limits, task.config)
+    return Outcome(results, sum(size(chunk) for chunk in asked), widths)
+
+
+def _zeros(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
+    """Zeros, column by column, of which no page takes memory before it is written to.
+
+    Where a large generation is driven beside a few members' validation, most of the array is nobody's: at population
+    100,000 it is 320 MB, of which 14 are used. NumPy's own would ask for pages too large for that.
+    """
+    size = shape[0] * shape[1] * dtype.itemsize
+    if size < LARGE_BYTES:
+        return np.zeros(shape, dtype)
+    room = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):  # Linux
+        room.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.ndarray(shape, dtype, buffer=room, order="F")
 
 
 def new_collected(task: CollectTask) -> Collected:
@@ -314,13 +346,15 @@ def cut(task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s:
     """
     chunks: list[Chunk] = []
     left = sum(metres(task, block) for block in asked)
-    least = min(WORTH_SENDING_S / metre_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    worth_s = max(WORTH_SENDING_S, CHUNK_S * workers)  # while one is at its chunk, all others get theirs
+    least = min(worth_s / metre_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    largest = max(LARGEST_S, LARGER * worth_s) / metre_s
     goals = targets(task.episodes, task.limits)
     for rows, columns in asked:
         mileage = np.concatenate([[0.0], np.cumsum(goals[columns])])  # m, of one member
         row, column = rows.start, 0
         while row < rows.stop and columns.stop > columns.start:
-            share = min(max(SHARE * left / workers, least), LARGEST_S / metre_s)
+            share = min(max(SHARE * left / workers, least), largest)
             if column == 0 and share >= mileage[-1]:
                 stop = min(row + int(share / mileage[-1]), rows.stop)
                 chunks.append(Chunk(slice(row, stop), columns))

@@ -63,6 +63,7 @@ from cluster.ray_address import (
     store_bytes,
 )
 from cluster.worker import CollectTask, Task, Worker
+from evolution.packing import pack_recipes
 from evolution.rollout import Limits
 from gridsim.scenarios import Scenario
 
@@ -189,7 +190,7 @@ class RayPool:
     ) -> Outcome:
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
-        self._work(task, asked, 1, lambda chunk: recipes[chunk.rows].tobytes(), outcome, on_progress, meanwhile)
+        self._work(task, asked, 1, lambda chunk: pack_recipes(recipes[chunk.rows]), outcome, on_progress, meanwhile)
         return outcome
 
     def collect(
@@ -237,9 +238,12 @@ class RayPool:
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
-            # Where there is something else to do, take what is there; else wait for the next.
-            patience = (len(waiting), 0.0) if meanwhile and self.pids() else (1, 1.0)
-            for ref in ray.wait(list(waiting), num_returns=patience[0], timeout=patience[1])[0]:
+            # Take all that is there: with many workers a look costs more than an answer. If there is nothing, and
+            # nothing else to do, wait for the next.
+            ready, _ = ray.wait(list(waiting), num_returns=len(waiting), timeout=0.0)
+            if not ready and not (meanwhile and self.pids()):
+                ready, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
+            for ref in ready:
                 slot = waiting[ref]
                 if slot.hello:
                     self._greet(slot)

@@ -4,7 +4,8 @@ Numba compiles one function at a time in a process. So processes of their own co
 starts Ray, and all others then load it from the cache on disk (`gridsim.jit`).
 
 Run as `python -m cluster.warm kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it prints a line
-when what a run needs first is there, and goes on with what is needed at the run's end.
+when what a run needs first is there, and goes on with what is needed at the run's end. `python -m cluster.warm
+everything` compiles what the learners need by default on all roads, for an image that is to be started often.
 """
 
 from __future__ import annotations
@@ -15,18 +16,22 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
+import llvmlite.binding
 import numpy as np
 
-from cluster.settings import DqnSettings, RunSettings
+from cluster.pool import answer, everything, new_outcome
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.worker import CollectTask, Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
-from evolution.policy import PolicySpec
+from evolution.packing import pack_recipes
+from evolution.policy import Observation, PolicySpec
 from evolution.rollout import EPISODE, Limits, trajectory
 from gridsim.config import SimConfig
 from gridsim.ego import FIELDS
-from gridsim.jit import CACHE_FOLDER
-from gridsim.scenarios import blank, build, is_map_file, sample_starts
+from gridsim.jit import CACHE_FOLDER, CONFIG
+from gridsim.scenarios import REGISTRY, blank, build, default_traffic, is_map_file, sample_starts
 from gridsim.simulator import views
 from gridsim.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.world import LANE, spawn
@@ -63,7 +68,9 @@ def begin(settings: RunSettings) -> Warming:
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
     traffic = "traffic" if settings.traffic else "alone"
-    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}")
+    # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
+    cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}")
     if warming.done.exists():
         return warming
     what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
@@ -105,9 +112,10 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
         maps=(),
         limits=Limits(1.0, STEPS),
         config=config,
-        rewind=1,
     )
-    Worker().evaluate(task, [blank(config)], recipes)
+    everyone = everything(task, recipes)
+    raw = answer(Worker(), task, [blank(config)], pack_recipes(recipes), 0, 1)
+    new_outcome(task, recipes, everyone).take(0, everyone[0], raw)
     if command == DqnSettings.command:
         Worker().collect(
             CollectTask(
@@ -144,6 +152,29 @@ def compile_roads(scenario: str, traffic: int) -> None:
     spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig().traffic)
 
 
+def everything_by_default() -> list[RunSettings]:
+    """Settings that need, between them, all that the learners compile on the roads by default."""
+    return [
+        kind(scenario=scenario, traffic=traffic, observation=observation)
+        for scenario in REGISTRY
+        for traffic in sorted({0, default_traffic(scenario)})
+        for kind in (EvolveSettings, DqnSettings)
+        for observation in get_args(Observation)
+    ]
+
+
+def compile_everything() -> None:
+    """Compile all that; a process that fails ends it. Raises: CalledProcessError."""
+    for settings in everything_by_default():
+        warming = begin(settings)
+        warming.wait()
+        for process in warming.processes:
+            process.communicate()
+            if process.returncode:
+                raise subprocess.CalledProcessError(process.returncode, process.args)
+        print(warming.done.name, flush=True)
+
+
 def main(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
     """What the process does."""
     if part == "kernels":
@@ -157,4 +188,7 @@ def main(part: str, scenario: str, policy: str, traffic: int, command: str) -> N
 
 
 if __name__ == "__main__":
+    if sys.argv[1:] == ["everything"]:
+        compile_everything()
+        sys.exit()
     main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]), sys.argv[5])

@@ -7,6 +7,8 @@ interval, so that speed counts only where it is bounded. Both are shares of the 
 
 from __future__ import annotations
 
+from bisect import bisect_right
+
 import numpy as np
 
 LINEAR_SHARE = 0.4  # of an element; without it, who crawls through the last kilometre has nearly all
@@ -32,19 +34,14 @@ def _share(distance: np.ndarray, target: np.ndarray | float) -> np.ndarray:
 
 
 def pareto(values: np.ndarray) -> np.ndarray:
-    """Rank key float64 [n] of elements [n, k], greater is better: front first, crowding within it (Deb et al. 2002).
+    """Rank key float64 [n] of elements [n, 2], greater is better: front first, crowding within it (Deb et al. 2002).
 
     Members of a better front have a greater key; within a front the lonelier one has.
     """
-    n = len(values)
-    key = np.empty(n)
-    better: np.ndarray = np.all(values[:, None, :] >= values[None, :, :], axis=2)
-    dominates = better & ~better.T
-    dominated_by = dominates.sum(axis=0)
-    left = np.ones(n, dtype=bool)
-    front = 0
-    while left.any():
-        here = np.flatnonzero(left & (dominated_by == 0))
+    key = np.empty(len(values))
+    front = _fronts(values)
+    by_front = np.argsort(front, kind="stable")
+    for here in np.split(by_front, np.flatnonzero(np.diff(front[by_front])) + 1):
         crowding = np.zeros(len(here))
         for k in range(values.shape[1]):
             order = np.argsort(values[here, k], kind="stable")
@@ -56,8 +53,25 @@ def pareto(values: np.ndarray) -> np.ndarray:
             crowding[order] += gap
         # Crowding in [0, 1): below the next better front whatever it is; those at the ends are loneliest of all.
         finite = np.minimum(crowding, 1e6)
-        key[here] = -front + finite / (1.0 + finite)
-        left[here] = False
-        dominated_by = dominated_by - dominates[here].sum(axis=0)
-        front += 1
+        key[here] = -front[here] + finite / (1.0 + finite)
     return key
+
+
+def _fronts(values: np.ndarray) -> np.ndarray:
+    """Front int64 [n] of two elements [n, 2], the best 0: in O(n log n), for generations of any size.
+
+    From the greatest first element down, a member is dominated by a front if and only if the front's latest member has
+    as great a second one; fronts are in descending order of that (Jensen 2003).
+    """
+    front = np.zeros(len(values), dtype=np.int64)
+    latest: list[float] = []  # of each front, the negated second element of its latest member
+    before: tuple[float, float] | None = None
+    at = 0
+    for k in np.lexsort((-values[:, 1], -values[:, 0])):
+        first, second = float(values[k, 0]), float(values[k, 1])
+        if (first, second) != before:  # equals do not dominate each other
+            at = bisect_right(latest, -second)
+            latest[at : at + 1] = [-second]
+            before = first, second
+        front[k] = at
+    return front

@@ -56,6 +56,8 @@ _F = np.float32
 #: its own target (m) and limit (control steps), where these are not 0.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4")])
 
+PER_METRE = 16  # distances in a RESULT are multiples of a metre's sixteenth, so that they travel as few bits
+
 #: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
 
@@ -239,10 +241,16 @@ def _run(setting, packed, layers, bounds, room, world, closing, eye):
 
 
 @leaf
+def rounded(metres):
+    """A distance as a RESULT has it."""
+    return _F(math.floor(metres * _F(PER_METRE) + _F(0.5))) / _F(PER_METRE)
+
+
+@leaf
 def note(car, end, row):
     """Fill a RESULT."""
-    row["distance"] = car[DISTANCE]
-    row["paced"] = car[PACED]
+    row["distance"] = rounded(car[DISTANCE])
+    row["paced"] = rounded(car[PACED])
     row["steps"] = car[STEPS]
     row["end"] = end
 
@@ -395,4 +403,4 @@ def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
     _copy(car, room.ring[int(car[STEPS])])
     if traffic is not None:
         _copy_world(world, room.world_ring[int(car[STEPS])])
-    return (car[DISTANCE], car[PACED], car[STEPS], end), room.ring, room.world_ring
+    return (rounded(car[DISTANCE]), rounded(car[PACED]), car[STEPS], end), room.ring, room.world_ring

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.pool import (
+    CHUNK_S,
     METRE_S,
     WORTH_SENDING_S,
     Chunk,
@@ -173,7 +174,7 @@ def test_chunks_let_nobody_wait_for_the_slowest(workers: int, n: int, episodes: 
     busy = [0.0] * workers
     for part in parts:
         busy[busy.index(min(busy))] += metres(task, part)
-    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / METRE_S, target) + 1e-6
+    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / METRE_S, CHUNK_S * workers / METRE_S, target) + 1e-6
     assert len(parts) <= 16 * workers, "as few as that needs"
 
 

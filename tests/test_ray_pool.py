@@ -153,8 +153,8 @@ def test_results_progress_and_what_is_sent(pool: RayPool) -> None:
     assert told == sorted(told)
     assert told[-1] == (512, 512)
     assert outcome.retries == 0
-    assert outcome.bytes_down == recipes.nbytes
-    assert outcome.bytes_up == outcome.results.nbytes + 8 * len(told)
+    assert 2 * 512 <= outcome.bytes_down <= 3 * 512 + 3 * len(told), "8 parents and 512 seeds"
+    assert outcome.bytes_up == outcome.results.nbytes + 9 * len(told), "these numbers are no distances: not packed"
     assert 8 * 311 * 4 < outcome.broadcast_bytes < 8 * 311 * 4 + 2000
     assert set(outcome.busy_s) <= {0, 1}
     assert len(set(pool.pids())) == pool.workers() <= 2

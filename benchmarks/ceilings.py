@@ -1,0 +1,259 @@
+"""What the coordinator can do at most, measured with workers that answer at once or sleep; `scaling.py` calls it.
+
+    python benchmarks/ceilings.py POPULATION
+
+prints as JSON the peak memory of a process that coordinates a run of so many members, all that a run does included, and
+what it broadcasts: a process of its own, so that nothing else is counted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cluster.learning import Maps
+from cluster.pool import Chunk, WorkerPool
+from cluster.ray_pool import RayPool
+from cluster.run import Session, make_tracker, new_run
+from cluster.settings import EvolveSettings
+from cluster.tracking import check_uri
+from cluster.worker import Task, Worker
+from evolution.breeding import RECIPE, Mutation, breed
+from evolution.genetic import Genetic, GeneticConfig
+from evolution.policy import PolicySpec
+from evolution.rollout import EPISODE, Limits, evaluate, no_traffic, targets
+from gridsim.config import SimConfig
+from gridsim.ego import End
+from gridsim.scenarios import build, sample_starts
+
+CHILDREN = 100_000  # members that the coordinator alone is timed with
+EPISODES = 12  # of the default run
+CHUNKS = 2_000  # that are sent to see what one costs
+WAITING = 1_000  # workers that are looked at to see what one costs
+SEED = 7  # of the sleeping workers' naps
+
+
+class InstantWorker(Worker):
+    """Answers at once: half of the episodes succeed, the others end on their way."""
+
+    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        results = np.zeros((len(recipes), len(task.episodes)), dtype=task.row)
+        goals = targets(task.episodes, task.limits)
+        share = (recipes["seed"][:, None] * 7919 + np.arange(len(goals)) * 104_729) % 512 / 256
+        results["distance"] = np.floor(np.minimum(share, 1.0) * goals)
+        results["paced"] = np.floor(results["distance"] / 2)
+        results["steps"] = results["distance"]
+        results["end"] = np.where(share >= 1.0, End.SUCCESS, End.COLLISION)
+        return results, 0.0
+
+
+class SleepingWorker(InstantWorker):
+    """Sleeps in place of evaluating: for as long as `naps` says, by a member's seed and an episode's mark."""
+
+    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        started = time.perf_counter()
+        columns = task.episodes["start"][:, 4].astype(int)
+        time.sleep(float(naps()[np.ix_(recipes["seed"] - 1, columns)].sum()))
+        return super().evaluate(task, maps, recipes)[0], time.perf_counter() - started
+
+
+def naps(members: int = 400, mean_s: float = 0.02) -> np.ndarray:
+    """Seconds [members, EPISODES]: as uneven as real episodes, most of which are driven to their end."""
+    rng = np.random.default_rng(SEED)
+    shape = (members, EPISODES)
+    shares = np.where(rng.random(shape) < 0.6, 1.0, rng.random(shape))
+    return shares * (mean_s / shares.mean() / EPISODES)
+
+
+def make_task(parents: np.ndarray, key: int = 1) -> Task:
+    """A generation's task without maps; each episode is marked by its number."""
+    episodes = np.zeros(EPISODES, EPISODE)
+    episodes["start"][:, 4] = np.arange(EPISODES)
+    return Task(
+        "mlp:6,7", parents, key, Mutation(), episodes, no_traffic(EPISODES), (), Limits(150.0, 245), SimConfig()
+    )
+
+
+def session(
+    folder: Path, name: str, settings: EvolveSettings, pool: WorkerPool, maps: Maps, initial: np.ndarray | None = None
+) -> Session:
+    """A run as the command makes it, in a folder of its own; `initial` is a genome to start from."""
+    run = new_run(folder, name, settings)
+    run.path.mkdir(parents=True)
+    tracker = make_tracker(run, check_uri(f"sqlite:///{folder}/mlflow.db"), "scaling")
+    return Session(run, pool, maps, tracker, time.perf_counter(), initial)
+
+
+def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> float:
+    """Members a second that the coordinator selects, writes recipes for, sends and collects; of InstantWorkers."""
+    spec = PolicySpec.parse("mlp:6,7")
+    genetic = Genetic(spec, GeneticConfig(population=children), 0)
+    rng = np.random.default_rng(0)
+    rates = []
+    for _ in range(6):
+        begun = time.perf_counter()
+        recipes, key = genetic.ask(Mutation())
+        results = pool.evaluate(make_task(genetic.parents, key), recipes).results
+        genetic.tell(results["distance"].sum(axis=1) + rng.random(children))
+        rates.append(children / (time.perf_counter() - begun))
+    return statistics.median(rates[1:])
+
+
+def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
+    """Seconds that the coordinator's thread takes for a chunk of one member, and for each look for what has come.
+
+    Of its processor and not of the clock: here InstantWorkers share its cores. With few workers nearly every chunk takes
+    a look of its own, with many one look finds many answers; so looks are taken apart.
+    """
+    import ray
+
+    wait, looks = ray.wait, [0.0]
+
+    def timed(*arguments: Any, **options: Any) -> Any:
+        begun = time.thread_time()
+        try:
+            return wait(*arguments, **options)
+        finally:
+            looks.append(time.thread_time() - begun)
+
+    recipes = np.zeros(chunks, RECIPE)
+    recipes["seed"] = np.arange(1, chunks + 1)
+    asked = [Chunk(slice(k, k + 1), slice(0, EPISODES)) for k in range(chunks)]
+    task = make_task(np.zeros((1, PolicySpec.parse("mlp:6,7").size), np.float32))
+    times = []
+    ray.wait = timed
+    try:
+        for _ in range(3):
+            begun, before = time.thread_time(), sum(looks)
+            pool.evaluate(task, recipes, asked=asked)
+            times.append((time.thread_time() - begun - sum(looks) + before) / chunks)
+    finally:
+        ray.wait = wait
+    return statistics.median(times), statistics.median(looks)
+
+
+def ray_costs(waiting: int = WAITING) -> tuple[float, float]:
+    """Seconds to look at one busy worker, and to send a byte; while a pool has Ray up."""
+    import ray
+
+    class Helper:
+        def nap(self, seconds: float) -> None:
+            time.sleep(seconds)
+
+        def length(self, payload: bytes) -> int:
+            return len(payload)
+
+    make: Any = ray.remote(num_cpus=0)(Helper)
+    one = make.remote()
+    small, large = b"0" * 1_000, b"0" * 2_000_000
+    times: dict[bytes, list[float]] = {small: [], large: []}
+    for payload in [small, large] * 10:
+        begun = time.perf_counter()
+        ray.get(one.length.remote(payload))
+        times[payload].append(time.perf_counter() - begun)
+    byte_s = (statistics.median(times[large]) - statistics.median(times[small])) / (len(large) - len(small))
+    busy = [one.nap.remote(3600.0) for _ in range(waiting)]
+    looks = []
+    for _ in range(11):
+        begun = time.thread_time()
+        ray.wait(busy, num_returns=len(busy), timeout=0.0)
+        looks.append(time.thread_time() - begun)
+    ray.kill(one)
+    return statistics.median(looks) / waiting, max(byte_s, 0.0)
+
+
+def gene_s(policy: str) -> float:
+    """Seconds to breed a gene."""
+    spec = PolicySpec.parse(policy)
+    count = max(1, 500_000 // spec.size)
+    parents = np.random.default_rng(0).normal(size=(64, spec.size)).astype(np.float32)
+    recipes = np.zeros(count, RECIPE)
+    recipes["seed"], recipes["b"] = np.arange(1, count + 1), 1
+    times = []
+    for _ in range(4):
+        begun = time.perf_counter()
+        breed(parents, recipes, 1, spec, Mutation())
+        times.append(time.perf_counter() - begun)
+    return statistics.median(times[1:]) / (count * spec.size)
+
+
+def step_s(policy: str, members: int = 64) -> float:
+    """Seconds of a car-step with that network, by untrained drivers on `seamless`."""
+    spec, scenario = PolicySpec.parse(policy), build("seamless", 0)
+    rng = np.random.default_rng(0)
+    genomes = (rng.normal(size=(members, spec.size)) * 0.3).astype(np.float32)
+    episodes = np.zeros(4, EPISODE)
+    episodes["start"] = sample_starts(scenario, 4, rng)
+    times = []
+    for _ in range(4):
+        begun = time.perf_counter()
+        results, _, _ = evaluate(spec, genomes, [scenario], episodes, Limits(150.0, 245), SimConfig())
+        times.append((time.perf_counter() - begun) / results["steps"].sum())
+    return statistics.median(times[1:])
+
+
+def sleeping_efficiency(workers: int, members: int, generations: int = 3) -> float:
+    """Efficiency of so many real Ray actors on whatever cores there are: they sleep, which takes none."""
+    maps = Maps("seamless", SimConfig())
+    pool = RayPool(workers, maps.build, worker_factory=SleepingWorker)
+    recipes = np.zeros(members, RECIPE)
+    recipes["seed"] = np.arange(1, members + 1)
+    task = make_task(np.zeros((72, PolicySpec.parse("mlp:6,7").size), np.float32))
+    try:
+        while pool.workers() < workers:  # all are up, and it is known how long a metre takes
+            pool.evaluate(task, recipes)
+        walls = [pool.evaluate(task, recipes).wall_s for _ in range(generations)]
+    finally:
+        pool.close()
+        maps.close()
+    return float(naps()[:members].sum()) / (workers * statistics.median(walls))
+
+
+def memory(population: int) -> dict[str, float]:
+    """Figures of a process that coordinates so many members, by `python benchmarks/ceilings.py POPULATION`."""
+    done = subprocess.run(
+        [sys.executable, __file__, str(population)], stdout=subprocess.PIPE, text=True, check=True, timeout=600
+    )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def coordinate(population: int, generations: int = 12) -> dict[str, float]:
+    """Run some generations of InstantWorkers in the longest episodes, saved and logged as always."""
+    settings = EvolveSettings(population=population, generations=generations, until=2.0)
+    with tempfile.TemporaryDirectory() as folder:
+        maps = Maps(settings.scenario, SimConfig())
+        pool = RayPool(2, maps.build, worker_factory=InstantWorker)
+        this = session(Path(folder), "large", settings, pool, maps)
+        curriculum = this.learning.curriculum
+        curriculum.config = dataclasses.replace(curriculum.config, first_target=curriculum.config.last_target)
+        curriculum.target = curriculum.config.last_target
+        broadcast: list[int] = []
+        this.on_row = lambda step, row: broadcast.append(sum(o.broadcast_bytes for o in this.learning.outcomes))
+        begun = time.perf_counter()
+        try:
+            this.learn()
+        finally:
+            pool.close()
+            this.tracker.close("FINISHED")
+            maps.close()
+        seconds = time.perf_counter() - begun
+    scale = 1 if sys.platform == "darwin" else 1024
+    return {
+        "coordinator_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * scale / 2**20,
+        "broadcast_bytes": min(broadcast),
+        "generation_s": seconds / generations,
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(coordinate(int(sys.argv[1]))))

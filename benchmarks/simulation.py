@@ -1,0 +1,220 @@
+"""A generation on 1 to 10,000 workers, as a discrete-event simulation fed by what `ceilings.py` measured.
+
+The coordinator is one thread, as in `cluster.ray_pool`: it sends chunks to who is free, looks at all who are busy, and
+takes in what has come. The chunks are those of `cluster.pool.cut`. Simulated are its time, the network's latency and
+the bandwidth of its own link, the mating pool on its way to the nodes, the workers' evaluations and the race that
+follows. Not simulated: deaths, and other people's load.
+
+Efficiency is the time of evaluation over what all workers had: 1 means that nobody ever waited.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cluster.pool import Chunk, cut
+from cluster.worker import Task
+from evolution.breeding import Mutation
+from evolution.packing import result_widths
+from evolution.rollout import EPISODE, Limits, no_traffic, targets
+from gridsim.config import SimConfig
+
+WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
+POPULATION = 10_000
+QUEUE = 2  # chunks that a worker holds, as in the pool
+GENERATIONS = 1  # simulated for each figure: with so many members they are all alike
+TASK_BYTES = 4_000  # of a broadcast, beside genomes: episodes, settings, and how they are pickled
+RECIPE_BYTES = 6  # of a packed one at such populations
+CHUNK_BYTES = 300  # around what is sent, either way: Ray's own description of a call
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What things cost, in seconds; the last three are assumed and not measured."""
+
+    child_s: float  # of the coordinator's, a member: to select, to score
+    chunk_s: float  # of the coordinator's, a chunk: to send it and to take in what it brought
+    look_s: float  # of the coordinator's, a look for what has come
+    look_worker_s: float  # and as much again for each worker that is busy
+    byte_s: float  # of the coordinator's, a byte that is sent
+    gene_s: float  # to breed a gene
+    latency_s: float = 0.3e-3  # from one machine to another
+    bandwidth: float = 1.25e9  # bytes/s of a machine's link: 10 Gbit/s
+    node_workers: int = 16  # workers of a machine
+
+
+@dataclass(frozen=True)
+class Load:
+    """What a generation asks for.
+
+    Attributes:
+        targets: m, of each episode [e].
+        drives: s, of each member's episodes [n, e]; members are drawn from it.
+        race_targets, race_drives: the same of the race [racers, r], which is held as it is.
+        genes: of a network.
+        parents: genomes in a broadcast.
+        recipes: whether children are sent as recipes; else as genomes, which the coordinator breeds.
+    """
+
+    targets: np.ndarray
+    drives: np.ndarray
+    race_targets: np.ndarray
+    race_drives: np.ndarray
+    genes: int
+    parents: int = 72
+    recipes: bool = True
+
+
+@dataclass
+class Call:
+    """One call of a pool: what is asked for, and how long it took."""
+
+    costs: Costs
+    workers: int
+    drives: np.ndarray  # s [n, e]
+    episodes: np.ndarray  # EPISODE [e]
+    member_bytes: float  # sent for each member, in each chunk that it is in
+    member_s: float  # of the coordinator's, for the same
+    broadcast: int  # bytes
+
+    def chunks(self) -> list[Chunk]:
+        """As the pool cuts it, which knows from the last generation how long a metre takes."""
+        limits = Limits(1.0, 1)
+        task = Task(
+            "mlp:6,7", np.zeros((1, 1), np.float32), 0, Mutation(), self.episodes, no_traffic(len(self.episodes)), (),
+            limits, SimConfig(),
+        )  # fmt: skip
+        n, e = self.drives.shape
+        metres = targets(self.episodes, limits).sum() * n
+        return cut(task, [Chunk(slice(0, n), slice(0, e))], self.workers, max(self.drives.sum() / metres, 1e-12))
+
+    def run(self) -> float:
+        """Seconds from its begin to its end."""
+        k, chunks = self.costs, self.chunks()
+        size = np.concatenate([np.zeros((len(self.drives), 1)), np.cumsum(self.drives, axis=1)], axis=1)
+        answer = np.cumsum(np.concatenate([[0], result_widths(self.episodes, Limits(1.0, 1), SimConfig()).sum(axis=1)]))
+        todo = deque(chunks)
+        idle = deque(range(self.workers))
+        single: deque[int] = deque()  # who holds one chunk, in the order in which they got it
+        held = [0] * self.workers
+        free_at = [0.0] * self.workers
+        broadcast_at: dict[int, float] = {}  # by node
+        coming: list[tuple[float, int, float]] = []  # (when an answer is here, whose, how many bytes it has)
+        link_s = 0.0  # until when the coordinator's link is busy
+        now = self.broadcast * k.byte_s
+
+        def send(worker: int) -> None:
+            nonlocal now, link_s
+            rows, columns = todo.popleft()
+            members = rows.stop - rows.start
+            down = CHUNK_BYTES + members * self.member_bytes
+            now += k.chunk_s / 2 + down * k.byte_s + members * self.member_s
+            link_s = max(link_s, now) + down / k.bandwidth
+            node = worker // k.node_workers
+            if node not in broadcast_at:
+                # Every node that has it passes it on, so that those who have it double.
+                rounds = math.ceil(math.log2(node + 2))
+                broadcast_at[node] = link_s + rounds * (2 * k.latency_s + self.broadcast / k.bandwidth)
+            begin = max(link_s + k.latency_s, free_at[worker], broadcast_at[node])
+            free_at[worker] = begin + float((size[rows, columns.stop] - size[rows, columns.start]).sum())
+            up = CHUNK_BYTES + members * (answer[columns.stop] - answer[columns.start]) / 8
+            heapq.heappush(coming, (free_at[worker] + k.latency_s + up / k.bandwidth, worker, up))
+            held[worker] += 1
+            if held[worker] == 1:
+                single.append(worker)
+
+        left = len(chunks)
+        while left:
+            while todo and idle:
+                send(idle.popleft())
+            for _ in range(len(single)):
+                if len(todo) <= self.workers:
+                    break
+                worker = single.popleft()
+                if 0 < held[worker] < QUEUE:
+                    send(worker)
+            looked = now = max(now + k.look_s + k.look_worker_s * (self.workers - len(idle)), coming[0][0])
+            while coming and coming[0][0] <= looked:
+                _, worker, up = heapq.heappop(coming)
+                now += k.chunk_s / 2 + up * k.byte_s
+                left -= 1
+                held[worker] -= 1
+                (single if held[worker] else idle).append(worker)
+        return now
+
+
+def episodes_of(goals: np.ndarray) -> np.ndarray:
+    """EPISODE [e] with these targets (m), as long as they take at 7 m/s."""
+    episodes = np.zeros(len(goals), dtype=EPISODE)
+    episodes["target"], episodes["steps"] = goals, np.ceil(goals / 0.7 + 30)
+    return episodes
+
+
+def generation(costs: Costs, load: Load, workers: int, drives: np.ndarray) -> float:
+    """Seconds of a generation: its members [n, e], then the race."""
+    n = len(drives)
+    genomes = 0 if load.recipes else 4 * load.genes
+    bred = 0.0 if load.recipes else costs.gene_s * load.genes
+    pool = 4 * load.genes * load.parents if load.recipes else 0
+    racers = len(load.race_drives)
+    main = Call(
+        costs, workers, drives, episodes_of(load.targets), genomes or RECIPE_BYTES, bred, TASK_BYTES + pool
+    )  # fmt: skip
+    # Racers are broadcast as they are, whatever children are.
+    race = Call(
+        costs, workers, load.race_drives, episodes_of(load.race_targets), RECIPE_BYTES, 0.0,
+        TASK_BYTES + 4 * load.genes * racers,
+    )  # fmt: skip
+    breeding_racers_and_parents = costs.gene_s * load.genes * (racers + load.parents)
+    return n * costs.child_s + main.run() + breeding_racers_and_parents + race.run()
+
+
+def efficiency(costs: Costs, load: Load, workers: int, population: int = POPULATION) -> float:
+    """Time of evaluation over what the workers had, of GENERATIONS."""
+    spent = had = 0.0
+    for seed in range(GENERATIONS):
+        rows = np.random.default_rng(seed).integers(len(load.drives), size=population)
+        drives = load.drives[rows]
+        spent += drives.sum() + load.race_drives.sum()
+        had += workers * generation(costs, load, workers, drives)
+    return spent / had
+
+
+def at(load: Load, member_s: float, **changes: object) -> Load:
+    """The same where a member's evaluation takes so long in the mean."""
+    factor = member_s / load.drives.sum(axis=1).mean()
+    values = {**load.__dict__, "drives": load.drives * factor, "race_drives": load.race_drives * factor, **changes}
+    return Load(**values)
+
+
+def table(costs: Costs, cases: dict[str, Load], workers: Sequence[int] = WORKERS) -> dict[str, list[float]]:
+    """Efficiency of each case at each number of workers."""
+    return {name: [efficiency(costs, load, w) for w in workers] for name, load in cases.items()}
+
+
+def draw(figures: dict[str, list[float]], path: Path, workers: Sequence[int] = WORKERS) -> None:
+    """The same as a picture."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
+    for k, (name, values) in enumerate(figures.items()):
+        axes.plot(workers, values, "--" if "genomes" in name else "-", color=f"C{k // 2}", marker=".", label=name)
+    axes.set(
+        xscale="log", ylim=(0, 1.02), xlabel="workers", ylabel="efficiency",
+        title=f"Simulated efficiency of a generation of {POPULATION:,} members",
+    )  # fmt: skip
+    axes.axhline(0.9, color="0.7", linewidth=0.8, zorder=0)
+    axes.grid(alpha=0.25)
+    axes.legend(loc="lower left", frameon=False)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)

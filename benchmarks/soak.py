@@ -1,0 +1,137 @@
+"""Whether memory grows with the generations: python benchmarks/soak.py [--generations 2000] [--workers 2] [--json]
+
+Evolves a small population from a driver that is trained already, so that everything a long run does is done from the
+start: races, crashes, validation, a checkpoint and an MLflow row each generation. After each, the memory of the
+command and of all that it started (Ray's processes and the workers) is added up as the kernel shares it out (PSS), so
+that what lies in shared memory counts once.
+
+What is there after the first 100 generations (or half of a shorter run) is compared with the end's, as medians of 20.
+Exits with 1 where the end's is over 5 % more. Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from ceilings import session  # beside this file
+
+from cluster.champion import load_champion
+from cluster.learning import Maps
+from cluster.ray_pool import RayPool
+from cluster.settings import EvolveSettings
+from cluster.warm import compile_kernels
+from gridsim.config import SimConfig
+
+FIRST = 100  # generations, after which nothing may grow
+WINDOW = 20  # generations that a figure is the median of
+GROWTH = 0.05
+MIB = 2**20
+
+
+def tree(pid: int) -> list[int]:
+    """A process and all below it."""
+    children: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError, IndexError):
+                parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+                children.setdefault(parent, []).append(int(entry.name))
+    found = [pid]
+    for process in found:
+        found += children.get(process, [])
+    return found
+
+
+def memory(pid: int) -> int:
+    """Bytes of a process: its own, and its part of what it shares (PSS). 0 where it has gone."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+            if line.startswith("Pss:"):
+                return int(line.split()[1]) * 1024
+    return 0
+
+
+def soak(generations: int, workers: int) -> dict[str, list[int]]:
+    """Bytes after each generation: of the command (`own`), and of all that it started (`started`)."""
+    champion = load_champion(Path(__file__).with_name("champion.npz"))
+    settings = EvolveSettings(
+        policy=champion.policy, population=32, elites=4, parents=16, generations=generations, until=2.0
+    )
+    seen: dict[str, list[int]] = {"own": [], "started": []}
+    with tempfile.TemporaryDirectory() as folder:
+        maps = Maps(settings.scenario, SimConfig())
+        pool = RayPool(workers, maps.build)
+        this = session(Path(folder), "soak", settings, pool, maps, champion.genome)
+        # A short validation: all maps are in use at once, and a generation takes a tenth of a second.
+        curriculum = this.learning.curriculum
+        curriculum.config = dataclasses.replace(
+            curriculum.config, validation=48, first_validation=24, contenders=1, racers=4, race_episodes=8
+        )
+        curriculum.target = curriculum.config.last_target
+        compile_kernels(settings.policy, settings.traffic, settings.command)
+
+        def look(generation: int, row: dict[str, float]) -> None:
+            own, *started = tree(os.getpid())
+            seen["own"].append(memory(own))
+            seen["started"].append(sum(map(memory, started)))
+            if sys.stderr.isatty():
+                print(f"\rgeneration {generation} ", end="", file=sys.stderr, flush=True)
+
+        this.on_row = look
+        try:
+            this.learn()
+        finally:
+            pool.close()
+            this.tracker.close("FINISHED")
+            maps.close()
+    return seen
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--generations", type=int, default=2_000, help="how many (2000)")
+    parser.add_argument("--workers", type=int, default=2, help="how many (2)")
+    parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
+    options = parser.parse_args()
+    if options.generations < 2 or options.workers < 1:
+        parser.error("--generations must be 2 or more, --workers 1 or more")
+    begun = time.perf_counter()
+    seen = soak(options.generations, options.workers)
+    seconds = time.perf_counter() - begun
+    total = [sum(both) for both in zip(*seen.values(), strict=True)]
+    first = min(FIRST, len(total) // 2)
+    window = min(WINDOW, len(total) - first)
+    before, after = (statistics.median(part) for part in (total[first : first + window], total[-window:]))
+    growth = after / before - 1.0
+    figures = {
+        "generations": len(total),
+        "seconds": round(seconds, 1),
+        "mib_before": round(before / MIB, 1),
+        "mib_after": round(after / MIB, 1),
+        "own_mib_before": round(statistics.median(seen["own"][first : first + window]) / MIB, 1),
+        "own_mib_after": round(statistics.median(seen["own"][-window:]) / MIB, 1),
+        "growth": round(growth, 4),
+    }
+    if options.json:
+        print(json.dumps(figures))
+    else:
+        for name, value in figures.items():
+            print(f"{name:16} {value:12,}")
+    if growth > GROWTH:
+        print(f"soak: memory has grown by {growth:.1%}, more than {GROWTH:.0%}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,135 @@
+"""Every script in benchmarks/ runs, on a small scale, and the simulation behaves as queues do."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[1] / "benchmarks"
+#: A script and how it is run here; what `--json` must print.
+RUNS = {
+    "peers.py": ([], None),
+    "reference.py": (["curved", "--episodes", "2"], None),
+    "scaling.py": (
+        ["--quick", "--json"],
+        {
+            "speedup_2_workers", "overhead_ms_per_generation", "bytes_per_child", "broadcast_bytes_per_generation",
+            "children_per_s", "coordinator_mib_100k", "efficiency_1000_workers", "real_efficiency_2",
+            "simulated_efficiency_2",
+        },
+    ),
+    "soak.py": (["--generations", "12", "--workers", "1", "--json"], {"growth", "mib_before", "mib_after"}),
+    "throughput.py": (["--runs", "1", "--json"], {"rollout_rays", "vector_env_grid", "breed_512x1000_ms"}),
+    "traffic.py": (["--hours", "0.01", "--seeds", "1", "--scenario", "curved", "--json"], set()),
+}  # fmt: skip
+PARTS = {"ceilings.py", "simulation.py"}  # of scaling.py
+
+
+def test_every_script_is_run_here() -> None:
+    assert set(RUNS) | PARTS == {path.name for path in FOLDER.glob("*.py")}
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("name", RUNS)
+def test_script_runs(name: str, tmp_path: Path) -> None:
+    arguments, figures = RUNS[name]
+    done = subprocess.run(
+        [sys.executable, str(FOLDER / name), *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    # A peer has to be named; and in so few generations memory still grows.
+    allowed = {"peers.py": {2}, "soak.py": {0, 1}}.get(name, {0})
+    assert done.returncode in allowed, done.stderr
+    assert "Traceback" not in done.stderr
+    if figures is not None:
+        printed = json.loads(done.stdout)
+        assert figures <= set(printed)
+        assert all(isinstance(value, int | float) for value in printed.values()), "one flat object of numbers"
+    assert list(tmp_path.iterdir()) == [], "nothing is left where it is called"
+
+
+# ----------------------------------------------------------------------------------------------------- the simulation
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Any:
+    spec = importlib.util.spec_from_file_location("simulation", FOLDER / "simulation.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["simulation"] = module  # its dataclasses look themselves up
+    spec.loader.exec_module(module)
+    return module
+
+
+def load_of(simulation: Any, **changes: Any) -> Any:
+    goals = np.array([400.0] * 6 + [120.0] * 6)
+    race = np.full(16, 1000.0)
+    load = simulation.Load(goals, np.tile(goals, (64, 1)), race, np.tile(race, (24, 1)), 311)
+    return simulation.at(load, 1.0, **changes)
+
+
+def costs_of(simulation: Any, **costs: float) -> Any:
+    nothing = {
+        "child_s": 0.0,
+        "chunk_s": 0.0,
+        "look_s": 0.0,
+        "look_worker_s": 0.0,
+        "byte_s": 0.0,
+        "gene_s": 0.0,
+        "latency_s": 0.0,
+    }
+    return simulation.Costs(**{**nothing, "bandwidth": 1e30, **costs})
+
+
+def test_one_worker_at_no_cost_never_waits(simulation: Any) -> None:
+    assert simulation.efficiency(costs_of(simulation), load_of(simulation), 1, 50) == pytest.approx(1.0)
+
+
+def test_a_coordinator_that_takes_time_for_each_chunk_bounds_many_workers(simulation: Any) -> None:
+    """Every chunk takes 10 ms of one thread: nothing is faster than all of them one after the other."""
+    load, chunk_s = load_of(simulation), 0.01
+    call = simulation.Call(
+        costs_of(simulation, chunk_s=chunk_s), 500, np.tile(load.drives[:1], (1000, 1)),
+        simulation.episodes_of(load.targets), 6.0, 0.0, 0,
+    )  # fmt: skip
+    assert call.run() >= len(call.chunks()) * chunk_s
+    assert call.run() >= call.drives.sum() / 500
+
+
+def test_each_cost_lowers_efficiency_and_recipes_are_cheaper_than_genomes(simulation: Any) -> None:
+    load = load_of(simulation)
+    best = simulation.efficiency(costs_of(simulation), load, 100, 1000)
+    assert 0.85 < best < 1.0, "the last ones are waited for, and the race has fewer pieces than there are workers"
+    for cost in (
+        {"child_s": 1e-3},
+        {"chunk_s": 1e-3},
+        {"look_worker_s": 1e-4},
+        {"latency_s": 0.05},
+        {"bandwidth": 1e5},
+    ):
+        assert simulation.efficiency(costs_of(simulation, **cost), load, 100, 1000) < best
+    real = simulation.Costs(child_s=1e-6, chunk_s=3e-4, look_s=1e-4, look_worker_s=1e-6, byte_s=1e-9, gene_s=2e-9)
+    large = load_of(simulation, genes=100_000)
+    genomes = load_of(simulation, genes=100_000, recipes=False)
+    assert simulation.efficiency(real, genomes, 1000, 2000) < simulation.efficiency(real, large, 1000, 2000)
+
+
+def test_a_broadcast_takes_as_many_rounds_as_it_doubles(simulation: Any) -> None:
+    """One second of evaluation each on 64 workers of 4 machines; a broadcast takes 1 s to each machine."""
+    costs = costs_of(simulation, bandwidth=1e6)
+    drives = np.full((64, 1), 1.0)
+    episodes = simulation.episodes_of(np.array([100.0]))
+    quick = simulation.Call(costs, 64, drives, episodes, 0.0, 0.0, 0).run()
+    slow = simulation.Call(costs, 64, drives, episodes, 0.0, 0.0, 1_000_000).run()
+    assert slow - quick == pytest.approx(3.0, abs=0.1)  # 1, 2, 2 and 3 rounds
+
+
+def test_the_picture_is_drawn(simulation: Any, tmp_path: Path) -> None:
+    figures = {"mlp": [1.0, 0.9], "mlp, genomes": [1.0, 0.4]}
+    simulation.draw(figures, tmp_path / "scaling.png", (1, 1000))
+    assert (tmp_path / "scaling.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,337 @@
+"""The image and the compose file, without Docker: held against the project, and their commands run as they stand there.
+
+The image's own steps are not run in a fresh root: they fetch two gigabytes of packages, which takes minutes.
+"""
+
+import importlib.metadata
+import json
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import psutil  # type: ignore[import-untyped]
+import pytest
+import yaml
+from commands import BIN, finish, wait_until
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+
+from cluster import cli
+from cluster.settings import DqnSettings, EvolveSettings
+from cluster.warm import everything_by_default
+from gridsim.scenarios import REGISTRY
+
+ROOT = Path(__file__).parents[1]
+PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+DOCKERFILE = (ROOT / "docker/Dockerfile").read_text(encoding="utf-8")
+TOKEN = "0123456789abcdef" * 4
+
+
+def instructions() -> list[tuple[str, str]]:
+    """(instruction, the rest) of the Dockerfile."""
+    text = re.sub(r"^#.*\n", "", DOCKERFILE, flags=re.MULTILINE).replace("\\\n", " ")
+    return [tuple(line.split(None, 1)) for line in text.splitlines() if line.strip()]  # type: ignore[misc]
+
+
+def final_stage() -> list[tuple[str, str]]:
+    steps = instructions()
+    return steps[max(k for k, (name, _) in enumerate(steps) if name == "FROM") :]
+
+
+def compose() -> dict[str, Any]:
+    """The compose file with its variables filled in as their defaults are."""
+    text = (ROOT / "docker/compose.yaml").read_text(encoding="utf-8")
+    text = text.replace("${RAY_AUTH_TOKEN:?is not set; docker/README.md says how}", TOKEN)
+    return yaml.safe_load(re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text))
+
+
+def pins() -> dict[str, str]:
+    lines = (ROOT / "docker/requirements.txt").read_text(encoding="utf-8").splitlines()
+    found = [re.fullmatch(r"([A-Za-z0-9._-]+)==([A-Za-z0-9.+]+)", line) for line in lines if line[0] not in "#-"]
+    assert all(found), "every package with one version"
+    return {canonicalize_name(match[1]): match[2] for match in found if match}
+
+
+def ignored(path: str) -> bool:
+    """Whether .dockerignore keeps a path from the builder: the last pattern that fits decides."""
+    kept = True
+    for line in (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines():
+        pattern = line.lstrip("!").removeprefix("**/")
+        if line and not line.startswith("#") and (fnmatch(path, pattern) or fnmatch(Path(path).name, pattern)):
+            kept = line.startswith("!")
+    return not kept
+
+
+# ---------------------------------------------------------------------------------------------------------- the image
+
+
+def test_what_is_copied_is_there_and_is_what_pip_needs() -> None:
+    sources = [
+        source
+        for name, rest in instructions()
+        if name == "COPY" and "--from" not in rest
+        for source in rest.split()[:-1]
+    ]
+    assert [source for source in sources if not (ROOT / source).exists()] == []
+    files = [path for source in sources for path in [ROOT / source, *(ROOT / source).rglob("*.py")] if path.is_file()]
+    assert [path for path in files if ignored(str(path.relative_to(ROOT)))] == []
+    project = PROJECT["project"]
+    needed = {
+        "pyproject.toml",
+        project["readme"],
+        *project["license-files"],
+        *PROJECT["tool"]["setuptools"]["packages"],
+    }
+    assert needed <= set(sources)
+    assert ignored("runs/a/checkpoint.npz")
+    assert ignored(".git/config")
+    assert ignored("cluster/__pycache__/cli.cpython-311.pyc")
+    stages = {rest.split(" AS ")[1] for name, rest in instructions() if name == "FROM" and " AS " in rest}
+    assert {re.findall(r"--from=(\w+)", rest)[0] for name, rest in instructions() if "--from=" in rest} <= stages
+
+
+def test_pythons_version_is_one_that_the_project_takes_and_the_same_in_all_stages() -> None:
+    arguments = dict(rest.split("=") for name, rest in instructions() if name == "ARG")
+    bases = [rest.split()[0] for name, rest in instructions() if name == "FROM"]
+    assert len(set(bases)) == 1
+    assert bases[0].startswith("python:${PYTHON}-slim-")
+    assert re.fullmatch(r"3\.\d+\.\d+", arguments["PYTHON"]), "pinned to the last digit"
+    assert arguments["PYTHON"] in SpecifierSet(PROJECT["project"]["requires-python"])
+
+
+def test_every_package_is_pinned_to_a_version_that_the_project_takes() -> None:
+    pinned = pins()
+    for line in [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]:
+        requirement = Requirement(line)
+        assert pinned[canonicalize_name(requirement.name)] in requirement.specifier, line
+
+
+def test_the_pins_fit_each_other_and_nothing_is_left_to_chance() -> None:
+    """As far as what is installed here can tell: of packages in the version that is pinned."""
+    pinned, looked = pins(), 0
+    for name, version in pinned.items():
+        try:
+            found = importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        if found.version != version:
+            continue
+        looked += 1
+        for line in found.requires or []:
+            requirement = Requirement(line)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                assert pinned[canonicalize_name(requirement.name)] in requirement.specifier, f"{name} wants {line}"
+    assert looked, "nothing that is pinned is installed"
+
+
+def test_it_runs_as_a_user_whose_caches_and_volumes_are_its_own() -> None:
+    steps = final_stage()
+    user = [rest for name, rest in steps if name == "USER"][-1]
+    text = "\n".join(rest for _, rest in steps)
+    assert re.search(rf"useradd --uid [1-9]\d+ .*{user}", text)
+    owned = re.search(rf"install --directory --owner={user} --group={user} (.*)", text)
+    assert owned is not None
+    folders = set(owned[1].split())
+    cache = re.search(r"GRIDSIM_CACHE_DIR=(\S+)", text)
+    assert cache is not None
+    assert cache[1] in folders
+    home = [rest for name, rest in steps if name == "WORKDIR"][-1]
+    assert f"{home}/{cli.EvolveFlags().output}" in folders, "where runs go by default"
+    mounted = {
+        volume.split(":")[1] for service in compose()["services"].values() for volume in service.get("volumes", [])
+    }
+    assert mounted <= folders, "a new volume has its folder's owner"
+    command = json.loads([rest for name, rest in steps if name == "CMD"][-1])
+    assert command[0] in PROJECT["project"]["scripts"]
+
+
+def test_no_compiler_gets_in_and_kernels_are_compiled_by_the_user_from_sources_of_whole_seconds() -> None:
+    steps = instructions()
+    assert "apt-get" not in DOCKERFILE
+    runs = [k for k, (name, rest) in enumerate(steps) if name == "RUN"]
+    at = {what: next(k for k in runs if what in steps[k][1]) for what in ("touch", "cluster.warm", "command -v gcc")}
+    user = max(k for k, (name, _) in enumerate(steps) if name == "USER")
+    assert at["touch"] < user < at["cluster.warm"]
+    assert steps[at["cluster.warm"]][1].split() == ["python", "-m", "cluster.warm", "everything"]
+    assert subprocess.run(["/bin/sh", "-c", steps[at["command -v gcc"]][1]], env={"PATH": "/nowhere"}).returncode == 0
+    wanted = everything_by_default()
+    assert {s.scenario for s in wanted} == set(REGISTRY)
+    assert {type(s) for s in wanted} == {EvolveSettings, DqnSettings}
+    assert {bool(s.traffic) for s in wanted} == {False, True}
+    for settings in wanted:
+        settings.check()
+
+
+def test_kernels_that_meet_another_cpu_are_compiled_anew_beside_the_others(tmp_path: Path) -> None:
+    code = "import numpy as np, gridsim.counter as c; print(c.mix(np.uint64(7)))"
+
+    def run(**cpu: str) -> tuple[str, int]:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=ROOT,
+            env={**os.environ, "GRIDSIM_CACHE_DIR": str(tmp_path), **cpu},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
+        )
+        return done.stdout, len(list(tmp_path.rglob("*.nbc")))
+
+    first, compiled = run()
+    assert compiled >= 1
+    other, both = run(NUMBA_CPU_NAME="generic", NUMBA_CPU_FEATURES="")
+    assert both == 2 * compiled
+    assert run() == (first, both), "what was there is used"
+    assert other == first
+
+
+# ----------------------------------------------------------------------------------------------------------- compose
+
+
+def test_compose_is_one_image_of_this_version_with_ports_on_loopback_alone() -> None:
+    services = compose()["services"]
+    assert {"head", "worker", "mlflow"} == set(services)
+    for service in services.values():
+        assert service["image"] == f"gridsim:{PROJECT['project']['version']}"
+        assert service["build"] == {"context": "..", "dockerfile": "docker/Dockerfile"}
+        assert service["healthcheck"]["test"][0] == "CMD"
+        assert all(port.startswith("127.0.0.1:") for port in service.get("ports", []))
+        assert "privileged" not in service
+        assert "network_mode" not in service
+    assert [name for name, service in services.items() if service.get("ports")] == ["mlflow"]
+    volumes = {volume.split(":")[0] for service in services.values() for volume in service.get("volumes", [])}
+    assert volumes == set(compose()["volumes"])
+    assert services["worker"]["deploy"]["replicas"] >= 1
+
+
+def test_every_node_of_ray_has_the_token_and_room_for_its_store() -> None:
+    text = (ROOT / "docker/compose.yaml").read_text(encoding="utf-8")
+    assert "RAY_AUTH_TOKEN: ${RAY_AUTH_TOKEN:?" in text, "no token of ours, and none is an error"
+    for name in ("head", "worker"):
+        service = compose()["services"][name]
+        assert service["environment"]["RAY_AUTH_MODE"] == "token"
+        assert service["environment"]["RAY_AUTH_TOKEN"] == TOKEN
+        store = re.search(r"--object-store-memory=(\d+)", service["command"])
+        assert store is not None
+        assert service["shm_size"] == "1gb"
+        assert int(store[1]) < 2**30
+    assert "RAY_AUTH_TOKEN" not in str(compose()["services"]["mlflow"])
+
+
+def test_the_guides_commands_are_read_by_the_real_parser() -> None:
+    text = (ROOT / "docker/README.md").read_text(encoding="utf-8")
+    commands = re.findall(r"gridsim-evolve ([^`\n]*)", text.replace("\n", " \n"))
+    assert len(commands) >= 3
+    for line in commands:
+        cli.parse(cli.EvolveFlags, "gridsim-evolve", shlex.split(line.replace("$WORKERS", "8")))
+    for option in re.findall(r"--file (\S+)", text):
+        assert (ROOT / option).is_file()
+
+
+# --------------------------------------------------------------------------------------------- the services, for real
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Services:
+    """The services of the compose file as processes of this machine, with ports and folders of their own."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.services = folder, compose()["services"]
+        ray, mlflow = free_port(), free_port()
+        self.changes = {
+            r"head:6379": f"127.0.0.1:{ray}",
+            r"--port=6379": f"--port={ray} --node-ip-address=127.0.0.1",
+            r"--object-store-memory=\d+": "--object-store-memory=100000000",
+            r"--host 0\.0\.0\.0": "--host 127.0.0.1",
+            r"/home/gridsim/mlflow": str(folder / "mlflow"),
+            r"\bmlflow:5000": "127.0.0.1:5000",
+            r"\b5000\b": str(mlflow),
+        }
+        self.started: dict[str, subprocess.Popen[bytes]] = {}
+
+    def here(self, text: str) -> str:
+        for old, new in self.changes.items():
+            text = re.sub(old, new, text)
+        return text
+
+    def environment(self, name: str) -> dict[str, str]:
+        image = dict(re.findall(r"((?:RAY|MLFLOW|GIT)_\w+)=(\S+)", "".join(rest for _, rest in final_stage())))
+        given = {k: self.here(v) for k, v in self.services[name].get("environment", {}).items()}
+        path = f"{BIN}:{os.environ['PATH']}"
+        return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), **image, **given}
+
+    def start(self, name: str) -> None:
+        log = (self.folder / f"{name}.log").open("wb")
+        with log:
+            self.started[name] = subprocess.Popen(
+                shlex.split(self.here(self.services[name]["command"])),
+                cwd=self.folder,
+                env=self.environment(name),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def healthy(self, name: str) -> bool:
+        assert self.started[name].poll() is None, (self.folder / f"{name}.log").read_text()
+        check = [self.here(word) for word in self.services[name]["healthcheck"]["test"][1:]]
+        return subprocess.run(check, env=self.environment(name), capture_output=True, timeout=60).returncode == 0
+
+    def stop(self) -> None:
+        for started in reversed(self.started.values()):
+            processes = [psutil.Process(started.pid), *psutil.Process(started.pid).children(recursive=True)]
+            started.terminate()
+            for process in psutil.wait_procs(processes, 20)[1]:
+                process.kill()
+            started.wait()
+
+
+@pytest.fixture
+def services(tmp_path: Path) -> Iterator[Services]:
+    (tmp_path / "mlflow").mkdir()
+    services = Services(tmp_path)
+    try:
+        yield services
+    finally:
+        services.stop()
+
+
+@pytest.mark.e2e
+def test_the_services_come_up_and_a_run_is_evolved_on_them_and_tracked(services: Services) -> None:
+    """`docker compose up`, and the guide's `exec head gridsim-evolve`, with processes in place of containers."""
+    services.start("mlflow")
+    services.start("head")
+    wait_until(lambda: services.healthy("head"))
+    services.start("worker")
+    wait_until(lambda: services.healthy("worker"))
+    wait_until(lambda: services.healthy("mlflow"))
+    environment = services.environment("head")
+    address = services.here("head:6379")  # where containers say auto: another Ray may run on this machine
+    done = finish(
+        "gridsim-evolve", "--address", address, "--workers", "1", "--population", "16", "--generations", "1",
+        "--elites", "2", "--name", "composed", cwd=services.folder, **environment,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((services.folder / "runs/composed/summary.json").read_text())
+    assert summary["workers"] == 1
+    assert summary["mlflow_run_id"], "the server has it"
+    refused = finish(
+        "gridsim-evolve", "--address", address, "--workers", "1", "--name", "refused", cwd=services.folder,
+        **{**environment, "RAY_AUTH_TOKEN": "f" * 64},
+    )  # fmt: skip
+    assert refused.returncode != 0, "with another token nobody is let in"
