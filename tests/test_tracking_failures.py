@@ -16,7 +16,7 @@ import time
 import pytest
 from tracked import client, row, steps, tracker
 
-from cluster.tracking import TrackingError, check_uri
+from cluster.tracking_address import TrackingError, check_uri
 
 # ---------------------------------------------------------------------------------------------- what goes wrong
 

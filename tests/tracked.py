@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from cluster import tracking
-from cluster.tracking import Tracker
+from cluster.tracker import Tracker
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}
@@ -17,7 +17,7 @@ def row(step):
 
 def client(uri):
     """MLflow's own."""
-    tracking._silence()
+    tracking.quiet()
     from mlflow.tracking import MlflowClient
 
     return MlflowClient(tracking_uri=uri)
