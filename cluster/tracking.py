@@ -293,7 +293,7 @@ def _note_tags(text: str) -> dict[str, str]:
 def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, Any]) -> None:
     """Write a torch module as MLflow's model: graph and weights (`pt2`), signature and input example.
 
-    Args: the folder, which is replaced as a whole; a torch.nn.Module; its input, float32 [n, inputs] with n of 2 or
+    Args: the folder, which is replaced as a whole; a torch.nn.Module without gradients; its input, float32 [n, inputs] with n of 2 or
     more, so that any number may be given to what is written; what else the model shall tell of itself.
     """
     quiet()
@@ -304,7 +304,7 @@ def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, A
     built = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
     shutil.rmtree(built, ignore_errors=True)
     try:
-        with warnings.catch_warnings(), torch.no_grad():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch's and MLflow's own making
             mlflow.pytorch.save_model(
                 module,

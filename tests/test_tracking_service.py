@@ -109,7 +109,7 @@ def check_complete(served, name):
 
 
 def test_a_run_outlives_an_outage_and_loses_nothing(served):
-    out, err = served.said["during"]
+    _out, err = served.said["during"]
     assert (served.codes["during"], err) == (0, "")
     assert 0 < served.there["during"] < GENERATIONS
     run = check_complete(served, "during")
@@ -118,7 +118,7 @@ def test_a_run_outlives_an_outage_and_loses_nothing(served):
 
 
 def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
-    out, err = served.said["after"]
+    _out, err = served.said["after"]
     assert served.codes["after"] == 0
     assert re.fullmatch(
         rf"{COMMAND}: warning: not logged to MLflow at {served.uri}: \d+ rows \(step \d+ to {GENERATIONS - 1}\), "
