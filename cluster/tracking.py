@@ -293,16 +293,17 @@ def _note_tags(text: str) -> dict[str, str]:
 def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, Any]) -> None:
     """Write a torch module as MLflow's model: graph and weights (`pt2`), signature and input example.
 
-    Args: the folder, which is replaced as a whole; a torch.nn.Module without gradients; its input, float32 [n, inputs] with n of 2 or
-    more, so that any number may be given to what is written; what else the model shall tell of itself.
+    Args: the folder, which is replaced as a whole; a torch.nn.Module without gradients; an input of it, float32 [n,
+    inputs] with n of 2 or more, so that any number may be given to what is written; what else it shall say of itself.
     """
     quiet()
     import mlflow.pytorch
     import torch
     from mlflow.models import infer_signature
 
+    for left_behind in folder.parent.glob(f".{folder.name}.*.tmp"):
+        shutil.rmtree(left_behind, ignore_errors=True)
     built = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    shutil.rmtree(built, ignore_errors=True)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of torch's and MLflow's own making

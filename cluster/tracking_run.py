@@ -50,7 +50,7 @@ def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
 
 def title(name: str, settings: RunSettings) -> str:
     """MLflow's name of a run: its folder's, and what that does not say and sets it apart."""
-    words = "" if name.startswith(what(settings)) else f": {what(settings)}"
+    words = "" if f"{name}-".startswith(f"{what(settings)}-") else f": {what(settings)}"
     more = unusual(settings)
     parts = [str(more["policy"])] if "policy" in more else []
     parts += [f"{settings.traffic} cars"] if "traffic" in more else []
