@@ -5,9 +5,9 @@ calls in its own thread and never lets a run wait.
 
 Models are written here and never read: GridSim drives `champion.npz` (`checkpoint.load`: arrays and a checksum, no
 pickle) and loads nothing from MLflow, whoever may write to the server. What is written is `torch.export`'s graph with
-its weights, MLflow's format `pt2`, never a pickled module. Who loads one in a program of his own calls
-`mlflow.pytorch.load_model`, which refuses an archive with anything but tensors in it, and any pickled model, as long as
-MLFLOW_ALLOW_PICKLE_DESERIALIZATION is not set.
+its weights, MLflow's format `pt2`, never a pickled module. But `mlflow.pytorch.load_model`, in a program of the user's
+own, runs whatever a model's maker has put into it, in either format, unless MLFLOW_ALLOW_PICKLE_DESERIALIZATION is
+`false`: then it refuses all but plain tensors. Models that were written here load with it.
 """
 
 import contextlib
@@ -44,6 +44,7 @@ MODEL = "model"
 
 # Only where the user has not decided otherwise. MLflow's own retries would go on for minutes; ours replace them.
 _ENVIRONMENT = {
+    "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
     "MLFLOW_CONFIGURE_LOGGING": "false",
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",

@@ -4,13 +4,15 @@ import io
 import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 import zipfile
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tracked import client, drive, row, steps, tracker
+from tracked import client, drive, row, steps, tracker, with_path
 
 from cluster.champion import Champion, load_champion
 from cluster.settings import EvolveSettings
@@ -43,7 +45,7 @@ def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
     import mlflow.pytorch
     from mlflow.models import Model
 
-    monkeypatch.delenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", raising=False)
+    monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
     folder, inputs = tmp_path / "model", PolicySpec.parse(policy).inputs
     module = written(folder, policy)
     assert os.listdir(tmp_path) == ["model"]
@@ -55,8 +57,8 @@ def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
         x = torch.rand((n, inputs), generator=torch.Generator().manual_seed(n))
         assert torch.allclose(loaded(x), module(x), atol=1e-5)
     about = Model.load(str(folder))
-    assert about.signature.inputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": [-1, inputs]}
-    assert about.signature.outputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": [-1, 8]}
+    assert about.signature.inputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, inputs)}
+    assert about.signature.outputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, 8)}
     shown = np.asarray(about.load_input_example(str(folder)), dtype=np.float32)
     assert shown == pytest.approx(example(PolicySpec.parse(policy), SimConfig()))
 
@@ -97,17 +99,21 @@ def poisoned(model, evil):
 
 @pytest.mark.e2e
 def test_a_hostile_model_is_refused_where_users_load_models(tmp_path, monkeypatch):
-    """GridSim loads none; this is what its docs promise of `mlflow.pytorch.load_model`."""
+    """GridSim loads none; this is what its docs say of `mlflow.pytorch.load_model`, which users call."""
     import mlflow.pytorch
     from mlflow.exceptions import MlflowException
 
-    monkeypatch.delenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", raising=False)
+    monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
     written(tmp_path / "model", "mlp:6,7")
     poisoned(tmp_path / "model/data/model.pt2", Evil(str(tmp_path / "touched")))
     with pytest.raises(MlflowException, match="disallowed"):
         mlflow.pytorch.load_model(str(tmp_path / "model"))
     assert saved_champion(tmp_path / "model") == "abc"  # what GridSim looks at
     assert not (tmp_path / "touched").exists()
+    script = "import sys, mlflow.pytorch; mlflow.pytorch.load_model(sys.argv[1])"
+    usual = with_path(MLFLOW_ALLOW_PICKLE_DESERIALIZATION="true")
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "model")], env=usual, capture_output=True)
+    assert (tmp_path / "touched").exists()  # so that the test knows it if the poison has lost its power
 
 
 # ---------------------------------------------------------------------------------------------- registered
@@ -149,7 +155,7 @@ def test_a_champion_is_registered_once(uri, tmp_path):
     assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns == before
     assert logged(uri, folder, seed=2) == (run_id, None)  # it was extended, and has another champion
-    assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {"1", "2"}
+    assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {1, 2}
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns != before
 
 
