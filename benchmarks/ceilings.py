@@ -26,7 +26,7 @@ from cluster.pool import Chunk, WorkerPool
 from cluster.ray_pool import RayPool
 from cluster.run import Session, make_tracker, new_run
 from cluster.settings import EvolveSettings
-from cluster.tracking import check_uri
+from cluster.tracking_address import check_uri
 from cluster.worker import Task, Worker
 from evolution.breeding import RECIPE, Mutation, breed
 from evolution.genetic import Genetic, GeneticConfig

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from cluster.learning import Maps
     from cluster.pool import WorkerPool
     from cluster.run import RunFolder
-    from cluster.tracking import Tracker
+    from cluster.tracker import Tracker
+    from cluster.tracking import Status
     from cluster.warm import Warming
 
 T = TypeVar("T")
@@ -312,7 +313,7 @@ def settings_of(flags: Flags) -> RunSettings:
 
 
 def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
-    from cluster import tracking
+    from cluster.tracking_address import TrackingError, check_uri
 
     prog = kind.command
     console = Console()
@@ -325,16 +326,17 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         from gridsim.config import SimConfig
 
         if is_finished(run):
+            from cluster.late import send
+
             first = kind.counts[0]
-            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; nothing to do.", soft_wrap=True)  # type: ignore[index]
+            sent, lost = send(run, flags.tracking_uri, flags.experiment)
+            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
+            if lost:
+                print(f"{prog}: warning: {lost}", file=sys.stderr)
             return 0
         saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
-        uri = tracking.check_uri(flags.tracking_uri or saved or None)
-    except UsageError as error:
-        fail(prog, str(error))
-    except SettingsError as error:
-        fail(prog, str(error))
-    except tracking.TrackingError as error:
+        uri = check_uri(flags.tracking_uri or saved or None)
+    except (UsageError, SettingsError, TrackingError) as error:
         fail(prog, str(error))
 
     made = _make_folder(prog, run)
@@ -355,7 +357,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         fail(prog, str(error))
 
     tracker = make_tracker(run, uri, flags.experiment)
-    status: tracking.Status = "FAILED"
+    status: Status = "FAILED"
     code = FAILED
     message = ""
     again = f"continue with: {prog} --resume {_shown(run.path)}"
@@ -384,7 +386,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
             maps.close()
             lost = tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
     if lost:
-        print(f"{prog}: warning: {lost}", file=sys.stderr)
+        later = f"; send it later with: {prog} --resume {_shown(run.path)}" if status == "FINISHED" else ""
+        print(f"{prog}: warning: {lost}{later}", file=sys.stderr)
     resumable = (run.path / "checkpoint.npz").is_file()
     if status == "KILLED":
         where = again if resumable else f"no {kind.counts[0]} was done yet"

@@ -40,7 +40,7 @@ from evolution.policy import Observation
 from gridsim.scenarios import REGISTRY
 
 if TYPE_CHECKING:
-    from cluster.tracking import Tracker
+    from cluster.tracker import Tracker
 
 PROG = "gridsim-compare"
 TABLE, ROWS, PICTURE, ROUTE = "table.md", "table.csv", "comparison.png", "route.png"
@@ -122,6 +122,8 @@ def compare_main() -> None:
 
 
 def _compare(arguments: Sequence[str]) -> int:
+    from cluster.tracking_address import TrackingError, check_uri
+
     flags = parse(CompareFlags, PROG, arguments)
     if flags.quick and not flags.resume:
         flags = parse(CompareFlags, PROG, arguments, CompareFlags(seeds=QUICK_SEEDS, budget=QUICK_BUDGET))
@@ -131,13 +133,11 @@ def _compare(arguments: Sequence[str]) -> int:
             return _existing(console, flags)
         folder, flags = _prepare(arguments, flags)
         cells = folder.cells()
-        from cluster import tracking
-
-        uri = tracking.check_uri(flags.tracking_uri or None)
+        uri = check_uri(flags.tracking_uri or None)
         experiment.hold(folder.path)
     except (ExperimentError, CheckpointError) as error:
         fail(PROG, str(error))
-    except tracking.TrackingError as error:
+    except TrackingError as error:
         fail(PROG, str(error))
     return _experiment(console, folder, cells, flags, uri)
 
@@ -187,7 +187,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str) -> int:
     """Train what is not finished, and write what can be said of what is."""
     from cluster.cells import Cells
-    from cluster.tracking import TrackingError
+    from cluster.tracking_address import TrackingError
 
     left = [cell for cell in cells if not cell.finished()]
     status, code = "FAILED", FAILED
@@ -251,7 +251,7 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
 
 def _tracker(folder: ComparisonFolder, uri: str, name: str) -> Tracker:
     """MLflow's parent run."""
-    from cluster.tracking import Tracker
+    from cluster.tracker import Tracker
 
     params = {key: " ".join(v) if isinstance(v, list) else str(v) for key, v in folder.plan.to_dict().items()}
     tags = {"algorithm": "comparison"}

@@ -25,14 +25,15 @@ from typing import Any
 
 import numpy as np
 
-from cluster import checkpoint
+from cluster import checkpoint, tracking_run
 from cluster.champion import Champion
 from cluster.checkpoint import CheckpointError
 from cluster.coordinator import Evolution
 from cluster.learning import Learning, Maps, held_out_episodes, now
 from cluster.pool import WorkerPool
 from cluster.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
-from cluster.tracking import Tracker, TrackingError, git_commit
+from cluster.tracker import Tracker
+from cluster.tracking_address import TrackingError
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
 from gridsim.maps import map_digest
@@ -163,8 +164,7 @@ def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init
     """A new run's folder, checked but not yet made. Raises RunError."""
     if not name:
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        road = re.sub(r"[^\w.+=@-]", "_", label(settings.scenario))
-        name = f"{road}-{settings.algorithm}-s{settings.seed}-{stamp}"
+        name = f"{tracking_run.what(settings)}-{stamp}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
@@ -234,14 +234,15 @@ class Session:
     def __post_init__(self) -> None:
         self.learning = new_learning(self.run.settings, self.pool, self.maps, self.initial, self.on_progress)
         self._digest = self.run.digest()
+        self._bests = tracking_run.Bests()
         if self.run.saved is not None:
             self.learning.restore(*self.run.saved)
 
     def learn(self) -> None:
         """Learn to the end, saving after every step."""
         learning = self.learning
-        for step, past in enumerate(learning.history):
-            self._log(step, past)  # what MLflow has is skipped
+        for step, past in enumerate(learning.history):  # what MLflow has is skipped
+            self._log(step, past, learning.wall_before_s - past["wall_s"])
         if learning.history:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
         learning.meanwhile, learning.out_of_time = self._save_last, self._out_of_time
@@ -274,8 +275,9 @@ class Session:
             self._unsaved = False
             self._log(learning.steps - 1, learning.history[-1])
 
-    def _log(self, step: int, row: dict[str, float]) -> None:
-        self.tracker.log_row(step, {name: row[name] for name in self.learning.columns if name not in NOT_LOGGED})
+    def _log(self, step: int, row: dict[str, float], ago_s: float = 0.0) -> None:
+        metrics = {name: row[name] for name in self.learning.columns if name not in NOT_LOGGED}
+        self.tracker.log_row(step, metrics | self._bests(row), ago_s)
 
     def save(self) -> None:
         """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
@@ -319,6 +321,7 @@ class Session:
             scenario, states, path / "trajectory.png",
             f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
+        self.tracker.log_model(path, tracking_run.torch_model(champion, settings, figures))  # while it is filmed
         if self.film:
             self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
         wall = self._wall_s()
@@ -338,8 +341,8 @@ class Session:
             "solved": learning.solved,
             "held_out": figures,
         }
-        self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
-        self.write_summary(summary)
+        self.tracker.log_summary(tracking_run.held_out_metrics(figures))
+        write_summary(self.run.path, summary)
         return summary
 
     def complete(self, workers: int, note: Callable[[str], None]) -> dict[str, Any]:
@@ -350,7 +353,8 @@ class Session:
         if not summary["mlflow_run_id"]:
             with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
                 summary["mlflow_run_id"] = self.tracker.wait_ready(30.0)
-        self.write_summary(summary)
+        write_summary(self.run.path, summary)
+        self.tracker.describe(tracking_run.describe(self.run, summary))
         self.tracker.log_artifacts(self.run.path)
         return summary
 
@@ -367,31 +371,21 @@ class Session:
             (self.run.path / VIDEO).unlink(missing_ok=True)
             self.lost = f"no {VIDEO}: {error}"
 
-    def write_summary(self, summary: dict[str, Any]) -> None:
-        """Write summary.json, the mark of a finished run."""
-        checkpoint.write_atomic(self.run.path / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
 
-
-def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "") -> Tracker:
-    """The run's tracker, not yet started; `parent_id` is MLflow's run that it belongs to."""
-    settings = run.settings
+def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:
+    """The run's tracker, not yet started; `parent_id` is MLflow's run that it belongs to. `more` is the Tracker's."""
     known = run.saved[1]["tracking"] if run.saved else {}
-    params = {name: str(value) for name, value in to_dict(settings).items()}
-    params |= {f"curriculum/{k}": str(v) for k, v in dataclasses.asdict(settings.curriculum()).items()}
-    for part, values in dataclasses.asdict(SimConfig()).items():
-        params |= {f"{part}/{k}": str(v) for k, v in values.items()}
-    tags = {
-        "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
-        "search": settings.algorithm,
-        "scenario": settings.scenario,
-        "seed": str(settings.seed),
-        "git_commit": git_commit(),
-    } | ({"mlflow.parentRunId": parent_id} if parent_id else {})
+    tags = tracking_run.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(
-        uri, experiment, run.name, params, tags,
+        uri, experiment, tracking_run.title(run.name, run.settings), tracking_run.params(run.settings), tags,
         run_id=known.get("run_id") if known.get("uri") == uri else None,
-        key=run.tracking_key, start=False,
+        key=run.tracking_key, start=False, note=tracking_run.describe(run), **more,
     )  # fmt: skip
+
+
+def write_summary(folder: Path, summary: dict[str, Any]) -> None:
+    """Write summary.json, the mark of a finished run."""
+    checkpoint.write_atomic(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
 
 
 def read_history(path: Path) -> list[dict[str, float]]:

@@ -40,7 +40,8 @@ def root() -> Path:
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
-    from cluster.tracking import Tracker, check_uri
+    from cluster.tracker import Tracker
+    from cluster.tracking_address import check_uri
 
     folder = tmp_path_factory.mktemp("mlflow")
     begun = Tracker(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {})
@@ -53,7 +54,7 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def uri(empty_database: Path, tmp_path: Path) -> str:
     """MLflow's address of a database that holds nothing but the experiment `other`."""
-    from cluster.tracking import check_uri
+    from cluster.tracking_address import check_uri
 
     (tmp_path / "store").mkdir()
     shutil.copy(empty_database, tmp_path / "store" / "mlflow.db")
@@ -63,12 +64,12 @@ def uri(empty_database: Path, tmp_path: Path) -> str:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short pauses of a tracker."""
-    from cluster import tracking
+    from cluster import tracker, tracking_address
 
-    monkeypatch.setattr(tracking, "FLUSH_S", 0.05)
-    monkeypatch.setattr(tracking, "RETRY_S", 0.1)
-    monkeypatch.setattr(tracking, "CHANCE_S", 0.1)
-    monkeypatch.setattr(tracking, "PROBE_S", 0.3)
+    monkeypatch.setattr(tracker, "FLUSH_S", 0.05)
+    monkeypatch.setattr(tracker, "RETRY_S", 0.1)
+    monkeypatch.setattr(tracker, "CHANCE_S", 0.1)
+    monkeypatch.setattr(tracking_address, "PROBE_S", 0.3)
 
 
 @pytest.fixture(scope="session")

@@ -77,6 +77,10 @@ def wait_until(condition, timeout_s=240.0):
         time.sleep(0.05)
 
 
+def content(folder):
+    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+
+
 @pytest.mark.e2e
 def test_a_killed_comparison_goes_on_without_repeating_what_is_finished(tmp_path):
     asked = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--budget", "100M"]
@@ -90,14 +94,14 @@ def test_a_killed_comparison_goes_on_without_repeating_what_is_finished(tmp_path
     finally:
         process.kill()
         process.communicate()
-    before = {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.iterdir()}
+    before = content(first)
     assert "summary.json" in before
 
     process = begin(tmp_path, "--resume", "runs/c", "--workers", "0")
     said, errors = process.communicate(timeout=240)
     assert process.returncode == 0, errors
     assert errors == ""
-    assert {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.iterdir()} == before
+    assert content(first) == before
     rows = list(csv.DictReader(io.StringIO((folder / "table.csv").read_text())))
     assert [(row["learner"], row["run"]) for row in rows] == [
         ("evolution", "curved-evolution-s0"),

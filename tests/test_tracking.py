@@ -13,8 +13,9 @@ import time
 import pytest
 from tracked import NAMES, PARAMS, TAGS, client, row, runs, steps, tracker, with_path
 
-from cluster import tracking
-from cluster.tracking import check_uri, git_commit
+import cluster.commit
+from cluster.commit import git_commit
+from cluster.tracking_address import check_uri
 
 # ---------------------------------------------------------------------------------------------- what is logged
 
@@ -217,7 +218,8 @@ def test_resume_of_a_run_that_was_thrown_away(uri):
 
 RUN = """
 import sys, time
-from cluster.tracking import Tracker, check_uri
+from cluster.tracker import Tracker
+from cluster.tracking_address import check_uri
 tracker = Tracker(check_uri("sqlite:///mlflow.db"), "driving", "a run", {}, {}, key="the-key")
 names = %r
 for step in range(100000):
@@ -260,10 +262,11 @@ def test_killed_at_any_moment_and_resumed(tmp_path, monkeypatch, kills):
 
 QUIET = """
 import sys, time
-from cluster import tracking
+from cluster.tracker import Tracker
+from cluster.tracking_address import check_uri
 assert not [name for name in ("mlflow", "sqlalchemy", "requests") if name in sys.modules]
 started = time.perf_counter()
-tracker = tracking.Tracker(tracking.check_uri(sys.argv[1]), "driving", "a run", {}, {})
+tracker = Tracker(check_uri(sys.argv[1]), "driving", "a run", {}, {})
 for step in range(20):
     tracker.log_row(step, {"a": 1.0})
 assert time.perf_counter() - started < 0.3
@@ -325,7 +328,7 @@ def test_git_commit(tmp_path, monkeypatch):
         return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.strip()
 
     def told(folder, **environment):
-        script = "from cluster.tracking import git_commit; print(git_commit())"
+        script = "from cluster.commit import git_commit; print(git_commit())"
         environment = {**os.environ, "PYTHONPATH": str(folder), **environment}
         done = subprocess.run([sys.executable, "-c", script], cwd="/", env=environment, capture_output=True, text=True)
         assert done.stderr == ""
@@ -334,7 +337,7 @@ def test_git_commit(tmp_path, monkeypatch):
     for place in ("repository", "repository/.venv/site-packages", "outside"):
         (tmp_path / place / "cluster").mkdir(parents=True)
         (tmp_path / place / "cluster" / "__init__.py").touch()
-        shutil.copy(tracking.__file__, tmp_path / place / "cluster")
+        shutil.copy(cluster.commit.__file__, tmp_path / place / "cluster")
     assert told(tmp_path / "outside") == "unknown"
     git("init")
     assert told(tmp_path / "repository") == "unknown"

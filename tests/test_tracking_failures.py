@@ -5,18 +5,16 @@ import http.server
 import os
 import re
 import shutil
-import signal
 import socket
 import sqlite3
 import subprocess
-import sys
 import threading
 import time
 
 import pytest
-from tracked import client, row, steps, tracker
+from tracked import client, free_port, mlflow_server, row, steps, tracker
 
-from cluster.tracking import TrackingError, check_uri
+from cluster.tracking_address import TrackingError, check_uri
 
 # ---------------------------------------------------------------------------------------------- what goes wrong
 
@@ -58,6 +56,37 @@ def test_a_database_that_is_locked_for_a_while(uri, impatient):
     assert steps(uri, logged.run_id) == [0]
 
 
+def test_a_disk_that_is_full_for_a_while(empty_database, tmp_path, impatient):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)], capture_output=True).returncode:
+        pytest.skip("mounting a small disk takes root's rights")
+    try:
+        shutil.copy(empty_database, disk / "mlflow.db")
+        (tmp_path / "film.mp4").write_bytes(os.urandom(100_000))
+        logged = tracker(check_uri(f"sqlite:///{disk}/mlflow.db"))
+        logged.log_row(0, row(0))
+        while logged.missing([0]):
+            time.sleep(0.05)
+        with contextlib.suppress(OSError), open(disk / "filler", "wb", buffering=0) as filler:
+            while filler.write(bytes(4096)):
+                pass
+        for step in range(1, 6):
+            logged.log_row(step, row(step))
+        logged.log_files([tmp_path / "film.mp4"])
+        while logged.error is None:
+            time.sleep(0.05)
+        assert re.search("full|disk I/O error|No space left", logged.error)
+        time.sleep(0.5)  # and again, and again
+        (disk / "filler").unlink()
+        assert logged.close("FINISHED", timeout_s=60) is None
+        assert steps(logged.uri, logged.run_id) == list(range(6))
+        stored = disk / "mlartifacts" / logged.run_id / "artifacts/film.mp4"
+        assert stored.read_bytes() == (tmp_path / "film.mp4").read_bytes()
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
 class Silent:
     """A server that takes connections and never says a word."""
 
@@ -90,32 +119,10 @@ def test_a_server_that_says_nothing_is_waited_for_no_longer_than_allowed(silent,
     assert stuck.error == "no answer in time"
 
 
-@contextlib.contextmanager
-def mlflow_server(folder, port):
-    """MLflow's own, with a database and artifacts in `folder`; what is yielded kills it."""
-    command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1", "--port", str(port)]
-    command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
-    with open(folder / "server.log", "a") as log:
-        quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-        server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)
-    try:
-        for _ in range(300):
-            with contextlib.suppress(TrackingError):
-                check_uri(f"http://127.0.0.1:{port}")
-                break
-            time.sleep(0.2)
-        yield lambda: os.killpg(server.pid, signal.SIGKILL)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(server.pid, signal.SIGKILL)
-        server.wait(10)
-
-
 @pytest.mark.e2e
 def test_a_server_that_goes_away_and_comes_back(tmp_path, empty_database, capfd):
     shutil.copy(empty_database, tmp_path / "served.db")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+    port = free_port()
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "summary.json").write_text("{}")
     with mlflow_server(tmp_path, port) as kill:

@@ -1,0 +1,26 @@
+"""Which commit a run was made from."""
+
+import functools
+import os
+import subprocess
+from pathlib import Path
+
+
+@functools.cache
+def git_commit() -> str:
+    """The commit that this code was checked out from; `unknown` outside git (an installed copy, no git, no commit)."""
+    here = Path(__file__).resolve()
+    # A hook's GIT_DIR would lead to another repository.
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here.parent), *arguments]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=5.0, check=True)
+        return done.stdout.strip()
+
+    try:
+        # Installed into a .venv inside somebody else's repository, this file is there but is not tracked.
+        git("ls-files", "--error-unmatch", here.name)
+        return git("rev-parse", "HEAD") or "unknown"
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"

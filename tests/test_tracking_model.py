@@ -1,0 +1,218 @@
+"""The champion as a torch model: written without pickle, read back by MLflow, registered once."""
+
+import io
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import zipfile
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tracked import client, drive, row, steps, tracker, with_path
+
+from cluster.champion import Champion, load_champion
+from cluster.settings import EvolveSettings
+from cluster.tracking import save_model, saved_champion
+from cluster.tracking_run import torch_model
+from evolution.export import example, to_torch
+from evolution.policy import PolicySpec
+from gridsim.config import SimConfig
+
+torch = pytest.importorskip("torch")
+# Of torch's and MLflow's own making; what users see is held against silence in fresh processes.
+pytestmark = pytest.mark.filterwarnings("ignore")
+
+HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mps": 7.0, "collision_rate": 0.5}
+NAME = "gridsim-curved-evolution"
+
+
+def written(folder, policy):
+    """A model in `folder`, and the module that it was made from."""
+    spec = PolicySpec.parse(policy)
+    genome = (0.3 * np.random.default_rng(1).standard_normal(spec.size)).astype(np.float32)
+    module = to_torch(spec, genome, SimConfig())
+    save_model(folder, module, example(spec, SimConfig()), {"champion_sha256": "abc"})
+    return module
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:6,7+motion+steering", "cnn:8,8,8@2"])
+def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
+    import mlflow.pytorch
+    from mlflow.models import Model
+
+    monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
+    folder, inputs = tmp_path / "model", PolicySpec.parse(policy).inputs
+    module = written(folder, policy)
+    assert os.listdir(tmp_path) == ["model"]
+    assert saved_champion(folder) == "abc"
+    assert saved_champion(tmp_path) == ""
+
+    loaded = mlflow.pytorch.load_model(str(folder))
+    for n in (1, 2, 7):
+        x = torch.rand((n, inputs), generator=torch.Generator().manual_seed(n))
+        assert torch.allclose(loaded(x), module(x), atol=1e-5)
+    about = Model.load(str(folder))
+    assert about.signature.inputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, inputs)}
+    assert about.signature.outputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, 8)}
+    shown = np.asarray(about.load_input_example(str(folder)), dtype=np.float32)
+    assert shown == pytest.approx(example(PolicySpec.parse(policy), SimConfig()))
+
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files >= {"MLmodel", "data/model.pt2", "requirements.txt", "input_example.json"}
+    assert not [name for name in files if "pickle" in name or name.endswith((".pth", ".pkl"))]
+    assert "cloudpickle" not in (folder / "requirements.txt").read_text()
+
+    second = written(folder, policy)  # in place of the first
+    assert torch.equal(second(x), module(x))
+    assert os.listdir(tmp_path) == ["model"]
+
+
+class Evil:
+    """What a pickle may hold."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (Path(self.path),)
+
+
+def poisoned(model, evil):
+    """Replace the example inputs in a model's archive by a pickle that does as it likes."""
+    record = io.BytesIO()
+    torch.save(evil, record)
+    content = {}
+    with zipfile.ZipFile(model) as archive:
+        for info in archive.infolist():
+            content[info.filename] = archive.read(info)
+    (victim,) = (name for name in content if "sample_inputs" in name)
+    content[victim] = record.getvalue()
+    with zipfile.ZipFile(model, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+
+
+@pytest.mark.e2e
+def test_a_hostile_model_is_refused_where_users_load_models(tmp_path, monkeypatch):
+    """GridSim loads none; this is what its docs say of `mlflow.pytorch.load_model`, which users call."""
+    import mlflow.pytorch
+    from mlflow.exceptions import MlflowException
+
+    monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
+    written(tmp_path / "model", "mlp:6,7")
+    poisoned(tmp_path / "model/data/model.pt2", Evil(str(tmp_path / "touched")))
+    with pytest.raises(MlflowException, match="disallowed"):
+        mlflow.pytorch.load_model(str(tmp_path / "model"))
+    assert saved_champion(tmp_path / "model") == "abc"  # what GridSim looks at
+    assert not (tmp_path / "touched").exists()
+    script = "import sys, mlflow.pytorch; mlflow.pytorch.load_model(sys.argv[1])"
+    usual = with_path(MLFLOW_ALLOW_PICKLE_DESERIALIZATION="true")
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "model")], env=usual, capture_output=True)
+    assert (tmp_path / "touched").exists()  # so that the test knows it if the poison has lost its power
+
+
+# ---------------------------------------------------------------------------------------------- registered
+
+
+def champion_model(seed):
+    genome = np.random.default_rng(seed).standard_normal(PolicySpec.parse("mlp:6,7").size).astype(np.float32)
+    settings = EvolveSettings("curved", seed=seed)
+    return torch_model(Champion(genome, "mlp:6,7", "curved", SimConfig()), settings, HELD_OUT)
+
+
+def logged(uri, folder, seed):
+    """A run that logs a row and a champion; returns its id and what its tracker said in the end."""
+    begun = tracker(uri)
+    begun.log_row(0, row(0))
+    begun.log_model(folder, champion_model(seed))
+    said = begun.close("FINISHED", timeout_s=120)
+    return begun.run_id, said
+
+
+@pytest.mark.e2e
+def test_a_champion_is_registered_once(uri, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    run_id, said = logged(uri, folder, seed=1)
+    assert said is None
+    (version,) = client(uri).search_model_versions(f"name = '{NAME}'")
+    assert version.run_id == run_id
+    assert version.source == (tmp_path / "store/mlartifacts" / run_id / "artifacts/model").as_uri()
+    assert version.tags.items() >= {"seed": "1", "policy": "mlp:6,7", "held_out/success_rate": "0.5"}.items()
+    assert version.tags["champion_sha256"] == champion_model(1).version.champion_sha256
+    assert "seed 1" in version.description
+    stored = {each.path for each in client(uri).list_artifacts(run_id, "model")}
+    assert {"model/MLmodel", "model/data"} <= stored
+    assert client(uri).list_artifacts(run_id, "model/data")[0].path == "model/data/model.pt2"
+
+    before = (folder / "model/data/model.pt2").stat().st_mtime_ns
+    assert logged(uri, folder, seed=1) == (run_id, None)  # a killed run goes on, and ends again
+    assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
+    assert (folder / "model/data/model.pt2").stat().st_mtime_ns == before
+    assert logged(uri, folder, seed=2) == (run_id, None)  # it was extended, and has another champion
+    assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {1, 2}
+    assert (folder / "model/data/model.pt2").stat().st_mtime_ns != before
+
+
+def test_without_torch_everything_else_is_logged(uri, tmp_path):
+    def build():
+        raise ModuleNotFoundError("No module named 'torch'")
+
+    begun = tracker(uri)
+    begun.log_row(0, row(0))
+    begun.log_model(tmp_path, torch_model_with(build))
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/a.png").write_bytes(b"png")
+    begun.log_artifacts(tmp_path / "run")
+    assert begun.close("FINISHED", 60) == f"not logged to MLflow at {uri}: the model: No module named 'torch'"
+    assert steps(uri, begun.run_id) == [0]
+    assert client(uri).get_run(begun.run_id).info.status == "FINISHED"
+    assert [each.path for each in client(uri).list_artifacts(begun.run_id)] == ["a.png"]
+
+
+def torch_model_with(build):
+    from dataclasses import replace
+
+    return replace(champion_model(1), build=build)
+
+
+@pytest.mark.e2e
+def test_without_a_registry_everything_else_is_logged(uri, tmp_path, impatient):
+    with closing(sqlite3.connect(uri.removeprefix("sqlite:///"))) as database:
+        database.execute("ALTER TABLE model_versions RENAME COLUMN run_id TO gone")
+        database.commit()
+    (tmp_path / "run").mkdir()
+    run_id, said = logged(uri, tmp_path / "run", seed=1)
+    assert said.startswith(f"not logged to MLflow at {uri}: the model: ")
+    assert "\n" not in said
+    assert steps(uri, run_id) == [0]
+    assert client(uri).get_run(run_id).info.status == "FINISHED"
+    assert "model" in {each.path for each in client(uri).list_artifacts(run_id)}
+
+
+def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):
+    begun = tracker(uri)
+    begun.wait_ready()
+    begun.log_model(tmp_path, champion_model(1))
+    assert begun.close("KILLED", timeout_s=120) is None
+    assert client(uri).search_model_versions() == []
+
+
+# ---------------------------------------------------------------------------------------------- a fresh process
+
+
+@pytest.mark.e2e
+def test_the_model_drives_2_km_as_the_champion_does(root, tmp_path, uri):
+    champion = load_champion(root / "benchmarks/champion.npz")
+    shutil.copy(root / "benchmarks/champion.npz", tmp_path)
+    spec = PolicySpec.parse(champion.policy)
+    save_model(tmp_path / "model", to_torch(spec, champion.genome, champion.sim), example(spec, champion.sim), {})
+    count, end, distance = drive(uri, str(tmp_path / "model"), tmp_path / "champion.npz", 0)
+    assert end == "success"
+    assert distance >= 2000.0
+    assert count > 1500

@@ -1,0 +1,99 @@
+"""What MLflow is told of a run: names that tell runs apart, tags that put seeds together, figures that are the best."""
+
+import pytest
+
+from cluster.run import new_run
+from cluster.settings import DqnSettings, EvolveSettings
+from cluster.tracking_run import Bests, describe, group, model_name, params, tags, title
+
+SUMMARY = {
+    "generations": 48,
+    "car_steps": 96_300_000,
+    "wall_s": 57.2,
+    "solved": True,
+    "held_out": {
+        "episodes": 64,
+        "success_rate": 0.984,
+        "distance_m": 2000.2,
+        "speed_mps": 7.61,
+        "collision_rate": 0.016,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "shown"),
+    [
+        (
+            "curved-evolution-s3-20260101-120000",
+            EvolveSettings("curved", seed=3),
+            "curved-evolution-s3-20260101-120000",
+        ),
+        ("mine", EvolveSettings("curved", seed=3), "mine: curved-evolution-s3"),
+        ("mine", EvolveSettings("curved", traffic=2, search="random"), "mine: curved-random-s0 2 cars"),
+        ("mine", EvolveSettings("highway", traffic=8), "mine: highway-evolution-s0"),
+        ("seamless-dqn-s1-x", DqnSettings(seed=1, policy="mlp:64,64"), "seamless-dqn-s1-x mlp:64,64"),
+        ("big", DqnSettings(observation="grid", batch=64), "big: seamless-dqn-s0"),
+    ],
+)
+def test_a_runs_name_says_what_it_is(name, settings, shown):
+    assert title(name, settings) == shown
+
+
+def test_the_default_folders_name_is_title_enough(tmp_path):
+    run = new_run(tmp_path, "", EvolveSettings("city", seed=7))
+    assert run.name.startswith("city-evolution-s7-")
+    assert title(run.name, run.settings) == run.name
+
+
+def test_seeds_are_one_group_and_nothing_else_is():
+    def of(kind=EvolveSettings, **settings):
+        return group(kind("curved", **settings))
+
+    assert of() == of(seed=1) == of(generations=5) == "curved evolution mlp:6,7"
+    others = [
+        of(population=64), of(policy="mlp:8"), of(traffic=3), of(search="random"), of(observation="grid"),
+        of(sigma=0.1), of(DqnSettings), of(DqnSettings, double=False), of(DqnSettings, observation="grid"),
+    ]  # fmt: skip
+    assert len({of(), *others}) == 1 + len(others)
+    assert of(population=64, sigma=0.1) == "curved evolution mlp:6,7, population 64, sigma 0.1"
+    assert of(DqnSettings, observation="grid") == "curved dqn cnn:16,32,256@4"
+    assert of(search="random", traffic=3) == "curved random mlp:6,7 3 cars"
+
+
+def test_tags_and_params_name_everything():
+    found = tags(EvolveSettings("highway", seed=4, search="random"))
+    assert found.items() >= {
+        "algorithm": "evolution", "search": "random", "scenario": "highway", "seed": "4", "policy": "mlp:6,7",
+        "observation": "rays", "traffic": "8", "group": "highway random mlp:6,7 8 cars",
+    }.items()  # fmt: skip
+    assert tags(DqnSettings())["algorithm"] == "dqn"
+    assert params(EvolveSettings()).items() >= {"population": "512", "vehicle/wheelbase": "2.5"}.items()
+    assert model_name(EvolveSettings("curved")) == "gridsim-curved-evolution"
+
+
+def test_best_figures_are_told_when_they_are_reached():
+    bests = Bests()
+    rows = [
+        {"fitness/best": 0.5, "distance_m/best": 10.0, "validation/success_rate": 0.0, "loss": 1.0},
+        {"fitness/best": 0.4, "distance_m/best": 12.0, "validation/success_rate": 0.0, "loss": 0.5},
+        {"fitness/best": float("nan"), "distance_m/best": 12.0, "validation/success_rate": 0.0},
+        {"fitness/best": 0.6, "distance_m/best": 11.0, "validation/success_rate": 0.25},
+    ]
+    assert [bests(row) for row in rows] == [
+        {"best_fitness": 0.5, "best_distance_m": 10.0, "best_success_rate": 0.0},
+        {"best_distance_m": 12.0},
+        {},
+        {"best_fitness": 0.6, "best_success_rate": 0.25},
+    ]
+
+
+def test_the_description_says_what_came_of_it_and_how_to_watch_it(tmp_path):
+    run = new_run(tmp_path, "mine", EvolveSettings("curved", seed=3, traffic=2))
+    begun, done = describe(run), describe(run, SUMMARY)
+    assert begun.splitlines()[0] == done.splitlines()[0]
+    assert begun.startswith("Evolution of a `mlp:6,7` driver on **curved**, among 2 cars, seed 3.")
+    for words in ("48 generations, 96.3 million car-steps and 57 s", "**98.4%**", "7.61 m/s", "collides in 1.6%",
+                  f"gridsim-watch {tmp_path}/mine", "champion.mp4", "float32 [n, 32]", "gridsim-curved-evolution",
+                  'load_model("runs:/{run_id}/model")'):  # fmt: skip
+        assert words in done
