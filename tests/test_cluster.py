@@ -160,7 +160,7 @@ def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytes
 # --- Two hosts -------------------------------------------------------------------------------------------------------
 
 RAY = BIN / "ray"
-RUN = ["--scenario", "curved", "--traffic", "0", "--population", "64", "--generations", "12", "--seed", "3"]
+RUN = ["--scenario", "curved", "--traffic", "2", "--population", "64", "--generations", "12", "--seed", "3"]
 UP_S = 300.0  # for what takes half a minute on a quiet machine
 
 
