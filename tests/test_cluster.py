@@ -196,7 +196,7 @@ class Machines:
         config = read(root, "local")
         config["provider"].update(head_ip=self.head.address, worker_ips=[self.worker.address])
         config["auth"]["ssh_user"] = "root"
-        config["setup_commands"] = config["setup_commands"][:1]
+        config["setup_commands"] = config["setup_commands"][:2]
         config["head_setup_commands"] = []
         for which in ("head", "worker"):
             config[f"{which}_start_ray_commands"][-1] += " --num-cpus=1 --object-store-memory=100000000"
@@ -244,7 +244,7 @@ def test_a_run_on_two_hosts(reference: Path, up: Machines) -> None:
     found = up.worker.start(RAY.with_name("python"), "-c", "import gridsim.config")
     assert "No module named 'gridsim.config'" in found.finish(60, code=1), "it has no GridSim"
     command = shlex.join(["--address", "auto", "--workers", "2", "--name", "n", *RUN])
-    run = up.laptop.start(RAY, "exec", up.config, f"~/.gridsim/bin/gridsim-evolve {command}")
+    run = up.laptop.start(RAY, "exec", up.config, f"gridsim-evolve {command}")
     on_both = wait_until(
         lambda: all(ray_workers(host.pid) for host in (up.head, up.worker)) or run.process.poll() is not None, UP_S
     )
@@ -271,7 +271,7 @@ def test_the_same_run_as_a_job(reference: Path, up: Machines) -> None:
         pytest.skip(f"needs pip install 'ray[default]' ({', '.join(packages)})")
     tunnel = up.laptop.start(RAY, "dashboard", up.config)
     wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S)
-    command = ["~/.gridsim/bin/gridsim-evolve", "--workers", "2", "--name", "j", "--output", "~/runs", *RUN]
+    command = ["gridsim-evolve", "--workers", "2", "--name", "j", "--output", "~/runs", *RUN]
     where = ["--tracking-uri", "sqlite:///$HOME/jobs.db"]  # `~` and `$HOME` are the head's
     job = [RAY, "job", "submit", "--address", "http://127.0.0.1:8265", "--", *command, *where]
     up.laptop.run(*job, timeout=UP_S, RAY_AUTH_MODE="token")
