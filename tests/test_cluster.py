@@ -160,7 +160,7 @@ def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytes
 # --- Two hosts -------------------------------------------------------------------------------------------------------
 
 RAY = BIN / "ray"
-RUN = ["--scenario", "curved", "--traffic", "2", "--population", "64", "--generations", "12", "--seed", "3"]
+RUN = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "8", "--seed", "5"]
 UP_S = 300.0  # for what takes half a minute on a quiet machine
 
 
@@ -234,7 +234,7 @@ def up(machines: Machines, root: Path) -> Machines:
     laptop.run(RAY, "get-auth-token", "--generate")
     laptop.run(RAY, "up", "--yes", "--no-config-cache", machines.config, cwd=root, timeout=UP_S)
     print(f"the head is up after {time.monotonic() - began:.0f} s")
-    wait_until(lambda: any("raylet" in process for process in machines.worker.processes()), UP_S)
+    wait_until(lambda: any("raylet" in process for process in machines.worker.processes()), UP_S, 0.5)
     print(f"the worker is up after {time.monotonic() - began:.0f} s")
     return machines
 
@@ -246,7 +246,9 @@ def test_a_run_on_two_hosts(reference: Path, up: Machines) -> None:
     command = shlex.join(["--address", "auto", "--workers", "2", "--name", "n", *RUN])
     run = up.laptop.start(RAY, "exec", up.config, f"gridsim-evolve {command}")
     on_both = wait_until(
-        lambda: all(ray_workers(host.pid) for host in (up.head, up.worker)) or run.process.poll() is not None, UP_S
+        lambda: all(ray_workers(host.pid) for host in (up.head, up.worker)) or run.process.poll() is not None,
+        UP_S,
+        pause=0.5,
     )
     output = run.finish(UP_S)
     assert on_both is True, output
@@ -270,10 +272,9 @@ def test_the_same_run_as_a_job(reference: Path, up: Machines) -> None:
     if packages := lacking():
         pytest.skip(f"needs pip install 'ray[default]' ({', '.join(packages)})")
     tunnel = up.laptop.start(RAY, "dashboard", up.config)
-    wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S)
-    command = ["gridsim-evolve", "--workers", "2", "--name", "j", "--output", "~/runs", *RUN]
-    where = ["--tracking-uri", "sqlite:///$HOME/jobs.db"]  # `~` and `$HOME` are the head's
-    job = [RAY, "job", "submit", "--address", "http://127.0.0.1:8265", "--", *command, *where]
+    wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
+    command = ["gridsim-evolve", "--workers", "2", "--name", "j", *RUN]
+    job = [RAY, "job", "submit", "--address", "http://127.0.0.1:8265", "--", *command]
     up.laptop.run(*job, timeout=UP_S, RAY_AUTH_MODE="token")
     wait_until(lambda: (reference / "summary.json").exists(), UP_S)
     assert summary(up.head.home / "runs/j")["champion_sha256"] == summary(reference)["champion_sha256"]
