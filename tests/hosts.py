@@ -90,8 +90,9 @@ class Command:
             self.process.wait(timeout)
         finally:
             self.process.kill()
+            self.process.wait()
             output = self.log.read_text(errors="replace")
-        assert self.process.returncode == code, f"{self.process.args} ended with {self.process.returncode}:\n{output}"
+        assert self.process.returncode == code, f"{self.process.args!r} ended with {self.process.returncode}:\n{output}"
         return output
 
 

@@ -152,8 +152,8 @@ def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytes
     for submitted in (None, {}, {"working_dir": "gcs://w.zip"}):
         monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps({"runtime_env": submitted, "metadata": {}}))
         assert shipping.runtime_env() == alone
-    submitted = {"py_modules": ["gcs://mine.zip"]}
-    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps({"runtime_env": submitted}))
+    brought = {"runtime_env": {"py_modules": ["gcs://mine.zip"]}}
+    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps(brought))
     assert shipping.runtime_env()["py_modules"] == [*alone["py_modules"], "gcs://mine.zip"]
 
 
@@ -272,13 +272,15 @@ def test_the_same_run_as_a_job(reference: Path, up: Machines) -> None:
     if packages := lacking():
         pytest.skip(f"needs pip install 'ray[default]' ({', '.join(packages)})")
     tunnel = up.laptop.start(RAY, "dashboard", up.config)
-    wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
-    command = ["gridsim-evolve", "--workers", "2", "--name", "j", *RUN]
-    job = [RAY, "job", "submit", "--address", "http://127.0.0.1:8265", "--", *command]
-    up.laptop.run(*job, timeout=UP_S, RAY_AUTH_MODE="token")
+    try:
+        wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
+        job = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "gridsim-evolve", "--workers", 2]
+        up.laptop.run(RAY, *job, "--name", "j", *RUN, timeout=UP_S, RAY_AUTH_MODE="token")
+    finally:
+        tunnel.process.kill()
+        tunnel.process.wait()
     wait_until(lambda: (reference / "summary.json").exists(), UP_S)
     assert summary(up.head.home / "runs/j")["champion_sha256"] == summary(reference)["champion_sha256"]
-    tunnel.process.kill()
 
 
 @pytest.mark.e2e

@@ -224,8 +224,8 @@ def test_sigterm_is_seen_while_ray_waits(pool: RayPool, folder: Path) -> None:
     pool.evaluate(make_task(), make_recipes(4))  # they are up
     (folder / "sleep-100").write_text("3")
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
     with pytest.raises(Stopped), stoppable():
-        timer.start()
         pool.evaluate(make_task(), make_recipes(512))
 
 
