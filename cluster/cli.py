@@ -168,6 +168,8 @@ def stoppable() -> Iterator[None]:
     before = signal.signal(signal.SIGTERM, stop)
     try:
         yield
+    except SystemError as error:  # what Ray makes of it where it waits
+        raise error.__cause__ or error from None
     finally:
         signal.signal(signal.SIGTERM, before)
 
@@ -362,7 +364,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
     message = ""
     again = f"continue with: {prog} --resume {_shown(run.path)}"
     try:
-        message = _run(console, run, pool, maps, tracker, flags, started, warming)
+        with stoppable():
+            message = _run(console, run, pool, maps, tracker, flags, started, warming)
         status, code = "FINISHED", 0
     except KeyboardInterrupt:
         status, code = "KILLED", INTERRUPTED

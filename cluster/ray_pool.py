@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from cluster import shipping
 from cluster.pool import (
     FINER,
     METRE_S,
@@ -459,7 +460,9 @@ def _join(address: str) -> None:
         with contextlib.suppress(ImportError, AttributeError):  # what Ray does where it is asked to find the cluster
             setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
             setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
-    ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+    with environment(shipping.ENVIRONMENT):
+        env = shipping.runtime_env()
+        ray.init(address=address, runtime_env=env, log_to_driver=False, logging_level=logging.CRITICAL)
 
 
 @contextlib.contextmanager

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core.caching import UserProvidedCacheLocator
 
 # Packages whose files may hold kernels; all their sources count, so that nobody has to keep a list in step.
 KERNEL_PACKAGES = ("gridsim", "evolution")
@@ -57,6 +58,18 @@ CACHE_FOLDER = cache_folder()
 FAST_MATH = {"contract", "arcp", "nsz", "reassoc"}
 
 
+class CacheLocator(UserProvidedCacheLocator):
+    """Finds kernels by the name of their package and not, as Numba does, by the path that it lies at.
+
+    `CACHE_FOLDER` is that of these very sources, so that a copy of them has the same kernels: Ray unpacks what is
+    shipped to a cluster's node into a folder that is new with each start of the cluster.
+    """
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        return Path(py_file).resolve().parent.name
+
+
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable[..., Any]:
     """`numba.njit` with this project's options: cached in `CACHE_FOLDER`, divisions without a zero check.
 
@@ -65,12 +78,12 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     """
     if function is None:
         return lambda f: njit(f, **options)
-    before = CONFIG.CACHE_DIR
-    CONFIG.CACHE_DIR = str(CACHE_FOLDER)
+    before = CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES
+    CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = str(CACHE_FOLDER), f"{__name__}.{CacheLocator.__name__}"
     try:
         return numba.njit(**{"cache": True, "error_model": "numpy", "fastmath": FAST_MATH, **options})(function)
     finally:
-        CONFIG.CACHE_DIR = before
+        CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = before
 
 
 def leaf(function: Callable[..., Any]) -> Callable[..., Any]:

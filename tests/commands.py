@@ -74,10 +74,10 @@ def ray_workers(pid):
     return [child for child, name in names.items() if name.startswith(b"ray::_Actor")]
 
 
-def wait_until(condition, timeout=120.0):
+def wait_until(condition, timeout=120.0, pause=0.02):
     end = time.monotonic() + timeout
     while time.monotonic() < end:
         if value := condition():
             return value
-        time.sleep(0.02)
+        time.sleep(pause)
     raise AssertionError("it did not happen in time")

@@ -98,6 +98,15 @@ def test_an_edited_kernel_is_seen_by_its_callers_in_other_files(copy, tmp_path):
     assert (edited["hit"], edited["from_cache"]) == (True, 0)
 
 
+def test_a_copy_elsewhere_has_the_same_kernels(copy, tmp_path):
+    python(CALLER, copy, tmp_path / "cache")
+    elsewhere = tmp_path / "shipped" / "unpacked"
+    shutil.copytree(copy, elsewhere)
+    found = python(CALLER, elsewhere, tmp_path / "cache")
+    assert Path(found["file"]).is_relative_to(elsewhere)
+    assert found["from_cache"] == 1
+
+
 def test_an_edit_of_any_file_is_another_cache_folder(copy, tmp_path):
     digests = python(DIGESTS, copy, tmp_path / "cache")
     assert digests.pop("after") == digests["before"]

@@ -45,6 +45,12 @@ def test_every_package_is_listed_and_typed(root: Path) -> None:
     assert [top for top in sorted(tops) if not (root / top / "py.typed").is_file()] == []
 
 
+def test_cluster_files_are_packaged(root: Path) -> None:
+    patterns = PROJECT["tool"]["setuptools"]["package-data"]["cluster"]
+    packaged = {path.name for pattern in patterns for path in (root / "cluster").glob(pattern)}
+    assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml"}
+
+
 def test_make_help_names_every_target(root: Path) -> None:
     done = subprocess.run(["make", "help"], cwd=root, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

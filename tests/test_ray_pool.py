@@ -218,6 +218,17 @@ def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayP
     assert outcome.retries == 0
 
 
+def test_sigterm_is_seen_while_ray_waits(pool: RayPool, folder: Path) -> None:
+    from cluster.cli import Stopped, stoppable  # not with the stand-ins above: a worker must not load it
+
+    pool.evaluate(make_task(), make_recipes(4))  # they are up
+    (folder / "sleep-100").write_text("3")
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
+    timer.start()
+    with pytest.raises(Stopped), stoppable():
+        pool.evaluate(make_task(), make_recipes(512))
+
+
 @pytest.mark.parametrize("times", [0, 1, 2])
 def test_experience_keeps_its_order_and_a_killed_worker_costs_its_chunk_alone(
     pool: RayPool, folder: Path, times: int

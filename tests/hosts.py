@@ -1,0 +1,220 @@
+"""Real hosts on one machine: each has network, processes, /tmp, home and SSH server of its own.
+
+A host is a process in namespaces of its own (`unshare`). Its first process reads from a pipe that only we hold: when we
+end, however that is, it ends too, and the kernel removes the host's processes, mounts and network with it.
+"""
+
+import importlib.util
+import os
+import pwd
+import shutil
+import subprocess
+import sys
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from commands import descendants, wait_until
+
+HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
+PROGRAMS = {
+    "unshare": "util-linux",
+    "nsenter": "util-linux",
+    "ip": "iproute2",
+    "sshd": "openssh-server",
+    "ssh": "openssh-client",
+    "ssh-keygen": "openssh-client",
+    "rsync": "rsync",
+    "uptime": "procps",  # `ray up` asks with it whether a host is there
+}
+UNSHARE = ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc"]
+SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
+
+# Arguments: the host's folder, the home to replace, what to keep (up to --), what to hide.
+SETUP = """
+set -e
+folder=$1 home=$2; shift 2
+keep=(); while [ "$1" != -- ]; do keep+=("$1"); shift; done; shift
+replace() {  # a directory by one of the host's own, in which what is kept lies where it was
+  for path in "${keep[@]}"; do
+    case $path/ in "$1"/*) mkdir -p "$2${path#"$1"}"; mount --bind "$path" "$2${path#"$1"}";; esac
+  done
+  mount --rbind "$2" "$1"
+}
+replace /tmp "$folder/tmp"
+replace "$home" "$folder/home"
+for path in "$@"; do mount -t tmpfs none "$path"; done
+mount -t tmpfs none /run
+mkdir /run/sshd
+printf 'root:*:19000:0:99999:7:::\\n' > "$folder/shadow"  # sshd lets nobody in whose account is locked
+mount --bind "$folder/shadow" /etc/shadow
+ip link set lo up
+echo ready
+read -r _ || true
+"""
+
+
+def missing() -> str:
+    """Why there can be no hosts here; empty where there can."""
+    if os.geteuid() != 0:
+        return "needs root, for network namespaces"
+    packages = sorted({package for program, package in PROGRAMS.items() if not shutil.which(program, path=SEARCH)})
+    if packages:
+        return f"needs apt-get install {' '.join(packages)}"
+    done = subprocess.run(
+        ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc", "true"], capture_output=True
+    )
+    return "" if done.returncode == 0 else "needs leave to make namespaces (in Docker: --privileged)"
+
+
+def package_folders() -> set[str]:
+    """Where a Python started anywhere finds this project, and where we do."""
+    names = ("cluster", "evolution", "gridsim")
+    code = f"import importlib.util as u; [print(*u.find_spec(n).submodule_search_locations) for n in {names}]"
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    installed = subprocess.run([sys.executable, "-c", code], cwd="/", env=environment, capture_output=True, text=True)
+    ours = [importlib.util.find_spec(name) for name in names]
+    here = {folder for spec in ours for folder in (spec and spec.submodule_search_locations) or ()}
+    return {*here, *installed.stdout.split()}
+
+
+class Command:
+    """A command on a host."""
+
+    def __init__(self, process: subprocess.Popen[bytes], log: Path):
+        self.process, self.log = process, log
+
+    def finish(self, timeout: float, code: int = 0) -> str:
+        """Wait for its end, which has to be with that exit code; returns its output, errors included."""
+        try:
+            self.process.wait(timeout)
+        finally:
+            self.process.kill()
+            self.process.wait()
+            output = self.log.read_text(errors="replace")
+        assert self.process.returncode == code, f"{self.process.args!r} ended with {self.process.returncode}:\n{output}"
+        return output
+
+
+class Host:
+    """One machine. `folder` holds what its disk is from the outside: tmp, home.
+
+    Args:
+        folder: a new one.
+        keep: paths that are the same on each host (the checkout, Python).
+        hide: folders that are empty on this one.
+    """
+
+    def __init__(self, folder: Path, keep: list[Path], hide: Collection[str] = ()):
+        self.folder, self.home = folder, folder / "home"
+        for part in ("tmp", "home/.ssh", "logs"):
+            (folder / part).mkdir(parents=True)
+        (folder / "tmp").chmod(0o1777)
+        (folder / "home").chmod(0o700)
+        (self.home / ".gridsim").symlink_to(sys.prefix)
+        self.address = ""
+        self._logs = 0
+        arguments = [folder, HOME, *keep, folder, "--", *sorted(hide)]
+        self._process = subprocess.Popen(
+            [*UNSHARE, "--uts", "--kill-child", "bash", "-c", SETUP, "host", *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=self.environment(),
+        )
+        assert self._process.stdout is not None
+        said = b""
+        while not said.endswith(b"ready\n"):
+            line = self._process.stdout.readline()
+            if not line:
+                raise RuntimeError(f"the host could not be set up: {said.decode()}")
+            said += line
+        self.pid = descendants(self._process.pid)[0]
+
+    @staticmethod
+    def environment() -> dict[str, str]:
+        """What a shell starts with there."""
+        return {"HOME": str(HOME), "PATH": SEARCH, "LANG": "C.UTF-8", "TERM": "dumb", "RAY_USAGE_STATS_ENABLED": "0"}
+
+    def start(self, *command: object, cwd: object = HOME, **environment: str) -> "Command":
+        """A command there, started."""
+        self._logs += 1
+        log = self.folder / "logs" / f"{self._logs}"
+        shell = ["bash", "-c", 'cd "$1" && shift && exec "$@"', "shell", cwd, *command]
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                [*self._enter("--pid", "--mount", "--uts"), *map(str, shell)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self.environment() | environment,
+            )
+        return Command(process, log)
+
+    def run(self, *command: object, timeout: float = 60.0, **options: Any) -> str:
+        """A command there, run to its end, which has to be a good one; returns its output."""
+        return self.start(*command, **options).finish(timeout)
+
+    def _enter(self, *namespaces: str) -> list[str]:
+        return ["nsenter", "--target", str(self.pid), "--net", *namespaces]
+
+    def connect(self, switch: "Host", address: str) -> None:
+        """Put a cable between this host and a switch, and give the host an address of 24 bits."""
+        port = f"p{address.rpartition('.')[2]}"
+        cable = ["ip", "link", "add", port, "type", "veth", "peer", "name", "eth0", "netns", str(self.pid)]
+        subprocess.run([*switch._enter(), *cable], check=True)
+        switch.run("ip", "link", "set", port, "master", "switch", "up")
+        self.run("ip", "address", "add", f"{address}/24", "dev", "eth0")
+        self.run("ip", "link", "set", "eth0", "up")
+        self.run("ip", "route", "add", "default", "dev", "eth0")  # by it Ray finds out its address
+        self.address = address
+
+    def serve_ssh(self, authorized: str) -> None:
+        """Let in who has the key."""
+        (self.home / ".ssh" / "authorized_keys").write_text(authorized)
+        self.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/host")
+        options = {
+            "HostKey": HOME / ".ssh/host",
+            "ListenAddress": self.address,
+            "PasswordAuthentication": "no",
+            "PermitRootLogin": "prohibit-password",
+            "PidFile": "none",
+            "StrictModes": "no",
+            "UsePAM": "no",
+        }
+        flags = [flag for name, value in options.items() for flag in ("-o", f"{name}={value}")]
+        self.run(shutil.which("sshd", path=SEARCH), "-f", "/dev/null", "-E", "/tmp/sshd.log", *flags)
+
+    def processes(self) -> list[str]:
+        """Command lines of what runs there."""
+        found = []
+        for pid in descendants(self.pid):
+            try:
+                found.append(Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+            except OSError:
+                continue
+        return found
+
+    def listening(self) -> dict[int, set[str]]:
+        """Ports that TCP connections are waited for at, and the addresses that they can be made to."""
+        ports: dict[int, set[str]] = {}
+        for line in self.run("ss", "-Hltn").splitlines():
+            address, _, port = line.split()[3].rpartition(":")
+            ports.setdefault(int(port), set()).add(address.partition("%")[0])
+        return ports
+
+    def close(self) -> None:
+        """Pull the plug."""
+        self._process.kill()
+        self._process.communicate()
+        wait_until(lambda: not os.path.exists(f"/proc/{self.pid}"), 30)
+
+
+def switch(folder: Path, keep: list[Path]) -> Host:
+    """A host with a network switch, at 10.77.0.1; the others are connected to it."""
+    host = Host(folder, keep)
+    host.run("ip", "link", "add", "switch", "type", "bridge")
+    host.run("ip", "address", "add", "10.77.0.1/24", "dev", "switch")
+    host.run("ip", "link", "set", "switch", "up")
+    host.address = "10.77.0.1"
+    return host

@@ -1,0 +1,300 @@
+"""The cluster files: held against Ray's schema and the project, and local.yaml used for real, on two hosts over SSH."""
+
+import importlib.util
+import json
+import re
+import shlex
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from importlib.metadata import distributions, requires
+from pathlib import Path
+from typing import Any
+
+import hosts
+import jsonschema  # type: ignore[import-untyped]
+import pytest
+import yaml
+from commands import BIN, ray_workers, start, summary, wait_until
+from hosts import HOME, Host
+from packaging.requirements import Requirement
+
+from cluster import shipping
+from cluster.cli import EvolveFlags, parse
+from gridsim.jit import CACHE_FOLDER
+
+CLOUDS = ("aws", "gcp")
+LAUNCHED = ("local", *CLOUDS)
+
+
+def read(root: Path, name: str) -> Any:
+    return yaml.safe_load((root / "cluster" / f"{name}.yaml").read_text(encoding="utf-8"))
+
+
+def kuberay(root: Path) -> dict[str, Any]:
+    """The documents of kuberay.yaml by their kind."""
+    text = (root / "cluster" / "kuberay.yaml").read_text(encoding="utf-8")
+    documents = list(yaml.safe_load_all(text))
+    by_kind = {document["kind"]: document for document in documents}
+    assert len(by_kind) == len(documents)
+    return by_kind
+
+
+def pinned(config: dict[str, Any]) -> dict[str, str]:
+    """Versions that a file's commands install, by name."""
+    text = " ".join(config["setup_commands"] + config["head_setup_commands"])
+    return dict(re.findall(r"([a-z]+)(?:\[[a-z]+\])?==(\S+)", text))
+
+
+@pytest.mark.parametrize("name", LAUNCHED)
+def test_file_fits_rays_schema(root: Path, name: str) -> None:
+    ray = importlib.util.find_spec("ray")
+    assert ray is not None
+    assert ray.submodule_search_locations is not None
+    schema = json.loads(Path(ray.submodule_search_locations[0], "autoscaler/ray-schema.json").read_text())
+    config = read(root, name)
+    jsonschema.validate(config, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**config, "head_start_ray_command": []}, schema)
+    assert config["provider"]["type"] == name
+    if name in CLOUDS:
+        assert config["head_node_type"] in config["available_node_types"]
+        largest = sum(kind.get("max_workers", 0) for kind in config["available_node_types"].values())
+        assert config["max_workers"] == largest
+
+
+@pytest.mark.parametrize("name", LAUNCHED)
+def test_file_gives_each_machine_the_project_and_the_token(root: Path, name: str) -> None:
+    config = read(root, name)
+    mounts = config["file_mounts"]
+    assert mounts.pop("~/.ray/auth_token") == "~/.ray/auth_token"
+    assert {package.__name__ for package in shipping.PACKAGES} < set(mounts.values())
+    assert [path for path in mounts.values() if not (root / path).exists()] == []
+    assert {there.removeprefix("~/gridsim/") for there in mounts} == set(mounts.values())
+    for which in ("head", "worker"):
+        last = config[f"{which}_start_ray_commands"][-1]
+        assert re.search(r"RAY_AUTH_MODE=token\b.* start ", last), "without it Ray lets everyone in"
+        assert "dashboard-host" not in last, "it is on loopback"
+
+
+@pytest.mark.parametrize("name", LAUNCHED)
+def test_versions_are_those_that_the_project_asks_for(root: Path, name: str) -> None:
+    wanted = {item.name: item for item in map(Requirement, requires("gridsim") or ())}
+    versions = pinned(read(root, name))
+    assert set(versions) >= {"numpy", "numba", "scipy", "torch"}
+    assert [package for package, version in versions.items() if not wanted[package].specifier.contains(version)] == []
+    assert versions == {package: pinned(read(root, "local"))[package] for package in versions}
+    ray = pinned(read(root, "local"))["ray"]
+    if name in CLOUDS:
+        assert read(root, name)["docker"]["image"].startswith(f"rayproject/ray:{ray}-py3")
+    for kind in ("RayJob", "RayCluster"):
+        spec = kuberay(root)[kind]["spec"]
+        assert spec.get("rayClusterSpec", spec)["rayVersion"] == ray
+
+
+def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
+    documents = kuberay(root)
+    job, cluster = documents["RayJob"], documents["RayCluster"]
+    assert job["spec"]["rayClusterSpec"] == cluster["spec"]
+    assert {document["metadata"]["labels"]["app"] for document in documents.values()} == {"gridsim"}
+    assert [job["apiVersion"], cluster["apiVersion"]] == ["ray.io/v1", "ray.io/v1"]
+    program, *flags = shlex.split(job["spec"]["entrypoint"])
+    assert program == "gridsim-evolve"
+    parsed = parse(EvolveFlags, program, flags)
+    spec = cluster["spec"]
+    assert spec["authOptions"] == {"mode": "token"}
+    assert spec["headGroupSpec"]["serviceType"] == "ClusterIP"
+    groups = [spec["headGroupSpec"], *spec["workerGroupSpecs"]]
+    images = set()
+    for group in groups:
+        pod = group["template"]["spec"]
+        (container,) = pod["containers"]
+        images.add(container["image"])
+        assert (
+            group["template"]["metadata"]["labels"] == documents["NetworkPolicy"]["spec"]["podSelector"]["matchLabels"]
+        )
+        assert pod["securityContext"]["runAsNonRoot"]
+        assert not container["securityContext"]["allowPrivilegeEscalation"]
+        assert container["livenessProbe"] == container["readinessProbe"]
+        assert all(isinstance(value, str) for value in group["rayStartParams"].values())
+    (image,) = images
+    version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert image.endswith(f"/gridsim:{version}")
+    (workers,) = spec["workerGroupSpecs"]
+    assert workers["minReplicas"] <= workers["replicas"] <= workers["maxReplicas"]
+    (container,) = workers["template"]["spec"]["containers"]
+    assert workers["replicas"] * int(container["resources"]["limits"]["cpu"]) == parsed.workers
+    assert container["readinessProbe"]["tcpSocket"]["port"] == int(workers["rayStartParams"]["node-manager-port"])
+    head = spec["headGroupSpec"]["template"]["spec"]
+    (container,) = head["containers"]
+    (mount,) = container["volumeMounts"]
+    assert parsed.output == mount["mountPath"]
+    assert parsed.tracking_uri.startswith(f"sqlite:///{mount['mountPath']}/")
+    claim = head["volumes"][0]["persistentVolumeClaim"]["claimName"]
+    assert claim == documents["PersistentVolumeClaim"]["metadata"]["name"]
+
+
+def test_the_guide_and_the_files_name_what_there_is(root: Path) -> None:
+    guide = (root / "docs" / "cluster.md").read_text(encoding="utf-8")
+    for path in re.findall(r"cluster/\w+\.yaml", guide):
+        assert (root / path).exists(), path
+    for name in (*LAUNCHED, "kuberay"):
+        assert f"cluster/{name}.yaml" in guide
+    assert "docs/cluster.md" in (root / "README.md").read_text(encoding="utf-8")
+
+
+def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_JOB_CONFIG_JSON_ENV_VAR", raising=False)
+    alone = shipping.runtime_env()
+    assert [Path(folder).name for folder in alone["py_modules"]] == ["cluster", "evolution", "gridsim"]
+    assert all(Path(folder, "__init__.py").exists() for folder in alone["py_modules"])
+    for submitted in (None, {}, {"working_dir": "gcs://w.zip"}):
+        monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps({"runtime_env": submitted, "metadata": {}}))
+        assert shipping.runtime_env() == alone
+    brought = {"runtime_env": {"py_modules": ["gcs://mine.zip"]}}
+    monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps(brought))
+    assert shipping.runtime_env()["py_modules"] == [*alone["py_modules"], "gcs://mine.zip"]
+
+
+# --- Two hosts -------------------------------------------------------------------------------------------------------
+
+RAY = BIN / "ray"
+RUN = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "8", "--seed", "5"]
+UP_S = 300.0  # for what takes half a minute on a quiet machine
+
+
+class Machines:
+    """A laptop, with the switch, and two machines that serve SSH: a head, and a worker without GridSim."""
+
+    def __init__(self, folder: Path, root: Path):
+        self.all: list[Host] = []
+        keep = [root, Path(sys.prefix), Path(sys.base_prefix), CACHE_FOLDER]
+        try:
+            self.laptop = hosts.switch(folder / "laptop", keep)
+            self.all.append(self.laptop)
+            self.head = Host(folder / "head", keep)
+            self.all.append(self.head)
+            self.worker = Host(folder / "worker", keep, hosts.package_folders())
+            self.all.append(self.worker)
+            self.laptop.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/gridsim")
+            authorized = (self.laptop.home / ".ssh/gridsim.pub").read_text()
+            for address, host in (("10.77.0.2", self.head), ("10.77.0.3", self.worker)):
+                host.connect(self.laptop, address)
+                host.serve_ssh(authorized)
+                (host.home / ".bashrc").write_text(f"export GRIDSIM_CACHE_DIR={CACHE_FOLDER.parents[1]}\n")
+            with (self.head.home / ".bashrc").open("a") as profile:
+                profile.write(f"export PYTHONPATH={root}\n")  # these sources, whatever is installed
+            self.config = HOME / "cluster.yaml"
+            (self.laptop.home / "cluster.yaml").write_text(yaml.safe_dump(self._adapted(root)))
+        except BaseException:
+            self.close()
+            raise
+
+    def _adapted(self, root: Path) -> dict[str, Any]:
+        """local.yaml with these addresses, without downloads, and with one core of each machine."""
+        config = read(root, "local")
+        config["provider"].update(head_ip=self.head.address, worker_ips=[self.worker.address])
+        config["auth"]["ssh_user"] = "root"
+        config["setup_commands"] = config["setup_commands"][:2]
+        config["head_setup_commands"] = []
+        for which in ("head", "worker"):
+            config[f"{which}_start_ray_commands"][-1] += " --num-cpus=1 --object-store-memory=100000000"
+        return config
+
+    def close(self) -> None:
+        for host in reversed(self.all):
+            host.close()
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The same run in one process, meanwhile."""
+    folder = tmp_path_factory.mktemp("reference")
+    process = start("gridsim-evolve", "--workers", "0", "--name", "r", *RUN, cwd=folder)
+    yield folder / "runs/r"
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture(scope="module")
+def machines(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Iterator[Machines]:
+    if reason := hosts.missing():
+        pytest.skip(reason)
+    machines = Machines(tmp_path_factory.mktemp("hosts"), root)
+    yield machines
+    machines.close()
+
+
+@pytest.fixture(scope="module")
+def up(machines: Machines, root: Path) -> Machines:
+    """The cluster, brought up with `ray up`."""
+    began = time.monotonic()
+    laptop = machines.laptop
+    laptop.run(RAY, "get-auth-token", "--generate")
+    laptop.run(RAY, "up", "--yes", "--no-config-cache", machines.config, cwd=root, timeout=UP_S)
+    print(f"the head is up after {time.monotonic() - began:.0f} s")
+    wait_until(lambda: any("raylet" in process for process in machines.worker.processes()), UP_S, 0.5)
+    print(f"the worker is up after {time.monotonic() - began:.0f} s")
+    return machines
+
+
+@pytest.mark.e2e
+def test_a_run_on_two_hosts(reference: Path, up: Machines) -> None:
+    found = up.worker.start(RAY.with_name("python"), "-c", "import gridsim.config")
+    assert "No module named 'gridsim.config'" in found.finish(60, code=1), "it has no GridSim"
+    command = shlex.join(["--address", "auto", "--workers", "2", "--name", "n", *RUN])
+    run = up.laptop.start(RAY, "exec", up.config, f"gridsim-evolve {command}")
+    on_both = wait_until(
+        lambda: all(ray_workers(host.pid) for host in (up.head, up.worker)) or run.process.poll() is not None,
+        UP_S,
+        pause=0.5,
+    )
+    output = run.finish(UP_S)
+    assert on_both is True, output
+    up.laptop.run(RAY, "rsync-down", up.config, "~/runs/", HOME / "runs/")
+    ours = summary(up.laptop.home / "runs/n")
+    assert ours["workers"] == 2
+    wait_until(lambda: (reference / "summary.json").exists(), UP_S)
+    assert ours["champion_sha256"] == summary(reference)["champion_sha256"]
+
+
+def lacking() -> list[str]:
+    """What is not installed of `ray[default]`."""
+    extra = [item for item in map(Requirement, requires("ray") or ()) if item.marker and "default" in str(item.marker)]
+    wanted = [item.name for item in extra if item.marker and item.marker.evaluate({"extra": "default"})]
+    installed = {distribution.name.lower().replace("_", "-") for distribution in distributions()}
+    return [name for name in wanted if name.lower().replace("_", "-") not in installed]
+
+
+@pytest.mark.e2e
+def test_the_same_run_as_a_job(reference: Path, up: Machines) -> None:
+    if packages := lacking():
+        pytest.skip(f"needs pip install 'ray[default]' ({', '.join(packages)})")
+    tunnel = up.laptop.start(RAY, "dashboard", up.config)
+    try:
+        wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
+        job = ["job", "submit", "--address", "http://127.0.0.1:8265", "--", "gridsim-evolve", "--workers", 2]
+        up.laptop.run(RAY, *job, "--name", "j", *RUN, timeout=UP_S, RAY_AUTH_MODE="token")
+    finally:
+        tunnel.process.kill()
+        tunnel.process.wait()
+    wait_until(lambda: (reference / "summary.json").exists(), UP_S)
+    assert summary(up.head.home / "runs/j")["champion_sha256"] == summary(reference)["champion_sha256"]
+
+
+@pytest.mark.e2e
+def test_who_can_reach_the_cluster(up: Machines, root: Path) -> None:
+    refused = up.laptop.start(BIN / "gridsim-evolve", "--address", f"{up.head.address}:6379", PYTHONPATH=str(root))
+    assert "wants its token" in refused.finish(60, code=2)
+    assert (up.worker.home / ".ray/auth_token").read_text() == (up.laptop.home / ".ray/auth_token").read_text()
+    assert (up.worker.home / ".ray/auth_token").stat().st_mode & 0o77 == 0
+    open_ports = up.head.listening()
+    assert 6379 in open_ports
+    assert open_ports.get(8265, {"127.0.0.1"}) == {"127.0.0.1"}, "the dashboard"
+
+
+@pytest.mark.e2e
+def test_ray_down(up: Machines, root: Path) -> None:
+    up.laptop.run(RAY, "down", "--yes", up.config, cwd=root, timeout=UP_S)
+    assert [process for process in up.head.processes() if "gcs_server" in process or "raylet" in process] == []
