@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import RECIPE
+from evolution.breeding import FRESH, RECIPE
 from evolution.experience import Experience, from_bytes, join, to_bytes
 from evolution.policy import PolicySpec
 from evolution.rollout import RESULT, targets
@@ -52,6 +52,7 @@ class Cost:
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
         broadcast_bytes: put into the object store: the task and the maps that were new to it.
+        warnings: a line for each member, or episode of experience, that was lost since it kills its worker.
     """
 
     wall_s: float = 0.0
@@ -60,6 +61,7 @@ class Cost:
     bytes_down: int = 0
     bytes_up: int = 0
     broadcast_bytes: int = 0
+    warnings: list[str] = field(default_factory=list)
     _done: int = 0
 
     def _count(self, worker: int, done: int, seconds: float) -> None:
@@ -72,11 +74,14 @@ class Outcome(Cost):
     """What one call of `evaluate` brought, and what it took.
 
     Attributes:
-        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
+        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for, and
+            for who was lost.
+        lost: bool [members], who killed every worker that tried.
         asked: episodes of members that were asked for.
     """
 
     results: np.ndarray
+    lost: np.ndarray
     asked: int
 
     def members(self) -> int:
@@ -103,6 +108,12 @@ class Outcome(Cost):
         self.add(worker, chunk, results.reshape(-1, columns), float(np.frombuffer(raw, np.float64, 1)[0]))
         self.bytes_up += len(raw)
 
+    def lose(self, chunk: Chunk) -> None:
+        """Do without a chunk's members: nothing of them counts, not even what is there."""
+        self.lost[chunk.rows] = True
+        self.results[chunk.rows] = np.zeros((), self.results.dtype)
+        self._done += size(chunk)
+
 
 @dataclass
 class Collected(Cost):
@@ -110,12 +121,14 @@ class Collected(Cost):
 
     Attributes:
         policy: whose experience it is.
-        results: RESULT [episodes].
-        experience: of all episodes, in their order.
+        results: RESULT [episodes]; zero where one was lost.
+        lost: bool [episodes], which killed every worker that tried.
+        experience: of all episodes but those, in their order.
     """
 
     policy: PolicySpec
     results: np.ndarray
+    lost: np.ndarray
     _parts: dict[int, Experience] = field(default_factory=dict)  # by their first episodes
 
     @cached_property
@@ -142,6 +155,11 @@ class Collected(Cost):
         experience = from_bytes(self.policy, memoryview(raw)[8 + results.nbytes :])
         self.add(worker, chunk, experience, results, float(np.frombuffer(raw, np.float64, 1)[0]))
         self.bytes_up += len(raw)
+
+    def lose(self, chunk: Chunk) -> None:
+        """Do without a chunk's episodes."""
+        self.lost[chunk.columns] = True
+        self._done += size(chunk)
 
 
 def answer(
@@ -285,12 +303,13 @@ def size(chunk: Chunk) -> int:
 def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outcome:
     """An outcome to be filled, its results all zero."""
     results = np.zeros((len(recipes), len(task.episodes)), dtype=task.row)
-    return Outcome(results, sum(size(chunk) for chunk in asked))
+    return Outcome(results, np.zeros(len(recipes), dtype=bool), sum(size(chunk) for chunk in asked))
 
 
 def new_collected(task: CollectTask) -> Collected:
     """A collection to be filled."""
-    return Collected(PolicySpec.parse(task.policy), np.zeros(len(task.episodes), dtype=RESULT))
+    n = len(task.episodes)
+    return Collected(PolicySpec.parse(task.policy), np.zeros(n, dtype=RESULT), np.zeros(n, dtype=bool))
 
 
 def finish(meanwhile: Meanwhile | None) -> None:
@@ -347,6 +366,16 @@ def describe(task: Task | CollectTask, index: int, chunk: Chunk) -> str:
     if isinstance(task, CollectTask):
         return f"chunk {index} (episodes {chunk.columns.start} to {chunk.columns.stop - 1})"
     return f"chunk {index} (members {chunk.rows.start} to {chunk.rows.stop - 1})"
+
+
+def identify(task: Task | CollectTask, chunk: Chunk, payload: bytes) -> str:
+    """The one member, or episode, of a chunk: with its recipe, so that it can be tried again."""
+    if isinstance(task, CollectTask):
+        k = chunk.columns.start
+        return f"episode {k} (key {task.keys[k]:#x}, exploration {task.epsilons[k]:.3g})"
+    recipe = np.frombuffer(payload, RECIPE)[0]
+    parents = f"parents {recipe['a']} and {recipe['b']}" if recipe["a"] != FRESH else "no parents"
+    return f"member {chunk.rows.start} ({parents}, seed {recipe['seed']}, key {task.key:#x})"
 
 
 def last_line(error: BaseException) -> str:

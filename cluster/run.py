@@ -336,6 +336,7 @@ class Session:
             f"champion_{learning.step_name}": learning.champion.generation,
             "validation_success_rate": learning.champion.success_rate,
             "solved": learning.solved,
+            "lost_chunks": learning.lost_chunks,
             "held_out": figures,
         }
         self.tracker.log_summary({f"held_out/{k}": v for k, v in figures.items() if k != "episodes"})
