@@ -73,6 +73,7 @@ from evolution.rollout import Limits
 
 CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
+UNKNOWN_S = 10.0  # that a chunk may take where nothing is known of such tasks
 MUTE = 10.0  # times what its chunk should take at most, in which a worker that is only slow has answered
 MAX_DEATHS = 15  # of workers in a row, without an answer in between: two members that kill cost fewer
 MAX_FAILED_STARTS = 3  # in a row, while nobody else is up
@@ -179,8 +180,16 @@ class RayPool:
         self._wait_for_ray()
         kind = type(task), task.limits
         metre_s = self._metre_s.get(kind, METRE_S)
+        whole = sum(metres(task, block) for block in asked)
+
+        def expected_s(part: Chunk) -> float:
+            done, total = brought.progress()
+            if not done:
+                return metres(task, part) * metre_s if kind in self._metre_s else UNKNOWN_S
+            return metres(task, part) * max(metre_s, sum(brought.busy_s.values()) * total / (done * whole))
+
         parts = cut(task, asked, finer * self._asked, metre_s)
-        dispatch = Dispatch(parts, isinstance(task, CollectTask), lambda part: metres(task, part) * metre_s)
+        dispatch = Dispatch(parts, isinstance(task, CollectTask), expected_s)
         self._serial += 1
         task_ref, brought.broadcast_bytes = self._shared.put(task)
         call = _Call(task, task_ref, dispatch, payload, brought, kind in self._metre_s)
@@ -213,9 +222,8 @@ class RayPool:
             elif time.monotonic() - nobody_since > self._patience_s:
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {_capacity()}")
         finish(meanwhile)
-        driven = sum(metres(task, block) for block in asked)
-        if driven > 0.0:
-            self._metre_s[kind] = max(sum(brought.busy_s.values()) / driven, 1e-9)
+        if whole > 0.0:
+            self._metre_s[kind] = max(sum(brought.busy_s.values()) / whole, 1e-9)
         brought.wall_s = time.perf_counter() - started
         if self._metrics:
             self._metrics.count(int(brought.results["steps"].sum()), brought.retries, len(brought.warnings))
