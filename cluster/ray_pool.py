@@ -75,6 +75,7 @@ CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 UNKNOWN_S = 10.0  # that a chunk may take where nothing is known of such tasks
 MUTE = 10.0  # times what its chunk should take at most, in which a worker that is only slow has answered
+FIRST_S = 600.0  # for a worker's first answer: it may have to compile the kernels
 MAX_DEATHS = 15  # of workers in a row, without an answer in between: two members that kill cost fewer
 MAX_FAILED_STARTS = 3  # in a row, while nobody else is up
 MAX_PAUSE_S = 30.0  # before a worker that cannot start is started again
@@ -93,6 +94,7 @@ class _Slot:
     maps: set[Name] = field(default_factory=set)  # that it was told of
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (serial of the task, answer), oldest first
     heard: float = 0.0  # when it last answered, or was given something to do; by time.monotonic
+    proven: bool = False  # whether it has ever answered
     start_at: float = 0.0  # where there is no actor
 
 
@@ -265,13 +267,13 @@ class RayPool:
             if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
                 return self._bury(slot, call, reason(cause), is_to_blame(cause))
             if serial == self._serial:
-                chunk = call.dispatch.at(slot.number)
-                what = describe(call.task, chunk, call.dispatch.parts[chunk])
+                at = call.dispatch.at(slot.number)
+                what = describe(call.task, at, call.dispatch.parts[at])
                 raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
         except ray.exceptions.RayError as error:
             return self._bury(slot, call, reason(error), is_to_blame(error))
         slot.sent.popleft()
-        slot.heard = time.monotonic()
+        slot.heard, slot.proven = time.monotonic(), True
         # What an earlier call has left is nobody's any more: a second copy, or what was interrupted.
         chunk = call.dispatch.answered(slot.number, slot.heard) if serial == self._serial else None
         if chunk is not None:
@@ -303,7 +305,7 @@ class RayPool:
 
         serial, ref = slot.sent[0]
         silent_s = time.monotonic() - slot.heard
-        slow_s = MUTE * max(LARGEST_S, call.dispatch.expected_s(slot.number))
+        slow_s = MUTE * max(LARGEST_S, call.dispatch.expected_s(slot.number)) if slot.proven else FIRST_S
         if serial == self._serial and (not call.measured or silent_s <= slow_s):
             return
         if not ray.wait([ref], timeout=0.0)[0]:  # it may have been us who did not listen
