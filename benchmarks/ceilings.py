@@ -112,8 +112,8 @@ def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> float:
 def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
     """Seconds that the coordinator's thread takes for a chunk of one member, and for each look for what has come.
 
-    Of its processor and not of the clock: here InstantWorkers share its cores. With few workers nearly every chunk takes
-    a look of its own, with many one look finds many answers; so looks are taken apart.
+    Of its processor and not of the clock: here InstantWorkers share its cores. With few workers nearly every chunk
+    takes a look of its own, with many one look finds many answers; so looks are taken apart.
     """
     import ray
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ class Cells:
         workers, address, tracking_uri, experiment: as the command has them.
         parent_id: MLflow's run that the cells belong to, or "".
         note: told how far a run is.
+        patience: as the command has it.
     """
 
     workers: int
@@ -43,6 +45,7 @@ class Cells:
     experiment: str
     parent_id: str = ""
     note: Callable[[str], None] = lambda text: None
+    patience: float = 0.0
     _pool: WorkerPool | None = None
     _maps: Maps | None = field(default=None, init=False)
 
@@ -83,12 +86,13 @@ class Cells:
         tracker = make_tracker(run, self.tracking_uri, self.experiment, self.parent_id)
         status: Status = "KILLED"
         try:
-            pool = self._workers()
+            pool = self._workers(run.path.parent.name)
             session = Session(
                 run, pool, maps, tracker, time.perf_counter(), film=False,
                 wall_limit_s=cell.plan.budget.wall_s or math.inf,
                 on_row=lambda _, row: self.note(session.learning.describe(row)),
             )  # fmt: skip
+            session.learning.warn = lambda text: print(f"{cell.name}: warning: {text}", file=sys.stderr, flush=True)
             maps.ahead(session.learning.curriculum.map_seeds[:3])
             if warming.processes:
                 self.note("compiling the simulator for this machine, once")
@@ -109,12 +113,13 @@ class Cells:
             maps.close()
             tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
 
-    def _workers(self) -> WorkerPool:
+    def _workers(self, comparison: str) -> WorkerPool:
         """The pool of all runs."""
         if self._pool is None and self.workers:
             from cluster.ray_pool import RayPool
 
-            self._pool = RayPool(self.workers, self._build, self.address or os.environ.get("RAY_ADDRESS") or None)
+            address = self.address or os.environ.get("RAY_ADDRESS") or None
+            self._pool = RayPool(self.workers, self._build, address, patience_s=self.patience, run=comparison)
         elif self._pool is None:
             self._pool = SerialPool(self._build)
         return self._pool

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from cluster.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError, check_workers
 from gridsim.scenarios import is_map_file
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-MAX_WORKERS = 10_000
 
 
 class UsageError(Exception):
@@ -63,6 +62,8 @@ class RunFlags:
     """A champion.npz to start from, in place of random networks."""
     address: str = ""
     """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
+    patience: float = 0.0
+    """Seconds to wait for workers when there are none; 0: 300 on a cluster, else 60. Then it stops, to be resumed."""
     tracking_uri: str = ""
     """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: str = "gridsim"
@@ -222,7 +223,7 @@ def _given(arguments: Sequence[str], flag: str) -> str:
 
 
 def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
-    """Flags and the run's folder, checked; nothing is written yet. Raises UsageError."""
+    """Flags and the run's folder, checked; nothing is written yet. Raises UsageError, SettingsError."""
     from cluster import run as runs
     from cluster.champion import load_champion
     from cluster.checkpoint import CheckpointError
@@ -252,13 +253,10 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     if flags.traffic and is_map_file(flags.scenario):
         print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
         flags = dataclasses.replace(flags, traffic=0)
-    if not 0 <= flags.workers <= MAX_WORKERS:
-        raise UsageError(f"--workers must be 0 to {MAX_WORKERS:,}, not {flags.workers}")
-    if flags.workers == 0 and flags.address:
-        raise UsageError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
+    check_workers(flags.workers, flags.address, flags.patience)
     if resume:
         for f in dataclasses.fields(kind):
-            if f.name in ("workers", "address", "tracking_uri", "experiment"):
+            if f.name in ("workers", "address", "patience", "tracking_uri", "experiment"):
                 continue
             now, then = getattr(flags, f.name), getattr(base, f.name)
             if f.name in kind.unbound and (now or math.inf) >= (then or math.inf):  # 0: any number
@@ -351,7 +349,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         else:
             from cluster.ray_pool import RayPool
 
-            pool = RayPool(flags.workers, maps.build, flags.address or os.environ.get("RAY_ADDRESS") or None)
+            address = flags.address or os.environ.get("RAY_ADDRESS") or None
+            pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience, run=run.name)
     except PoolError as error:
         warming.stop()
         maps.close()
@@ -417,6 +416,7 @@ def _run(
 
     initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
     session = Session(run, pool, maps, tracker, started, initial)
+    session.learning.warn = lambda text: print(f"{flags.command}: warning: {text}", file=sys.stderr, flush=True)
     if warming.processes:
         with console.status("compiling the simulator for this machine, once (some 10 s)"):
             warming.wait()

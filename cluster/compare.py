@@ -22,7 +22,7 @@ from rich.progress import Progress as Bar
 
 from cluster import checkpoint, experiment, tables
 from cluster.checkpoint import CheckpointError
-from cluster.cli import FAILED, INTERRUPTED, MAX_WORKERS, TERMINATED, Stopped, cores, fail, parse, stoppable
+from cluster.cli import FAILED, INTERRUPTED, TERMINATED, Stopped, cores, fail, parse, stoppable
 from cluster.experiment import Budget, Cell, CellError, ComparisonFolder, Plan
 from cluster.finished import (
     ERROR_FIGURES,
@@ -36,6 +36,7 @@ from cluster.finished import (
     read_run,
     series_of,
 )
+from cluster.settings import SettingsError, check_workers
 from evolution.policy import Observation
 from gridsim.scenarios import REGISTRY
 
@@ -86,6 +87,8 @@ class CompareFlags:
     """Folder of a comparison to continue; a larger --seeds adds to it."""
     address: str = ""
     """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
+    patience: float = 0.0
+    """Seconds to wait for workers when there are none; 0: 300 on a cluster, else 60. Then a run fails."""
     tracking_uri: str = ""
     """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: str = "gridsim"
@@ -105,7 +108,8 @@ class CompareFlags:
         return plan
 
 
-FREE = ("resume", "workers", "address", "tracking_uri", "experiment")  # may differ when a comparison is resumed
+# May differ when a comparison is resumed.
+FREE = ("resume", "workers", "address", "patience", "tracking_uri", "experiment")
 KEPT = ("runs", "output", "name", "reference")  # go with --runs
 
 
@@ -135,7 +139,7 @@ def _compare(arguments: Sequence[str]) -> int:
         cells = folder.cells()
         uri = check_uri(flags.tracking_uri or None)
         experiment.hold(folder.path)
-    except (ExperimentError, CheckpointError) as error:
+    except (ExperimentError, CheckpointError, SettingsError) as error:
         fail(PROG, str(error))
     except TrackingError as error:
         fail(PROG, str(error))
@@ -150,11 +154,8 @@ def _stamped(flags: CompareFlags) -> str:
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
-    """The comparison's folder, checked; nothing is written yet. Raises ExperimentError."""
-    if not 0 <= flags.workers <= MAX_WORKERS:
-        raise ExperimentError(f"--workers must be 0 to {MAX_WORKERS:,}, not {flags.workers}")
-    if flags.workers == 0 and flags.address:
-        raise ExperimentError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
+    """The comparison's folder, checked; nothing is written yet. Raises ExperimentError, SettingsError."""
+    check_workers(flags.workers, flags.address, flags.patience)
     if not flags.resume:
         plan = flags.plan()
         return ComparisonFolder(experiment.new_folder(Path(flags.output), _stamped(flags)), plan), flags
@@ -208,7 +209,7 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
                     parent = tracker.wait_ready(30.0)
                 except TrackingError as error:
                     shown.line(f"{PROG}: warning: its runs are not nested in MLflow: {error}")
-            execute = Cells(flags.workers, flags.address, uri, flags.experiment, parent, shown.note)
+            execute = Cells(flags.workers, flags.address, uri, flags.experiment, parent, shown.note, flags.patience)
 
             def done(cell: Cell, error: CellError | None) -> None:
                 if error:

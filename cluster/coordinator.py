@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learning import Learning, copies, made_good
+from cluster.learning import Learning, copies, made_good, some_left
 from cluster.pool import Chunk
 from cluster.settings import EvolveSettings
 from evolution import fitness
@@ -77,22 +77,30 @@ class Evolution(Learning):
         mean = self.genetic.mean()
         episodes = curriculum.episodes(generation)
         self.maps.ahead(curriculum.map_seeds[: generation + 4])
-        results = self._evaluate_all(episodes, limits)
+        results, lost = self._evaluate_all(episodes, limits)
+        some_left(lost, "evolve")
         goals = targets(episodes.rows, limits)
         score = self._score(results, goals)
         rank = fitness.pareto(fitness.elements(results, goals)) if s.ranking == "pareto" else score
+        rank = np.where(lost, -np.inf, rank)  # whatever a fitness says of somebody who drove nowhere
 
         # The generation's best race on more episodes; who raced comes before who did not.
         best = np.argsort(-np.nan_to_num(rank, nan=-np.inf), kind="stable")[: curriculum.config.racers]
+        best = best[~lost[best]]
         race = curriculum.race(generation)
         racers = self.genetic.genomes(best)
         race_limits = curriculum.race_limits()
-        raced = self.drive("race", racers, race, race_limits, curriculum.config.rewind)
+        driven = self.drive("race", racers, race, race_limits, curriculum.config.rewind)
+        some_left(driven.lost, "race")
+        raced = driven.results
         n, m = len(episodes.rows), len(race.rows)
         race_score = (n * score[best] + m * self._score(raced, race_limits.target)) / (n + m)
+        race_score = np.where(driven.lost, -np.inf, race_score)
         order = np.argsort(-race_score, kind="stable")
         total = rank - rank.max() - 1.0  # below 0
         total[best[order]] = np.arange(len(order), 0, -1)
+        total[best[driven.lost]] = -np.inf
+        order = order[: np.count_nonzero(~driven.lost)]
         race_success = float(success_rate(raced)[order[:8]].mean())
         curriculum.raced(order, raced, race)
         self.genetic.tell(total)
@@ -122,19 +130,20 @@ class Evolution(Learning):
         self.history.append(row)
         return row
 
-    def _evaluate_all(self, episodes: Episodes, limits: Limits) -> np.ndarray:
-        """Results RESULT [population, e] of a generation; who is on trial drives beside it."""
+    def _evaluate_all(self, episodes: Episodes, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+        """Results RESULT [population, e] of a generation, and who was lost; who is on trial drives beside it."""
         recipes, key = self.genetic.ask(self._mutation())
         parents, n, e = self.genetic.parents, len(recipes), len(episodes.rows)
         if not len(self.trials):
-            return self._evaluate("evolve", parents, recipes, key, episodes, limits, meanwhile=self.meanwhile)
+            driven = self._evaluate("evolve", parents, recipes, key, episodes, limits, meanwhile=self.meanwhile)
+            return driven.results, driven.lost
         trial, asked = self._trial()
         both = episodes.and_then(trial)
         asked = [
             Chunk(slice(n + rows.start, n + rows.stop), slice(e + columns.start, e + columns.stop))
             for rows, columns in asked
         ]
-        results = self._evaluate(
+        driven = self._evaluate(
             "evolve",
             np.concatenate([parents, self.trials.first, self.trials.last]),
             np.concatenate([recipes, copies(len(self.trials), len(parents))]),
@@ -144,8 +153,9 @@ class Evolution(Learning):
             asked=[*asked, Chunk(slice(0, n), slice(0, e))],  # the longest first
             meanwhile=self.meanwhile,
         )
-        self._judge(results[n:, e:])
-        return np.ascontiguousarray(results[:n, :e])  # the rest is not kept, and sums do not depend on the layout
+        self._judge(driven.results[n:, e:], driven.lost[n:])
+        # The rest is not kept, and sums do not depend on the layout.
+        return np.ascontiguousarray(driven.results[:n, :e]), driven.lost[:n]
 
     # ------------------------------------------------------------------------------------------------------- state
 

@@ -13,8 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learning import Learning, copies, made_good
-from cluster.pool import Collected
+from cluster.learning import Learning, copies, made_good, some_left
 from cluster.settings import DqnSettings
 from cluster.worker import CollectTask
 from evolution.curriculum import success_rate
@@ -83,13 +82,13 @@ class Dqn(Learning):
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
         steps, distance, episodes, reward, speeds = 0, 0.0, 0, 0.0, 0.0
         while steps < self.settings.evaluate_every and not (steps and self.out_of_time()):
-            brought = self._collect()
-            n = int(brought.results["steps"].sum())
+            results, rewards = self._collect()
+            n = int(results["steps"].sum())
             steps += n
-            episodes += len(brought.results)
-            distance += float(brought.results["distance"].sum())
-            reward += float(brought.experience.rewards.sum())
-            speeds += made_good(brought.results, self.sim.episode.control_period) * len(brought.results)
+            episodes += len(results)
+            distance += float(results["distance"].sum())
+            reward += rewards
+            speeds += made_good(results, self.sim.episode.control_period) * len(results)
         row = {
             "distance_m/mean": distance / episodes,
             "speed_mps/mean": speeds / episodes,
@@ -108,8 +107,11 @@ class Dqn(Learning):
         row["validation/success_rate"] = self.champion.success_rate if self.champion else 0.0
         return row
 
-    def _collect(self) -> Collected:
-        """Have one batch collected, train meanwhile, and remember what was brought."""
+    def _collect(self) -> tuple[np.ndarray, float]:
+        """Have one batch collected, train meanwhile, and remember what was brought.
+
+        Returns: RESULT [episodes] and the sum of their rewards. An episode that kills its workers is left out of all.
+        """
         s, k = self.settings, self.batches
         n = int(np.clip(BATCH_STEPS / self._mean_steps, *EPISODES))
         episodes = self.curriculum.starts(k, n)
@@ -129,14 +131,17 @@ class Dqn(Learning):
         progress = self.on_progress
         tell = (lambda done, total: progress("collect", done, total)) if progress else None
         brought = self.pool.collect(task, tell, self._train)
+        self._tell_of_lost("collect", brought)
+        some_left(brought.lost, "collect")
         self.replay.add(brought.experience)
-        steps = int(brought.results["steps"].sum())
+        results = brought.results[~brought.lost]
+        steps = int(results["steps"].sum())
         self._owed += steps * s.updates / 1000.0
-        self._mean_steps = steps / n
+        self._mean_steps = steps / len(results)
         self.car_steps += steps
-        self.episodes += n
+        self.episodes += len(results)
         self.batches += 1
-        return brought
+        return results, float(brought.experience.rewards.sum())
 
     def _epsilons(self, n: int) -> np.ndarray:
         """Shares of random actions of a batch's episodes: float32 [n]."""
@@ -169,12 +174,13 @@ class Dqn(Learning):
         self.trials.first, self.trials.first_generation = network[None], self.steps
         episodes, asked = self._trial()
         genomes = np.concatenate([self.trials.first, self.trials.last])
-        results = self._evaluate(
+        driven = self._evaluate(
             "validate", genomes, copies(len(genomes)), 0, episodes, self.curriculum.goal_limits(), asked=asked,
             meanwhile=self._train,
         )  # fmt: skip
-        self._judge(results)
-        first = results[0, : self.curriculum.config.first_validation]
+        some_left(driven.lost, "validate")
+        self._judge(driven.results, driven.lost)
+        first = driven.results[0, : self.curriculum.config.first_validation]
         return {
             "distance_m/best": float(first["distance"].mean()),
             "speed_mps/best": made_good(first, self.sim.episode.control_period),

@@ -11,6 +11,7 @@ import csv
 import io
 import threading
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.checkpoint import CheckpointError
-from cluster.pool import Chunk, Meanwhile, Outcome, WorkerPool
+from cluster.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.settings import RunSettings
 from cluster.worker import Task
 from evolution.breeding import RECIPE, Mutation
@@ -110,6 +111,8 @@ class Learning(ABC):
         initial: a genome to start from, float32 [genes].
         history: a row of figures for each step (`columns`).
         elites: the network of each step, float32 [genes].
+        lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
+        warn: told of each of these, in one line.
     """
 
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
@@ -125,7 +128,9 @@ class Learning(ABC):
     history: list[dict[str, float]] = field(default_factory=list)
     elites: list[np.ndarray] = field(default_factory=list)
     car_steps: int = 0
+    lost_chunks: int = 0
     wall_before_s: float = 0.0
+    warn: Callable[[str], None] = warnings.warn
     on_progress: Callable[[str, int, int], None] | None = None
     meanwhile: Callable[[], None] | None = None  # called in each step when the workers are busy
     out_of_time: Callable[[], bool] = lambda: False  # whether a budget of wall time is spent: a long step ends early
@@ -182,6 +187,8 @@ class Learning(ABC):
             self.trials.enter(self.elites[-1][None], self.steps - 1)
         while len(self.trials) and not self.solved:
             self._validate()
+        if self.champion is None:
+            raise PoolError("there is no champion: each network that was to be validated killed its workers")
 
     def _mutation(self) -> Mutation:
         """How bred members differ from their parents."""
@@ -192,7 +199,7 @@ class Learning(ABC):
     def _evaluate(
         self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, episodes: Episodes, limits: Limits,
         rewind: int = 0, asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> Outcome:  # fmt: skip
         task = Task(
             policy=self.settings.policy,
             parents=parents,
@@ -210,10 +217,16 @@ class Learning(ABC):
         outcome = self.pool.evaluate(task, recipes, tell, asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
-        return outcome.results
+        self._tell_of_lost(stage, outcome)
+        return outcome
 
-    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, rewind: int = 0) -> np.ndarray:
-        """Results RESULT [n, e] of given genomes [n, genes]: recipes that are plain copies."""
+    def _tell_of_lost(self, stage: str, brought: Outcome | Collected) -> None:
+        self.lost_chunks += len(brought.warnings)
+        for text in brought.warnings:
+            self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
+
+    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, rewind: int = 0) -> Outcome:
+        """Results [n, e] of given genomes [n, genes]: recipes that are plain copies."""
         return self._evaluate(stage, genomes, copies(len(genomes)), 0, episodes, limits, rewind)
 
     def _trial(self) -> tuple[Episodes, list[Chunk]]:
@@ -231,16 +244,18 @@ class Learning(ABC):
         episodes, asked = self._trial()
         genomes = np.concatenate([self.trials.first, self.trials.last])
         recipes, limits = copies(len(genomes)), self.curriculum.goal_limits()
-        self._judge(self._evaluate("validate", genomes, recipes, 0, episodes, limits, asked=asked))
+        tried = self._evaluate("validate", genomes, recipes, 0, episodes, limits, asked=asked)
+        self._judge(tried.results, tried.lost)
 
-    def _judge(self, results: np.ndarray) -> None:
+    def _judge(self, results: np.ndarray, lost: np.ndarray) -> None:
         """Find out whether `trials.last` beats the champion, and who of `trials.first` is tried next.
 
-        Args: RESULT [members, validation], zero where a member's stage has no such episode.
+        Args: RESULT [members, validation], zero where a member's stage has no such episode; and bool [members], who
+            was lost: it is neither.
         """
         trials, score = self.trials, self.curriculum.validation_score
         stage, k = self.curriculum.config.first_validation, len(self.trials.first)
-        if len(trials.last):
+        if len(trials.last) and not lost[k]:
             whole = results[k:, stage:]
             total, distance = float(score(whole)[0]), float(whole["distance"].mean())
             if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
@@ -248,9 +263,9 @@ class Learning(ABC):
                 self.champion = Champion(trials.last[0].copy(), total, rate, distance, trials.last_generation)
             self.solved = self.champion.score >= self.settings.until
         trials.last = trials.first[:0]
-        if k:
+        if not lost[:k].all():
             first = results[:k, :stage]
-            scores = score(first)
+            scores = np.where(lost[:k], -1.0, score(first))
             best = int(np.lexsort((first["distance"].mean(axis=1), scores))[-1])
             if self.champion is None or scores[best] >= self.champion.score - 0.02:
                 trials.last, trials.last_generation = trials.first[best : best + 1], trials.first_generation
@@ -269,9 +284,10 @@ class Learning(ABC):
         assert self.champion is not None
         before = self.car_steps
         episodes = held_out_episodes(self.maps, self.settings.traffic)
-        results = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
+        driven = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
+        some_left(driven.lost, "held out")
         self.car_steps = before  # not part of learning
-        return summarise(results[0], self.sim.episode.control_period)
+        return summarise(driven.results[0], self.sim.episode.control_period)
 
     # ------------------------------------------------------------------------------------------------------- state
 
@@ -289,6 +305,7 @@ class Learning(ABC):
         }
         meta: dict[str, Any] = {
             "solved": self.solved,
+            "lost_chunks": self.lost_chunks,
             **self.counts(),
             "columns": list(self.columns),
             "trials": [self.trials.first_generation, self.trials.last_generation],
@@ -330,6 +347,7 @@ class Learning(ABC):
         if not fits or not np.isfinite(history).all():
             raise ValueError("its parts do not fit each other")
         self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
+        self.lost_chunks = int(meta.get("lost_chunks", 0))  # of a version that knew none
         self.history = [dict(zip(self.columns, row.tolist(), strict=True)) for row in history]
         self.elites = list(elites)
         first_generation, last_generation = (int(k) for k in meta["trials"])
@@ -354,6 +372,12 @@ def copies(n: int, first: int = 0) -> np.ndarray:
     recipes = np.zeros(n, dtype=RECIPE)
     recipes["a"] = recipes["b"] = np.arange(first, first + n)
     return recipes
+
+
+def some_left(lost: np.ndarray, stage: str) -> None:
+    """Raises: PoolError where all of lost, bool [n], are: there is nothing to go on with."""
+    if lost.all():
+        raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")
 
 
 def held_out_episodes(maps: Maps, traffic: int) -> Episodes:

@@ -12,6 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cluster.worker import CollectTask, Task, Worker
+from evolution.breeding import FRESH
 from evolution.experience import Experience, from_bytes, join, to_bytes
 from evolution.packing import pack_results, result_widths, unpack_recipes, unpack_results
 from evolution.policy import PolicySpec
@@ -57,6 +58,7 @@ class Cost:
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
         broadcast_bytes: put into the object store: the task and the maps that were new to it.
+        warnings: a line for each member, or episode of experience, that was lost since it kills its worker.
     """
 
     wall_s: float = 0.0
@@ -65,6 +67,7 @@ class Cost:
     bytes_down: int = 0
     bytes_up: int = 0
     broadcast_bytes: int = 0
+    warnings: list[str] = field(default_factory=list)
     _done: int = 0
 
     def _count(self, worker: int, done: int, seconds: float) -> None:
@@ -77,12 +80,15 @@ class Outcome(Cost):
     """What one call of `evaluate` brought, and what it took.
 
     Attributes:
-        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for.
+        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for, and
+            for who was lost.
+        lost: bool [members], who killed every worker that tried.
         asked: episodes of members that were asked for.
         widths: int64 [episodes, fields], bits of each number of a RESULT as workers pack it.
     """
 
     results: np.ndarray
+    lost: np.ndarray
     asked: int
     widths: np.ndarray
 
@@ -113,6 +119,12 @@ class Outcome(Cost):
         self.add(worker, chunk, results, float(np.frombuffer(raw, np.float64, 1)[0]))
         self.bytes_up += len(raw)
 
+    def lose(self, chunk: Chunk) -> None:
+        """Do without a chunk's members: nothing of them counts, not even what is there."""
+        self.lost[chunk.rows] = True
+        self.results[chunk.rows] = np.zeros((), self.results.dtype)
+        self._done += size(chunk)
+
 
 @dataclass
 class Collected(Cost):
@@ -120,12 +132,14 @@ class Collected(Cost):
 
     Attributes:
         policy: whose experience it is.
-        results: RESULT [episodes].
-        experience: of all episodes, in their order.
+        results: RESULT [episodes]; zero where one was lost.
+        lost: bool [episodes], which killed every worker that tried.
+        experience: of all episodes but those, in their order.
     """
 
     policy: PolicySpec
     results: np.ndarray
+    lost: np.ndarray
     _parts: dict[int, Experience] = field(default_factory=dict)  # by their first episodes
 
     @cached_property
@@ -152,6 +166,11 @@ class Collected(Cost):
         experience = from_bytes(self.policy, memoryview(raw)[8 + results.nbytes :])
         self.add(worker, chunk, experience, results, float(np.frombuffer(raw, np.float64, 1)[0]))
         self.bytes_up += len(raw)
+
+    def lose(self, chunk: Chunk) -> None:
+        """Do without a chunk's episodes."""
+        self.lost[chunk.columns] = True
+        self._done += size(chunk)
 
 
 def answer(
@@ -302,7 +321,7 @@ def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outc
     """An outcome to be filled, its results all zero."""
     results = _zeros((len(recipes), len(task.episodes)), task.row)
     widths = result_widths(task.episodes, task.limits, task.config)
-    return Outcome(results, sum(size(chunk) for chunk in asked), widths)
+    return Outcome(results, np.zeros(len(recipes), dtype=bool), sum(size(chunk) for chunk in asked), widths)
 
 
 def _zeros(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
@@ -322,7 +341,8 @@ def _zeros(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
 
 def new_collected(task: CollectTask) -> Collected:
     """A collection to be filled."""
-    return Collected(PolicySpec.parse(task.policy), np.zeros(len(task.episodes), dtype=RESULT))
+    n = len(task.episodes)
+    return Collected(PolicySpec.parse(task.policy), np.zeros(n, dtype=RESULT), np.zeros(n, dtype=bool))
 
 
 def finish(meanwhile: Meanwhile | None) -> None:
@@ -381,6 +401,16 @@ def describe(task: Task | CollectTask, index: int, chunk: Chunk) -> str:
     if isinstance(task, CollectTask):
         return f"chunk {index} (episodes {chunk.columns.start} to {chunk.columns.stop - 1})"
     return f"chunk {index} (members {chunk.rows.start} to {chunk.rows.stop - 1})"
+
+
+def identify(task: Task | CollectTask, chunk: Chunk, payload: bytes) -> str:
+    """The one member, or episode, of a chunk: with its recipe, so that it can be tried again."""
+    if isinstance(task, CollectTask):
+        k = chunk.columns.start
+        return f"episode {k} (key {task.keys[k]:#x}, exploration {task.epsilons[k]:.3g})"
+    recipe = unpack_recipes(payload)[0]
+    parents = f"parents {recipe['a']} and {recipe['b']}" if recipe["a"] != FRESH else "no parents"
+    return f"member {chunk.rows.start} ({parents}, seed {recipe['seed']}, key {task.key:#x})"
 
 
 def last_line(error: BaseException) -> str:

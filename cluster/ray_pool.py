@@ -6,8 +6,10 @@ What differs from Ray's own habits, and why:
   cost a second at the start, another one at the end, and 1.5 core-seconds of the workers' time (`_lean_head`).
 * Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the kernel
   kills Ray's processes when their parent *thread* dies, and so they die with us whatever kills us.
-* Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and a
-  chunk that kills whoever takes it has to end the run with a clear line.
+* Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
+  `dispatch` has to know who died of what.
+* Ray says nothing of a worker that is stopped, or whose host is cut off, for half a minute or for ever. Idle workers
+  take copies of what it holds; it gets nothing new before it has answered, and after `patience_s` it is replaced.
 """
 
 from __future__ import annotations
@@ -16,22 +18,22 @@ import contextlib
 import importlib
 import logging
 import os
-import pickle
 import shutil
-import signal
 import threading
 import time
-from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cluster import shipping
+from cluster.actor import Actor, Name, Shared
+from cluster.dispatch import BACKOFF_S, MAX_KILLS, Dispatch
 from cluster.pool import (
     FINER,
+    LARGEST_S,
     METRE_S,
     BuildMap,
     Chunk,
@@ -41,11 +43,11 @@ from cluster.pool import (
     PoolError,
     Progress,
     all_episodes,
-    answer,
     cut,
     describe,
     everything,
     finish,
+    identify,
     last_line,
     metres,
     new_collected,
@@ -54,68 +56,32 @@ from cluster.pool import (
 from cluster.ray_address import (
     AUTH_ENVIRONMENT,
     ENVIRONMENT,
+    LEAN,
     OWN_ENVIRONMENT,
     STORE_BYTES,
     TOKEN,
     environment,
     has_token,
+    lean_head,
     no_interrupt,
     probe,
     store_bytes,
 )
+from cluster.ray_errors import is_to_blame, reason
+from cluster.ray_metrics import RunMetrics
 from cluster.worker import CollectTask, Task, Worker
 from evolution.packing import pack_recipes
 from evolution.rollout import Limits
-from gridsim.scenarios import Scenario
 
 CONNECT_S = 60.0
-QUEUE = 2  # chunks that a worker holds: one that it works on, one so that it need not wait for us
-MAX_KILLS = 3  # workers that one chunk may cost
-MAX_FAILED_STARTS = 3  # in a row
+PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
+UNKNOWN_S = 10.0  # that a chunk may take where nothing is known of such tasks
+MUTE = 10.0  # times what its chunk should take at most, in which a worker that is only slow has answered
+FIRST_S = 600.0  # for a worker's first answer: it may have to compile the kernels
+MAX_DEATHS = 15  # of workers in a row, without an answer in between: two members that kill cost fewer
+MAX_FAILED_STARTS = 3  # in a row, while nobody else is up
+MAX_PAUSE_S = 30.0  # before a worker that cannot start is started again
 MAP_BYTES = 512 << 20  # of maps kept there: those of training and validation, or they are sent every generation
-
-_Name = tuple[str, int]  # of a map: scenario and seed
-
-#: What a worker needs to take up a task: references to it and to the maps that it lacks, and maps to be forgotten.
-_News = tuple[Any, dict[_Name, Any], list[_Name]]
-
-
-class _Actor:
-    """Runs in a worker's process: holds the present task and its maps, answers chunks."""
-
-    def __init__(self, factory: Callable[[], Worker]):
-        # Ctrl-C goes to every process of the terminal; whether the workers stop is the coordinator's business.
-        with contextlib.suppress(ValueError):
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-        self._worker = factory()
-        self._serial = 0
-        self._task: Task | CollectTask | None = None
-        self._maps: dict[_Name, Scenario] = {}
-
-    def hello(self) -> int:
-        return os.getpid()
-
-    def run(self, serial: int, payload: bytes, first: int, stop: int, news: _News | None) -> bytes:
-        """What `cluster.pool.answer` says; `news` is for a worker that does not have the task yet."""
-        if news:
-            self._take_up(serial, *news)
-        if self._task is None or serial != self._serial:
-            raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
-        maps = [self._maps[name] for name in self._task.maps]
-        return answer(self._worker, self._task, maps, payload, first, stop)
-
-    def _take_up(self, serial: int, task_ref: Any, map_refs: dict[_Name, Any], gone: list[_Name]) -> None:
-        import ray
-
-        self._task = None
-        for name, ref in map_refs.items():
-            if name not in self._maps:
-                self._maps[name] = Scenario.from_arrays(ray.get(ref))
-        # A map in use stays in the object store: those that the coordinator has let go are let go here.
-        for name in gone:
-            self._maps.pop(name, None)
-        self._task = ray.get(task_ref)
-        self._serial = serial
 
 
 @dataclass
@@ -123,12 +89,27 @@ class _Slot:
     """One worker's place; who dies in it is replaced."""
 
     number: int
-    actor: Any
-    hello: Any  # the answer that says it is up; None once it is
+    actor: Any = None
+    hello: Any = None  # the answer that says it is up; None once it is
     pid: int = 0
     serial: int = 0  # of the last task that it was told of
-    maps: set[_Name] = field(default_factory=set)  # that it was told of
-    sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (chunk, answer), oldest first
+    maps: set[Name] = field(default_factory=set)  # that it was told of
+    sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (serial of the task, answer), oldest first
+    heard: float = 0.0  # when it last answered, or was given something to do; by time.monotonic
+    proven: bool = False  # whether it has ever answered
+    start_at: float = 0.0  # where there is no actor
+
+
+@dataclass
+class _Call:
+    """What is being done."""
+
+    task: Task | CollectTask
+    task_ref: Any
+    dispatch: Dispatch
+    payload: Callable[[Chunk], bytes]
+    brought: Outcome | Collected
+    measured: bool  # whether it is known how long such chunks take
 
 
 class RayPool:
@@ -139,19 +120,16 @@ class RayPool:
         build_map: builds a map, here, once; workers see it in shared memory.
         address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
         worker_factory: makes what evaluates; must be importable in the workers.
-        start_timeout_s: how long there may be no worker at all; default 60 s, on a cluster 300 s (it may be growing).
+        patience_s: how long there may be no worker at all, or none may answer; default 60 s, on a cluster 300 s.
+        run: the run's name, for the cluster's metrics.
 
     Raises PoolError at once where nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
 
     def __init__(
-        self,
-        workers: int,
-        build_map: BuildMap,
-        address: str | None = None,
-        worker_factory: Callable[[], Worker] = Worker,
-        start_timeout_s: float | None = None,
-    ):
+        self, workers: int, build_map: BuildMap, address: str | None = None,
+        worker_factory: Callable[[], Worker] = Worker, patience_s: float | None = None, run: str = "",
+    ):  # fmt: skip
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
         for name, value in ENVIRONMENT.items():
@@ -160,10 +138,10 @@ class RayPool:
         self._asked = workers
         self._build_map = build_map
         self._factory = worker_factory
-        self._start_timeout_s = start_timeout_s or (60.0 if address is None else 300.0)
+        self._patience_s = patience_s or (PATIENCE_S if address is None else CLUSTER_PATIENCE_S)
+        self._run = run
+        self._metrics: RunMetrics | None = None
         self._slots: list[_Slot] = []
-        self._maps: OrderedDict[_Name, tuple[Any, int]] = OrderedDict()  # references and bytes
-        self._map_bytes = MAP_BYTES
         self._serial = 0
         self._failed_starts = 0
         self._metre_s: dict[tuple[type, Limits], float] = {}  # what a metre of such tasks took the last time
@@ -182,13 +160,9 @@ class RayPool:
         return [slot.pid for slot in self._slots if slot.pid]
 
     def evaluate(
-        self,
-        task: Task,
-        recipes: np.ndarray,
-        on_progress: Progress | None = None,
-        asked: Sequence[Chunk] | None = None,
-        meanwhile: Meanwhile | None = None,
-    ) -> Outcome:
+        self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None,
+        asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
+    ) -> Outcome:  # fmt: skip
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
         self._work(task, asked, 1, lambda chunk: pack_recipes(recipes[chunk.rows]), outcome, on_progress, meanwhile)
@@ -202,86 +176,147 @@ class RayPool:
         return collected
 
     def _work(
-        self,
-        task: Task | CollectTask,
-        asked: Sequence[Chunk],
-        finer: int,
-        payload: Callable[[Chunk], bytes],
-        brought: Outcome | Collected,
-        on_progress: Progress | None,
-        meanwhile: Meanwhile | None,
-    ) -> None:
+        self, task: Task | CollectTask, asked: Sequence[Chunk], finer: int, payload: Callable[[Chunk], bytes],
+        brought: Outcome | Collected, on_progress: Progress | None, meanwhile: Meanwhile | None,
+    ) -> None:  # fmt: skip
         """Have what is asked for done, in chunks `finer` times as small as they need be, and fill `brought`."""
-        import ray
-
         started = time.perf_counter()
         self._wait_for_ray()
         kind = type(task), task.limits
-        parts = cut(task, asked, finer * self._asked, self._metre_s.get(kind, METRE_S))
-        todo = deque(range(len(parts)))
-        kills: Counter[int] = Counter()
-        suspects: set[int] = set()
-        self._serial += 1
-        for slot in self._slots:
-            slot.sent.clear()  # left over where the last call was interrupted
-        task_ref = self._broadcast(task, brought)
-        nobody_since = time.monotonic()
+        metre_s = self._metre_s.get(kind, METRE_S)
+        whole = sum(metres(task, block) for block in asked)
 
-        while not brought.whole():
-            for slot in self._free(todo, suspects):
-                chunk = todo.popleft()
-                columns, raw = parts[chunk].columns, payload(parts[chunk])
-                what = None if slot.serial == self._serial else self._news(slot, task, task_ref)
-                answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, what)
-                slot.sent.append((chunk, answered))
-                slot.serial = self._serial
-                brought.bytes_down += len(raw)
+        def expected_s(part: Chunk) -> float:
+            done, total = brought.progress()
+            if not done:
+                return metres(task, part) * metre_s if kind in self._metre_s else UNKNOWN_S
+            return metres(task, part) * max(metre_s, sum(brought.busy_s.values()) * total / (done * whole))
+
+        parts = cut(task, asked, finer * self._asked, metre_s)
+        dispatch = Dispatch(parts, isinstance(task, CollectTask), expected_s)
+        self._serial += 1
+        task_ref, brought.broadcast_bytes = self._shared.put(task)
+        call = _Call(task, task_ref, dispatch, payload, brought, kind in self._metre_s)
+        nobody_since, quiet = time.monotonic(), False
+
+        while not dispatch.finished():
+            now = time.monotonic()
+            for slot in self._slots:
+                if slot.actor is None and slot.start_at <= now:
+                    self._start(slot)
+                elif slot.sent and now - slot.heard > self._patience_s:
+                    self._give_up_on_the_mute(slot, call)
+            idle = [slot.number for slot in self._slots if slot.pid and not slot.sent]
+            for number, chunk in dispatch.give(idle, now, quiet):
+                self._send(self._slots[number], chunk, call)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
-            # Take all that is there: with many workers a look costs more than an answer. If there is nothing, and
-            # nothing else to do, wait for the next.
-            ready, _ = ray.wait(list(waiting), num_returns=len(waiting), timeout=0.0)
-            if not ready and not (meanwhile and self.pids()):
-                ready, _ = ray.wait(list(waiting), num_returns=1, timeout=1.0)
-            for ref in ready:
-                slot = waiting[ref]
+            answered = self._answered(waiting, bool(meanwhile and self.pids()), dispatch.pause_s(now))
+            quiet = not answered
+            for slot in answered:
                 if slot.hello:
                     self._greet(slot)
-                    continue
-                chunk = slot.sent[0][0]
-                part = parts[chunk]
-                try:
-                    raw = ray.get(ref)
-                except ray.exceptions.RayTaskError as error:
-                    cause = error.cause if isinstance(error.cause, BaseException) else error
-                    raise PoolError(f"a worker failed on {describe(task, chunk, part)}: {last_line(cause)}") from error
-                except ray.exceptions.RayError as error:
-                    kills[chunk] += 1
-                    if kills[chunk] >= MAX_KILLS:
-                        raise PoolError(
-                            f"{describe(task, chunk, part)} killed its worker {MAX_KILLS} times; the last time "
-                            + _reason(error)
-                            + self._logs()
-                        ) from error
-                    suspects.update(index for index, _ in slot.sent)
-                    todo.extendleft(index for index, _ in reversed(slot.sent))
-                    brought.retries += len(slot.sent)
-                    self._replace(slot)
-                    continue
-                slot.sent.popleft()
-                brought.take(slot.number, part, raw)
-                if on_progress:
+                elif self._hear(slot, call) and on_progress:
                     on_progress(*brought.progress())
+            if self._metrics:
+                self._metrics.gauge(dispatch.waiting(), self.workers())
             if self.pids():
                 nobody_since = time.monotonic()
-            elif time.monotonic() - nobody_since > self._start_timeout_s:
-                raise PoolError(f"no worker came up within {self._start_timeout_s:g} s: {_capacity()}")
+            elif time.monotonic() - nobody_since > self._patience_s:
+                raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {_capacity()}")
         finish(meanwhile)
-        driven = sum(metres(task, block) for block in asked)
-        if driven > 0.0:
-            self._metre_s[kind] = max(sum(brought.busy_s.values()) / driven, 1e-9)
+        if whole > 0.0:
+            self._metre_s[kind] = max(sum(brought.busy_s.values()) / whole, 1e-9)
         brought.wall_s = time.perf_counter() - started
+        if self._metrics:
+            self._metrics.count(int(brought.results["steps"].sum()), brought.retries, len(brought.warnings))
+
+    def _send(self, slot: _Slot, chunk: int, call: _Call) -> None:
+        part = call.dispatch.parts[chunk]
+        columns, raw = part.columns, call.payload(part)
+        if not slot.sent:
+            slot.heard = time.monotonic()
+        news: list[Any] = []
+        if slot.serial != self._serial:
+            maps, gone, refs = self._shared.news(slot.maps, call.task, call.task_ref)
+            news = [maps, gone, *refs]
+        answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, *news)
+        slot.sent.append((self._serial, answered))
+        slot.serial = self._serial
+        call.brought.bytes_down += len(raw)
+
+    def _answered(self, waiting: dict[Any, _Slot], busy: bool, pause_s: float) -> list[_Slot]:
+        """All who have something to say: with many workers a look costs more than an answer.
+
+        Where nobody has, and we are not busy, wait for the next, a second at most.
+        """
+        import ray
+
+        timeout_s = 0.0 if busy else min(1.0, pause_s)
+        if not waiting:
+            time.sleep(min(timeout_s, BACKOFF_S))
+            return []
+        ready, _ = ray.wait(list(waiting), num_returns=len(waiting), timeout=0.0)
+        if not ready and timeout_s > 0.0:
+            ready, _ = ray.wait(list(waiting), num_returns=1, timeout=timeout_s)
+        return [waiting[ref] for ref in ready]
+
+    def _hear(self, slot: _Slot, call: _Call) -> bool:
+        """Take in a worker's oldest answer, or its death. Returns whether anything was brought."""
+        import ray
+
+        serial, ref = slot.sent[0]
+        try:
+            raw = ray.get(ref)
+        except ray.exceptions.RayTaskError as error:
+            cause = error.cause if isinstance(error.cause, BaseException) else error
+            if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
+                return self._bury(slot, call, reason(cause), is_to_blame(cause))
+            if serial == self._serial:
+                at = call.dispatch.at(slot.number)
+                what = describe(call.task, at, call.dispatch.parts[at])
+                raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
+        except ray.exceptions.RayError as error:
+            return self._bury(slot, call, reason(error), is_to_blame(error))
+        slot.sent.popleft()
+        slot.heard, slot.proven = time.monotonic(), True
+        # What an earlier call has left is nobody's any more: a second copy, or what was interrupted.
+        chunk = call.dispatch.answered(slot.number, slot.heard) if serial == self._serial else None
+        if chunk is not None:
+            call.brought.take(slot.number, call.dispatch.parts[chunk], raw)
+        return chunk is not None
+
+    def _bury(self, slot: _Slot, call: _Call, reason: str, blamed: bool = True) -> bool:
+        """Replace a worker, and see to it that what it held is done. Returns whether anything is lost."""
+        dispatch, brought = call.dispatch, call.brought
+        lost = [dispatch.parts[chunk] for chunk in dispatch.died(slot.number, time.monotonic(), blamed)]
+        brought.retries = dispatch.retries
+        for part in lost:
+            brought.lose(part)
+        if lost:
+            who = identify(call.task, lost[0], call.payload(lost[0]))
+            brought.warnings.append(
+                f"{who} killed its worker {MAX_KILLS} times and is lost; the last time {reason}{self._logs()}"
+            )
+        if dispatch.deaths > max(MAX_DEATHS, MAX_KILLS * self._asked):
+            raise PoolError(
+                f"workers die whatever they are given, {dispatch.deaths} in a row; the last time {reason}{self._logs()}"
+            )
+        self._replace(slot)
+        return bool(lost)
+
+    def _give_up_on_the_mute(self, slot: _Slot, call: _Call) -> None:
+        """Replace a worker that has not answered for too long, and for longer than its chunk could take."""
+        import ray
+
+        serial, ref = slot.sent[0]
+        silent_s = time.monotonic() - slot.heard
+        slow_s = MUTE * max(LARGEST_S, call.dispatch.expected_s(slot.number)) if slot.proven else FIRST_S
+        if serial == self._serial and (not call.measured or silent_s <= slow_s):
+            return
+        if not ray.wait([ref], timeout=0.0)[0]:  # it may have been us who did not listen
+            self._bury(slot, call, f"it did not answer for {silent_s:.0f} s")
 
     def close(self) -> None:
         if self._closed.is_set():
@@ -292,7 +327,7 @@ class RayPool:
                 import ray
 
                 for slot in self._slots:
-                    ray.kill(slot.actor)
+                    self._kill(slot)
                 ray.shutdown(wait_for_processes=True)
                 _forget_token()
                 if self._session and not self._troubled:
@@ -311,16 +346,21 @@ class RayPool:
             logging.getLogger("ray").setLevel(logging.CRITICAL)
             ray_worker: Any = importlib.import_module("ray._private.worker")
             ray_worker._worker_logs_enabled = False  # else it prints each worker's death, `log_to_driver` or not
+            map_bytes = MAP_BYTES
             if self.address is None:
                 store = store_bytes()
-                self._map_bytes = store * MAP_BYTES // STORE_BYTES
+                map_bytes = store * MAP_BYTES // STORE_BYTES
                 self._session = _start_own(self._asked, store)
             else:
                 _join(self.address)
             self._connected = True
-            self._actor_class = ray.remote(num_cpus=1)(_Actor)
-            for number in range(self._asked):
-                self._slots.append(_Slot(number, *self._new_actor()))
+            self._shared = Shared(ray.put, self._build_map, map_bytes)
+            self._actor_class = ray.remote(num_cpus=1)(Actor)
+            if self.address and ray_worker.global_worker.node.metrics_agent_port > 0:
+                self._metrics = RunMetrics(importlib.import_module("ray.util.metrics"), self._run)
+            self._slots = [_Slot(number) for number in range(self._asked)]
+            for slot in self._slots:
+                self._start(slot)
         except BaseException as error:
             self._failure = error
         finally:
@@ -336,19 +376,24 @@ class RayPool:
             raise self._failure
         if self._failure:
             where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
-            raise PoolError(f"{where}: {_reason(self._failure)}") from self._failure
+            raise PoolError(f"{where}: {reason(self._failure)}") from self._failure
 
-    def _new_actor(self) -> tuple[Any, Any]:
-        actor: Any = self._actor_class.remote(self._factory)
-        return actor, actor.hello.remote()
+    def _start(self, slot: _Slot) -> None:
+        slot.actor = self._actor_class.remote(self._factory)
+        slot.hello = slot.actor.hello.remote()
 
-    def _replace(self, slot: _Slot) -> None:
+    def _replace(self, slot: _Slot, pause_s: float = 0.0) -> None:
+        self._troubled = True
+        self._kill(slot)  # it may be alive and merely out of reach
+        self._slots[slot.number] = _Slot(slot.number, start_at=time.monotonic() + pause_s)
+        if not pause_s:
+            self._start(self._slots[slot.number])
+
+    def _kill(self, slot: _Slot) -> None:
         import ray
 
-        self._troubled = True
-        ray.kill(slot.actor)  # it may be alive and merely out of reach
-        actor, hello = self._new_actor()
-        self._slots[slot.number] = _Slot(slot.number, actor, hello)
+        if slot.actor is not None:
+            ray.kill(slot.actor)
 
     def _greet(self, slot: _Slot) -> None:
         """A worker is up, or could not start."""
@@ -357,57 +402,18 @@ class RayPool:
         try:
             slot.pid = ray.get(slot.hello)
         except ray.exceptions.RayError as error:
+            if not is_to_blame(error):
+                return self._replace(slot)
             self._failed_starts += 1
-            if self._failed_starts >= MAX_FAILED_STARTS:
-                raise PoolError(f"no worker can be started: {_reason(error)}{self._logs()}") from error
-            self._replace(slot)
+            if self._failed_starts >= MAX_FAILED_STARTS and not self.pids():
+                raise PoolError(f"no worker can be started: {reason(error)}{self._logs()}") from error
+            self._replace(slot, min(BACKOFF_S * 2.0**self._failed_starts, MAX_PAUSE_S))
         else:
             slot.hello = None
             self._failed_starts = 0
 
     def _logs(self) -> str:
         return f" (logs: {self._session}/logs)" if self._session else ""
-
-    def _free(self, todo: deque[int], suspects: set[int]) -> Iterator[_Slot]:
-        """Whom to give the next chunk, as long as there is one.
-
-        The last ones only go to who has nothing to do. So do suspects, which were lost with a worker, and nothing is
-        queued behind them: the next time it is clear which one it was.
-        """
-        up = [slot for slot in self._slots if slot.pid]
-        for slot in up:
-            if todo and not slot.sent:
-                yield slot
-        for slot in up:
-            if len(todo) > len(up) and 0 < len(slot.sent) < QUEUE and suspects.isdisjoint([todo[0], slot.sent[0][0]]):
-                yield slot
-
-    def _broadcast(self, task: Task | CollectTask, brought: Outcome | Collected) -> Any:
-        """Put the task, and those of its maps that are not there yet, into the object store; returns its reference."""
-        import ray
-
-        buffers: list[pickle.PickleBuffer] = []
-        head = pickle.dumps(task, protocol=5, buffer_callback=buffers.append)
-        brought.broadcast_bytes = len(head) + sum(buffer.raw().nbytes for buffer in buffers)
-        for name in task.maps:
-            if name not in self._maps:
-                arrays = self._build_map(*name).arrays()
-                size = sum(array.nbytes for array in arrays.values())
-                self._maps[name] = ray.put(arrays), size
-                brought.broadcast_bytes += size
-            self._maps.move_to_end(name)
-        used = sum(size for _, size in self._maps.values())
-        while used > self._map_bytes and len(self._maps) > len(set(task.maps)):
-            used -= self._maps.popitem(last=False)[1][1]
-        return ray.put(task)
-
-    def _news(self, slot: _Slot, task: Task | CollectTask, task_ref: Any) -> _News:
-        """What a worker needs to take up a task; from then on it has that."""
-        gone = [name for name in slot.maps if name not in self._maps]
-        refs = {name: self._maps[name][0] for name in task.maps if name not in slot.maps}
-        slot.maps.difference_update(gone)
-        slot.maps.update(refs)
-        return task_ref, refs, gone
 
 
 def check_address(address: str) -> str:
@@ -465,31 +471,13 @@ def _join(address: str) -> None:
         ray.init(address=address, runtime_env=env, log_to_driver=False, logging_level=logging.CRITICAL)
 
 
-@contextlib.contextmanager
-def _lean_head() -> Iterator[None]:
-    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
-
-    Ray has no setting for that, so this replaces private names while `ray.init` runs. Where a version lacks them, Ray
-    starts with all its helpers, as it would by itself.
-    """
-    try:
-        node = importlib.import_module("ray._private.node").Node
-        parameter: Any = importlib.import_module("ray._private.parameter")
-        start_api_server, ray_params = node.start_api_server, parameter.RayParams
-        ray_params(no_monitor=True, include_log_monitor=False)
-    except (ImportError, AttributeError, TypeError):
-        yield
-        return
-
-    def no_api_server(self: Any, **_: Any) -> None:
-        self._webui_url = ""
-
-    node.start_api_server = no_api_server
-    parameter.RayParams = partial(ray_params, no_monitor=True, include_log_monitor=False)
-    try:
-        yield
-    finally:
-        node.start_api_server, parameter.RayParams = start_api_server, ray_params
+def _lean_head() -> contextlib.AbstractContextManager[None]:
+    """Start Ray's head without the helpers that a run has no use for; with them where this version is another."""
+    with contextlib.suppress(ImportError, AttributeError, TypeError):
+        node, parameter = (importlib.import_module(f"ray._private.{name}") for name in ("node", "parameter"))
+        parameter.RayParams(**LEAN)
+        return lean_head(node.Node, parameter)
+    return contextlib.nullcontext()
 
 
 def _forget_token() -> None:
@@ -509,13 +497,3 @@ def _capacity() -> str:
 
     free, total = ray.available_resources().get("CPU", 0), ray.cluster_resources().get("CPU", 0)
     return f"Ray has {total:g} CPUs, {free:g} of them free, and a worker needs 1"
-
-
-def _reason(error: BaseException) -> str:
-    """What matters in Ray's long messages, in one short line."""
-    text = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
-    if "Worker exit detail: " in text:
-        text = text.split("Worker exit detail: ")[1].split(". Some common causes")[0]
-        if "connection error" in text:
-            text = "its process was killed, crashed, or ran out of memory"
-    return text[:300]

@@ -339,6 +339,7 @@ class Session:
             f"champion_{learning.step_name}": learning.champion.generation,
             "validation_success_rate": learning.champion.success_rate,
             "solved": learning.solved,
+            "lost_chunks": learning.lost_chunks,
             "held_out": figures,
         }
         self.tracker.log_summary(tracking_run.held_out_metrics(figures))

@@ -17,6 +17,7 @@ from evolution.policy import Observation, PolicySpec
 from evolution.replay import MAX_N_STEP
 from gridsim.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
+MAX_WORKERS = 10_000
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
 MAX_REPLAY = 10_000_000
@@ -285,6 +286,16 @@ def _check_share(settings: RunSettings, name: str) -> None:
     value = getattr(settings, name)
     if not 0.0 <= value <= 1.0:
         raise SettingsError(f"--{name.replace('_', '-')} must be 0 to 1, not {value}")
+
+
+def check_workers(workers: int, address: str, patience_s: float) -> None:
+    """Raises SettingsError, one line, where a run cannot be computed like that; no result depends on it."""
+    if not 0 <= workers <= MAX_WORKERS:
+        raise SettingsError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
+    if workers == 0 and address:
+        raise SettingsError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
+    if not 0.0 <= patience_s < math.inf:
+        raise SettingsError(f"--patience must be 0 or more, not {patience_s:g}")
 
 
 def to_dict(settings: RunSettings) -> dict[str, Any]:

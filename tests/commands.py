@@ -71,7 +71,7 @@ def ray_workers(pid):
             names[child] = Path(f"/proc/{child}/cmdline").read_bytes()
         except OSError:
             continue
-    return [child for child, name in names.items() if name.startswith(b"ray::_Actor")]
+    return [child for child, name in names.items() if name.startswith(b"ray::Actor")]
 
 
 def wait_until(condition, timeout=120.0, pause=0.02):

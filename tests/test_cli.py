@@ -220,6 +220,7 @@ WRONG = {
     "not a number": (["--population", "many"], "--population"),
     "population below elites": (["--population", "8", "--elites", "8"], "larger than"),
     "negative workers": (["--workers", "-1"], "--workers"),
+    "no patience": (["--patience", "-1"], "--patience must be 0 or more"),
     "output that cannot be written": (["--output", "/proc/nowhere"], "--output"),
     "name that is a path": (["--name", "../up"], "--name"),
     "resume of no run": (["--resume", "."], "no run's folder"),

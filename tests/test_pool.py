@@ -21,9 +21,11 @@ from cluster.pool import (
     answer,
     cut,
     everything,
+    identify,
     last_line,
     metres,
     new_collected,
+    new_outcome,
 )
 from cluster.worker import CollectTask, Task, Worker
 from evolution.breeding import FRESH, RECIPE, Mutation
@@ -257,6 +259,39 @@ def test_an_answer_is_taken_as_it_was_given() -> None:
     assert collected.results.tobytes() == whole.results.tobytes()
     assert set(collected.busy_s) == {0, 2, 5}
     assert all(not array.flags.writeable for array in (task.weights, task.episodes, task.worlds, task.keys))
+
+
+def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
+    """A member whose first episode came back and whose second kills; and an episode of a batch."""
+    task, recipes = make_task(), make_recipes(3)
+    outcome = new_outcome(task, recipes, everything(task, recipes))
+    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), 0.1)
+    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), 0.1)
+    assert not outcome.whole()
+    outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
+    assert outcome.whole()
+    assert outcome.lost.tolist() == [False, False, True]
+    assert (outcome.results["distance"] == [[1, 1], [1, 1], [0, 0]]).all()
+
+    task_of_10 = make_collect_task(10)
+    collected = new_collected(task_of_10)
+    for first, stop in ((4, 10), (0, 3)):
+        part = Answering().collect(task_of_10, [], first, stop)
+        collected.add(0, Chunk(slice(0, 1), slice(first, stop)), *part)
+    collected.lose(Chunk(slice(0, 1), slice(3, 4)))
+    assert collected.whole()
+    assert np.flatnonzero(collected.lost).tolist() == [3]
+    assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+
+
+def test_a_member_is_told_by_its_recipe() -> None:
+    recipes = make_recipes(9)
+    recipes["a"][8] = recipes["b"][8] = FRESH
+    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes[k : k + 1].tobytes()) for k in (7, 8)]
+    assert told == [
+        "member 7 (parents 7 and 5, seed 7, key 0x3039)",
+        "member 8 (no parents, seed 8, key 0x3039)",
+    ]
 
 
 def test_a_failing_worker_ends_in_one_line_that_names_the_chunk() -> None:

@@ -1,0 +1,324 @@
+"""What a run survives, with real processes: killed and stopped workers, hosts that come and go, a killed coordinator.
+
+Each ends with the same champion as the run that nobody disturbed. `GRIDSIM_KILLS=20` makes the last test as long as the
+issue asks for; it then takes some minutes.
+"""
+
+import contextlib
+import functools
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import psutil  # type: ignore[import-untyped]
+import pytest
+from commands import BIN, finish, ray_workers, rows, start, summary, wait_until
+from test_pool import Answering, make_recipes, make_task, never_built
+
+from cluster.coordinator import Evolution
+from cluster.learning import Maps
+from cluster.pool import PoolError, SerialPool
+from cluster.ray_pool import RayPool, check_address
+from cluster.settings import EvolveSettings
+from cluster.worker import Task, Worker
+from gridsim.config import SimConfig
+from gridsim.scenarios import Scenario
+
+pytestmark = pytest.mark.e2e
+
+LONG_S = 300.0  # what takes seconds where nothing else runs
+KILLS = int(os.environ.get("GRIDSIM_KILLS", "3"))
+ROAD = ["--scenario", "curved", "--traffic", "2"]
+SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5", "--elites", "4"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _stand_ins_can_be_imported() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
+        yield
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The undisturbed run, in one process."""
+    cwd = tmp_path_factory.mktemp("reference")
+    done = finish("gridsim-evolve", "--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return cwd / "runs/ref"
+
+
+def same(run: Path, reference: Path) -> bool:
+    """Whether two runs came to the same by the same way, and all of it is in MLflow once."""
+    from mlflow.tracking import MlflowClient
+
+    mine, theirs = summary(run), summary(reference)
+    assert mine["champion_sha256"] == theirs["champion_sha256"]
+    assert mine["car_steps"] == theirs["car_steps"]
+    assert mine["lost_chunks"] == 0
+    for row, other in zip(rows(run), rows(reference), strict=True):
+        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "race/success_rate"):
+            assert row[name] == other[name]
+    client = MlflowClient(tracking_uri=f"sqlite:///{run.parent.parent}/mlflow.db")
+    for name in ("fitness/best", "distance_m/mean", "car_steps", "wall_s"):
+        steps = [metric.step for metric in client.get_metric_history(mine["mlflow_run_id"], name)]
+        assert sorted(steps) == list(range(mine["generations"])), f"{name}: lost or doubled"
+    return True
+
+
+def generations(run: Path) -> int:
+    return len(rows(run)) if (run / "history.csv").is_file() else 0
+
+
+# --------------------------------------------------------------------------------------------------------- members
+
+
+class Deadly(Worker):
+    """Dies of one member of one generation. Everybody else drives as ever."""
+
+    def __init__(self, key: int, seed: int):
+        self._key, self._seed = key, seed
+
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        if self._key == task.key and self._seed in recipes["seed"]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().evaluate(task, maps, recipes)
+
+
+class Forgetting(SerialPool):
+    """Says of that member that it is lost, without having died of it."""
+
+    def __init__(self, maps: Maps, key: int, seed: int):
+        super().__init__(maps.build)
+        self._key, self._seed = key, seed
+
+    def evaluate(self, task, recipes, *arguments, **keywords):
+        outcome = super().evaluate(task, recipes, *arguments, **keywords)
+        outcome.lost[:] = (recipes["seed"] == self._seed) & (task.key == self._key)
+        outcome.results[outcome.lost] = np.zeros((), outcome.results.dtype)
+        return outcome
+
+
+def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
+    """The same one, whatever the number of workers; whoever is left is evolved as if it had never been able to win."""
+    settings = EvolveSettings("curved", 0, population=5, elites=1, parents=4, seed=3, generations=2)
+    maps = Maps(settings.scenario, SimConfig())
+    first = Evolution(settings, SerialPool(maps.build), maps)
+    recipes, key = first.genetic.ask(first._mutation())
+    seed = int(recipes["seed"][4])  # the last has a chunk of its own: it costs three workers, and no more
+    found = []
+    for workers in (0, 1, 2):
+        pool = (
+            RayPool(workers, maps.build, worker_factory=functools.partial(Deadly, key, seed))
+            if workers
+            else Forgetting(maps, key, seed)
+        )
+        with contextlib.closing(pool):
+            said: list[str] = []
+            evolution = Evolution(settings, pool, maps, warn=said.append)
+            for _ in range(settings.generations):
+                evolution.timed(evolution.step(), 1.0, None)
+            evolution.conclude()
+        assert evolution.champion is not None
+        found.append((evolution.champion.genome.tobytes(), {k: v.tobytes() for k, v in evolution.state()[0].items()}))
+        if workers:
+            assert evolution.lost_chunks == 1
+            assert said[0].startswith("generation 0, evolve: member 4 (no parents, seed ")
+            assert len(said) == 1
+    maps.close()
+    assert found[0] == found[1] == found[2]
+
+
+# --------------------------------------------------------------------------------------------------------- workers
+
+
+class Stopping(Answering):
+    """Stops its own process where it is told to, in the midst of a chunk: nobody hears of it again."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        with contextlib.suppress(FileNotFoundError):
+            (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
+            os.kill(os.getpid(), signal.SIGSTOP)
+        return super().evaluate(task, maps, recipes)
+
+
+def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> None:
+    """As a host that is cut off: Ray says nothing. Later calls go on without it; it may come back, or be replaced."""
+    wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(512)).results.tobytes()
+    pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path), patience_s=6.0)
+
+    def evaluate() -> float:
+        begun = time.monotonic()
+        outcome = pool.evaluate(make_task(), make_recipes(512))
+        assert outcome.results.tobytes() == wanted
+        assert outcome.retries == 0
+        return time.monotonic() - begun
+
+    def stop() -> int:
+        (tmp_path / "stop").touch()
+        took = evaluate()
+        (stopped,) = tmp_path.glob("stopped-*")
+        print(f"with a stopped worker: {took:.2f} s")
+        stopped.unlink()
+        return int(stopped.name.split("-")[1])
+
+    with contextlib.closing(pool):
+        wait_until(lambda: evaluate() and pool.workers() == 2, 60)
+        pid = stop()
+        calls = [evaluate() for _ in range(20)]
+        assert min(calls) < 1.0, "nothing new is sent to it, so that nothing waits for it"
+        os.kill(pid, signal.SIGCONT)
+        time.sleep(0.5)
+        assert sorted(pool.pids()) == sorted({pid, *pool.pids()})
+        assert min(evaluate() for _ in range(20)) < 1.0
+        assert pid in pool.pids(), "it came back before patience was at its end"
+
+        pid = stop()
+        wait_until(lambda: evaluate() and pid not in pool.pids(), 60)
+        wait_until(lambda: evaluate() and pool.workers() == 2, 60)
+    wait_until(lambda: not psutil.pid_exists(pid), 30)
+
+
+def test_ten_workers_killed_at_random_moments_change_nothing(reference: Path, tmp_path: Path) -> None:
+    process = start("gridsim-evolve", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)
+    run, rng, killed = tmp_path / "runs/k", random.Random(0), 0
+    try:
+        wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
+        while killed < 10 and process.poll() is None:
+            time.sleep(rng.uniform(0.0, 0.6))
+            for pid in rng.sample(victims := ray_workers(process.pid), min(len(victims), 1)):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                    killed += 1
+        _, err = process.communicate(timeout=LONG_S)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert (process.returncode, err) == (0, "")
+    print(f"{killed} workers were killed")
+    assert killed >= 3
+    assert same(run, reference)
+
+
+# ------------------------------------------------------------------------------------------------------------ hosts
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Callable[..., tuple[str, subprocess.Popen]]]:
+    """Start a Ray node as its users do: a head, or with the head's address another one. All on this machine."""
+    nodes: list[subprocess.Popen] = []
+
+    def node(cpus: int, address: str = "", **environment: str) -> tuple[str, subprocess.Popen]:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        where = [f"--address={address}"] if address else ["--head", f"--port={port}", "--include-dashboard=false"]
+        nodes.append(
+            subprocess.Popen(
+                [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}", "--object-store-memory=100000000", *where],
+                env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+        if not address:
+            wait_until(lambda: answers(f"127.0.0.1:{port}"), 60)
+        return address or f"127.0.0.1:{port}", nodes[-1]
+
+    yield node
+    for process in nodes:
+        end(process)
+
+
+def answers(address: str) -> bool:
+    with contextlib.suppress(PoolError):
+        return bool(check_address(address))
+    return False
+
+
+def below(node: subprocess.Popen, name: str) -> list[psutil.Process]:
+    """Processes of a host whose names begin so."""
+    return [p for p in psutil.Process(node.pid).children(recursive=True) if p.name().startswith(name)]
+
+
+def end(node: subprocess.Popen) -> None:
+    """Kill a host: all of its processes, at once."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+    node.wait()
+
+
+def metrics(port: int) -> dict[str, float]:
+    """What the head tells Prometheus of our run."""
+    with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as page:
+        lines = [line for line in page.read().decode().splitlines() if "gridsim_" in line and 'run="h"' in line]
+        return {line.split("{")[0].removeprefix("ray_"): float(line.rsplit(" ", 1)[1]) for line in lines}
+    return {}
+
+
+def test_hosts_come_and_go_and_in_the_end_patience_does(
+    reference: Path, cluster: Callable[..., tuple[str, subprocess.Popen]], tmp_path: Path
+) -> None:
+    """It waits for the first host, takes in the second, goes on without the first, and is resumed without any."""
+    address, _ = cluster(0, RAY_metrics_report_interval_ms="500")
+    run = tmp_path / "runs/h"
+    arguments = ("--workers", "2", "--address", address, "--patience", "15", "--name", "h", *SMALL)
+    process = start("gridsim-evolve", *arguments, cwd=tmp_path)
+    try:
+        _, first = cluster(1, address)
+        wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
+        _, second = cluster(1, address)
+        wait_until(lambda: below(second, "ray::Actor") or process.poll() is not None, LONG_S)
+        done = generations(run)
+        end(first)
+        wait_until(lambda: generations(run) > done + 1 or process.poll() is not None, LONG_S)
+        end(second)
+        killed = time.monotonic()
+        _, err = process.communicate(timeout=LONG_S)
+        assert time.monotonic() - killed > 14
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == 1
+    assert err.splitlines()[0].startswith(
+        "gridsim-evolve: error: there has been no worker for 15 s (--patience): Ray has"
+    )
+    assert err.splitlines()[1:] == ["continue with: gridsim-evolve --resume runs/h"]
+    done = finish("gridsim-evolve", "--workers", "0", "--resume", "runs/h", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert same(run, reference)
+
+
+# ------------------------------------------------------------------------------------------------------ coordinator
+
+
+def test_a_coordinator_killed_at_random_moments_and_resumed_each_time(
+    reference: Path, empty_database: Path, tmp_path: Path
+) -> None:
+    shutil.copy(empty_database, tmp_path / "mlflow.db")
+    run, rng = tmp_path / "runs/c", random.Random(1)
+    process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
+    for killed in range(KILLS):
+        if not killed:
+            wait_until(lambda: (run / "checkpoint.npz").exists(), LONG_S)
+        time.sleep(rng.uniform(0.0, 1.0 if not killed else 6.0))
+        process.kill()
+        _, err = process.communicate()
+        assert err == ""
+        process = start("gridsim-evolve", "--workers", "2", "--resume", "runs/c", cwd=tmp_path)
+    _, err = process.communicate(timeout=LONG_S)
+    assert (process.returncode, err) == (0, "")
+    assert same(run, reference)
