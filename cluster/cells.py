@@ -135,7 +135,8 @@ def settings_of(cell: Cell) -> RunSettings:
     common: dict[str, Any] = {"scenario": cell.scenario, "traffic": cell.traffic, "seed": cell.seed}
     if cell.learner == "dqn":
         steps = plan.budget.car_steps or UNBOUND
-        every = min(DqnSettings.evaluate_every, max(steps // EVALUATIONS, 1))
+        usual = DqnSettings.suited[plan.observation]["evaluate_every"]
+        every = min(usual, max(steps // EVALUATIONS, 1))
         if plan.observation == "rays":  # what evolution sees there, and not how the wheels stand
             seen = PolicySpec.parse(EvolveSettings(**common).policy)
             common["policy"] = "mlp:64,64" + "+motion" * getattr(seen, "motion", False)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cluster.settings import EvolveSettings, SettingsError, from_dict, to_dict
+from cluster.settings import DqnSettings, EvolveSettings, SettingsError, from_dict, to_dict
 
 
 def test_the_policy_follows_the_observation():
@@ -35,3 +35,19 @@ def test_a_run_from_before_there_were_grids_sees_rays():
     values = to_dict(EvolveSettings(policy="mlp:9"))
     del values["observation"]
     assert from_dict(EvolveSettings, values).observation == "rays"
+
+
+def test_what_is_not_given_suits_the_observation():
+    rays, grid = DqnSettings(), DqnSettings(observation="grid", batch=32)
+    for settings in (rays, grid):
+        settings.check()
+    assert (rays.batch, rays.updates, rays.replay) == (256, 4.0, 1_000_000)
+    assert (grid.batch, grid.updates, grid.replay) == (32, 16.0, 100_000)
+    assert from_dict(DqnSettings, to_dict(grid)) == grid
+
+
+def test_in_traffic_evolution_sees_motion():
+    assert EvolveSettings().policy == "mlp:6,7"
+    assert EvolveSettings(traffic=2).policy == EvolveSettings(scenario="city").policy == "mlp:16,16+motion"
+    assert EvolveSettings(traffic=2, observation="grid").policy == EvolveSettings(observation="grid").policy
+    assert EvolveSettings(traffic=2, policy="mlp:5").policy == "mlp:5"
