@@ -139,8 +139,8 @@ class EvolveSettings(RunSettings):
     units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
-    generations: int = 120
-    """Generations at most; a run whose champion is solved stops earlier."""
+    generations: int = 0
+    """Generations at most; a run whose champion is solved stops earlier. 0: 100, in traffic 90."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8
@@ -159,6 +159,11 @@ class EvolveSettings(RunSettings):
     """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.generations:  # two minutes' worth on two cores, in traffic five
+            object.__setattr__(self, "generations", 90 if self.traffic else 100)
 
     def default_policy(self) -> str:
         return self.policy_in_traffic if self.traffic and self.observation == "rays" else super().default_policy()
