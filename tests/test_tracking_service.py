@@ -165,6 +165,7 @@ def test_an_edited_run_is_finished_all_the_same_and_nothing_of_it_is_sent(served
     before = query(served.database, "SELECT * FROM metrics")
     sent, lost = send(open_run(tmp_path / "edited"), "", "gridsim")
     assert sent == NOTHING
+    assert lost is not None
     assert lost.startswith("what MLflow lacks is not sent: ")
     assert "\n" not in lost
     assert query(served.database, "SELECT * FROM metrics") == before
