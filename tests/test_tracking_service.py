@@ -54,9 +54,9 @@ def served(tmp_path_factory, empty_database):
                 runs[name] = start(
                     COMMAND, *SMALL, "--workers", "0", "--name", name, "--tracking-uri", uri, cwd=cwd
                 )  # fmt: skip
-            wait_until(lambda: begun("during") and begun("after"))
+            wait_until(lambda: begun("during") and begun("after"), 300)
         seen = lines("during")  # and the server is dead
-        wait_until(lambda: lines("during") >= min(seen + 3, GENERATIONS))
+        wait_until(lambda: lines("during") >= min(seen + 3, GENERATIONS), 300)
         os.kill(runs["during"].pid, signal.SIGSTOP)
         said["after"] = runs["after"].communicate(timeout=600)
         with mlflow_server(cwd, port):
