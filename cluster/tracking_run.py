@@ -31,14 +31,10 @@ BEST = {
 """MLflow's table of runs shows each metric's last value; these are logged when they grow, so that it is the best."""
 
 
-def file_word(text: str) -> str:
-    """A scenario's or policy's text with nothing in it but what names of files and models may have."""
-    return re.sub(r"[^\w.+=@-]", "_", text)
-
-
 def what(settings: RunSettings) -> str:
     """Scenario, algorithm and seed in one word, with which the name of a run begins unless another is given."""
-    return f"{file_word(label(settings.scenario))}-{settings.algorithm}-s{settings.seed}"
+    road = re.sub(r"[^\w.+=@-]", "_", label(settings.scenario))  # as names of folders may be
+    return f"{road}-{settings.algorithm}-s{settings.seed}"
 
 
 def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
@@ -96,7 +92,8 @@ def held_out_metrics(figures: Mapping[str, float]) -> dict[str, float]:
 
 def model_name(settings: RunSettings) -> str:
     """The registered model that the champions of such runs are versions of."""
-    return f"gridsim-{file_word(label(settings.scenario))}-{settings.algorithm}"
+    road = re.sub(r"[^\w.-]", "_", label(settings.scenario))  # an @ would be read as an alias
+    return f"gridsim-{road}-{settings.algorithm}"
 
 
 def headline(settings: RunSettings) -> str:

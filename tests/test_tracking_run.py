@@ -70,6 +70,7 @@ def test_tags_and_params_name_everything():
     assert tags(DqnSettings())["algorithm"] == "dqn"
     assert params(EvolveSettings()).items() >= {"population": "512", "vehicle/wheelbase": "2.5"}.items()
     assert model_name(EvolveSettings("curved")) == "gridsim-curved-evolution"
+    assert model_name(EvolveSettings("maps/my town@2.png")) == "gridsim-my_town_2-evolution"
 
 
 def test_best_figures_are_told_when_they_are_reached():

@@ -15,9 +15,10 @@ from types import SimpleNamespace
 
 import pytest
 from commands import finish, rows, start, summary, wait_until
-from tracked import client, drive, free_port, mlflow_server
+from tracked import client, drive_registered, free_port, mlflow_server
 
-from cluster.late import NOTHING
+from cluster.late import NOTHING, send
+from cluster.run import open_run
 
 pytestmark = pytest.mark.e2e
 
@@ -53,9 +54,9 @@ def served(tmp_path_factory, empty_database):
                 runs[name] = start(
                     COMMAND, *SMALL, "--workers", "0", "--name", name, "--tracking-uri", uri, cwd=cwd
                 )  # fmt: skip
-            wait_until(lambda: begun("during") and begun("after"))
+            wait_until(lambda: begun("during") and begun("after"), 300)
         seen = lines("during")  # and the server is dead
-        wait_until(lambda: lines("during") >= min(seen + 3, GENERATIONS))
+        wait_until(lambda: lines("during") >= min(seen + 3, GENERATIONS), 300)
         os.kill(runs["during"].pid, signal.SIGSTOP)
         said["after"] = runs["after"].communicate(timeout=600)
         with mlflow_server(cwd, port):
@@ -131,9 +132,7 @@ def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     assert run.info.end_time == pytest.approx(1000.0 * ended, abs=2.0)  # not when it was sent
 
     dump = [query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")]
-    done = finish(COMMAND, "--resume", "runs/after", cwd=served.cwd)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert f"is finished: {GENERATIONS} generations; {NOTHING}." in done.stdout
+    assert send(open_run(folder), "", "gridsim") == (NOTHING, None)
     assert dump == [
         query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")
     ]
@@ -146,7 +145,7 @@ def test_an_outage_changes_no_champion(served):
 
 def test_the_registered_champion_drives_as_the_file_does(served):
     """In a fresh process, from the registry alone."""
-    count, end, distance = drive(
+    count, end, distance = drive_registered(
         served.uri, "models:/gridsim-curved-evolution/1", served.cwd / "runs/during/champion.npz", 2
     )
     assert count > 10
@@ -156,9 +155,6 @@ def test_the_registered_champion_drives_as_the_file_does(served):
 
 @pytest.mark.parametrize("change", [{"held_out": 3}, {"wall_s": None}, {"held_out": {"success_rate": "all"}}])
 def test_an_edited_run_is_finished_all_the_same_and_nothing_of_it_is_sent(served, tmp_path, change):
-    from cluster.late import send
-    from cluster.run import open_run
-
     shutil.copytree(served.cwd / "runs/during", tmp_path / "edited")
     path = tmp_path / "edited/summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))

@@ -84,37 +84,45 @@ def mlflow_server(folder, port):
         server.wait(10)
 
 
-# ---------------------------------------------------------------------------------------------- a fresh process
+# ---------------------------------------------------------------------------------------------- driving
 
-DRIVE = """
+
+def drive_both(champion, network, traffic=0):
+    """Drive one episode by a champion and by its torch model, which act alike: steps, how it ended, metres."""
+    import torch
+
+    def drive(act):
+        env = champion.make_env(traffic=traffic)
+        observation, _ = env.reset(seed=2_000_001)
+        actions, over = [], False
+        while not over:
+            actions.append(act(observation))
+            observation, _, terminated, truncated, info = env.step(actions[-1])
+            over = terminated or truncated
+        return actions, info
+
+    mine = drive(champion.act)
+    theirs = drive(lambda seen: int(network(torch.from_numpy(seen[None])).argmax()))
+    assert mine == theirs, (mine[1], theirs[1])
+    return len(mine[0]), mine[1]["end"], mine[1]["distance_m"]
+
+
+FRESH = """
 import sys
-import mlflow.pytorch, torch
+import mlflow.pytorch
 from cluster.champion import load_champion
-tracking, model, path, traffic = sys.argv[1:]
-mlflow.set_tracking_uri(tracking)
-network, champion = mlflow.pytorch.load_model(model), load_champion(path)
-
-def drive(act):
-    env = champion.make_env(traffic=int(traffic))
-    observation, _ = env.reset(seed=2_000_001)
-    actions, over = [], False
-    while not over:
-        actions.append(act(observation))
-        observation, _, terminated, truncated, info = env.step(actions[-1])
-        over = terminated or truncated
-    return actions, info
-
-mine, theirs = drive(champion.act), drive(lambda seen: int(network(torch.from_numpy(seen[None])).argmax()))
-assert mine == theirs, (mine[1], theirs[1])
-print(len(mine[0]), mine[1]["end"], mine[1]["distance_m"])
+from tracked import drive_both
+mlflow.set_tracking_uri(sys.argv[1])
+print(*drive_both(load_champion(sys.argv[3]), mlflow.pytorch.load_model(sys.argv[2]), int(sys.argv[4])))
 """
 
 
-def drive(tracking, model, champion, traffic):
-    """Drive a model and a champion.npz in a fresh process that takes no pickle: steps, how it ended, metres."""
-    command = [sys.executable, "-c", DRIVE, tracking, model, str(champion), str(traffic)]
+def drive_registered(uri, model, champion, traffic):
+    """`drive_both` in a fresh process, which takes no pickle: a registered model and a champion.npz."""
+    command = [sys.executable, "-c", FRESH, uri, model, str(champion), str(traffic)]
     safe = with_path(MLFLOW_ALLOW_PICKLE_DESERIALIZATION="false")
-    done = subprocess.run(command, env=safe, capture_output=True, text=True, timeout=300)
+    safe["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
+    done = subprocess.run(command, env=safe, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     count, end, distance = done.stdout.split()
     return int(count), end, float(distance)
