@@ -4,6 +4,7 @@ import importlib.util
 import json
 import re
 import shlex
+import shutil
 import sys
 import time
 import tomllib
@@ -208,9 +209,10 @@ class Machines:
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def reference(tmp_path_factory: pytest.TempPathFactory, empty_database: Path) -> Iterator[Path]:
     """The same run in one process, meanwhile."""
     folder = tmp_path_factory.mktemp("reference")
+    shutil.copy(empty_database, folder / "mlflow.db")
     process = start("gridsim-evolve", "--workers", "0", "--name", "r", *RUN, cwd=folder)
     yield folder / "runs/r"
     process.kill()
@@ -218,10 +220,11 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def machines(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Iterator[Machines]:
+def machines(tmp_path_factory: pytest.TempPathFactory, root: Path, empty_database: Path) -> Iterator[Machines]:
     if reason := hosts.missing():
         pytest.skip(reason)
     machines = Machines(tmp_path_factory.mktemp("hosts"), root)
+    shutil.copy(empty_database, machines.head.home / "mlflow.db")
     yield machines
     machines.close()
 
