@@ -154,14 +154,15 @@ def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
     """What the simulation is fed with, and the figures of it."""
     pool = RayPool(2, maps.build, worker_factory=InstantWorker)
     try:
-        children = children_per_s(pool, CHILDREN // 10 if quick else CHILDREN)
+        children, child = children_per_s(pool, CHILDREN // 10 if quick else CHILDREN)
         chunk, look = chunk_costs(pool, CHUNKS // 10 if quick else CHUNKS)
         busy, byte = ray_costs()
     finally:
         pool.close()
-    costs = Costs(1.0 / children, chunk, look, busy, byte, gene_s(MLP))
+    costs = Costs(child, chunk, look, busy, byte, gene_s(MLP))
     figures = {
         "children_per_s": children,
+        "child_us": 1e6 * child,
         "chunk_us": 1e6 * chunk,
         "look_us": 1e6 * look,
         "look_us_per_worker": 1e6 * busy,

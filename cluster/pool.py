@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import time
 from collections.abc import Callable, Sequence
@@ -27,9 +28,10 @@ Meanwhile = Callable[[], bool | None]  # something to do; called until it return
 PARTS = 4  # as many workers' chunks are a pool's that has one worker and nothing to send: for progress alone
 METRE_S = 1e-6  # seconds that a metre of an episode's target takes, before it is known better
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to take in its results
-CHUNK_S = 0.0005  # of the coordinator's time, for a chunk and its results: who has many workers sends larger ones
+CHUNK_S = 0.001  # of the coordinator's time, for a chunk and its results: who has many workers sends larger ones
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
 LARGER = 4  # times what is worth sending, where that is more
+WHOLE = 0.6  # of a member's metres, from which on it is not cut
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
 LARGE_BYTES = 16 << 20  # of results, that are kept column by column
 PLAIN, PACKED = 0, 1  # how results travel
@@ -375,13 +377,15 @@ def cut(task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s:
         row, column = rows.start, 0
         while row < rows.stop and columns.stop > columns.start:
             share = min(max(SHARE * left / workers, least), largest)
-            if column == 0 and share >= mileage[-1]:
-                stop = min(row + int(share / mileage[-1]), rows.stop)
+            if column == 0 and share >= WHOLE * mileage[-1]:
+                stop = min(row + max(int(share / mileage[-1]), 1), rows.stop)
                 chunks.append(Chunk(slice(row, stop), columns))
                 left -= (stop - row) * mileage[-1]
                 row = stop
             else:
-                stop = int(np.searchsorted(mileage, mileage[column] + share, side="right")) - 1
+                rest = mileage[-1] - mileage[column]
+                share = rest / math.ceil(rest / share)  # pieces as even as may be: a small one costs as much to send
+                stop = int(np.searchsorted(mileage, mileage[column] + share * (1.0 + 1e-9), side="right")) - 1
                 stop = min(max(stop, column + 1), len(mileage) - 1)
                 chunks.append(Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)))
                 left -= mileage[stop] - mileage[column]
