@@ -444,7 +444,7 @@ def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
 def test_a_cluster_is_told_how_a_run_is_doing(
     cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """What Prometheus reads from its node, under the run's name; the part of Ray that tells it comes with ray[default]."""
+    """What Prometheus reads from its node, under the run's name. What tells it there comes with ray[default]."""
     pytest.importorskip("prometheus_client")
     monkeypatch.setenv("HOME", str(tmp_path))
     quick = {"RAY_metrics_report_interval_ms": "500"}
