@@ -10,6 +10,11 @@ def is_to_blame(error: BaseException) -> bool:
     return type(error).__name__ not in _ELSEWHERE and "its node has died" not in str(error)
 
 
+def failed_as_it_began(error: BaseException) -> bool:
+    """Whether a worker's own beginning raised an exception: the next one's would, too."""
+    return "raised in its creation task" in str(error)
+
+
 def reason(error: BaseException) -> str:
     """What matters in Ray's long messages."""
     text = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()

@@ -39,7 +39,8 @@ class RunMetrics:
             self._workers.set(workers)
 
     def count(self, car_steps: int, retries: int, lost: int) -> None:
-        """Tell what has come since the last time."""
+        """Tell what has come since the last time, now that nothing waits."""
+        self._queue.set(0)
         for counter, value in zip(self._counters, (car_steps, retries, lost), strict=True):
             if value:
                 counter.inc(value)

@@ -67,7 +67,7 @@ from cluster.ray_address import (
     probe,
     store_bytes,
 )
-from cluster.ray_errors import is_to_blame, reason
+from cluster.ray_errors import failed_as_it_began, is_to_blame, reason
 from cluster.ray_metrics import RunMetrics
 from cluster.worker import CollectTask, Task, Worker
 from evolution.packing import pack_recipes
@@ -79,8 +79,8 @@ UNKNOWN_S = 10.0  # that a chunk may take where nothing is known of such tasks
 MUTE = 10.0  # times what its chunk should take at most, in which a worker that is only slow has answered
 FIRST_S = 600.0  # for a worker's first answer: it may have to compile the kernels
 MAX_DEATHS = 15  # of workers in a row, without an answer in between: two members that kill cost fewer
-MAX_FAILED_STARTS = 3  # in a row, while nobody else is up
-MAX_PAUSE_S = 30.0  # before a worker that cannot start is started again
+MAX_FAILED_STARTS = 3  # in a row, each by an exception, while nobody else is up
+MAX_PAUSE_S = 5.0  # before a worker that did not come up is started again
 MAP_BYTES = 512 << 20  # of maps kept there: those of training and validation, or they are sent every generation
 
 
@@ -143,7 +143,7 @@ class RayPool:
         self._metrics: RunMetrics | None = None
         self._slots: list[_Slot] = []
         self._serial = 0
-        self._failed_starts = 0
+        self._failed_starts, self._last_words = 0, ""
         self._metre_s: dict[tuple[type, Limits], float] = {}  # what a metre of such tasks took the last time
         self._session: str | None = None  # folder of our own Ray's logs
         self._failure: BaseException | None = None
@@ -224,7 +224,8 @@ class RayPool:
             if self.pids():
                 nobody_since = time.monotonic()
             elif time.monotonic() - nobody_since > self._patience_s:
-                raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {_capacity()}")
+                why = _capacity() + self._last_words
+                raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
         if whole > 0.0:
             self._metre_s[kind] = max(sum(brought.busy_s.values()) / whole, 1e-9)
@@ -405,12 +406,12 @@ class RayPool:
             if not is_to_blame(error):
                 return self._replace(slot)
             self._failed_starts += 1
-            if self._failed_starts >= MAX_FAILED_STARTS and not self.pids():
+            self._last_words = f"; the last one: {reason(error)}{self._logs()}"
+            if failed_as_it_began(error) and self._failed_starts >= MAX_FAILED_STARTS and not self.pids():
                 raise PoolError(f"no worker can be started: {reason(error)}{self._logs()}") from error
             self._replace(slot, min(BACKOFF_S * 2.0**self._failed_starts, MAX_PAUSE_S))
         else:
-            slot.hello = None
-            self._failed_starts = 0
+            slot.hello, self._failed_starts, self._last_words = None, 0, ""
 
     def _logs(self) -> str:
         return f" (logs: {self._session}/logs)" if self._session else ""

@@ -10,10 +10,12 @@ import pytest
 from cluster.checkpoint import CheckpointError, load, save
 from cluster.coordinator import Evolution
 from cluster.learning import Maps
-from cluster.pool import SerialPool
+from cluster.pool import PoolError, SerialPool
 from cluster.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
 from cluster.settings import EvolveSettings
+from evolution.breeding import breed
 from evolution.curriculum import CrashError
+from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
 
@@ -274,3 +276,59 @@ def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
     (tmp_path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
     go_on_in(tmp_path, maps).learn()
     assert (tmp_path / "history.csv").read_bytes() == whole
+
+
+class Losing(SerialPool):
+    """Loses the members in some rows of some calls, as where each of those killed its workers."""
+
+    def __init__(self, maps, **rows):
+        super().__init__(maps.build)
+        self.rows = rows  # by the call's kind: evolve, race or validate
+        self.genomes = np.zeros((0, 311), dtype=np.float32)  # of who was lost
+
+    def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
+        outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
+        kind = "race" if task.rewind else "evolve" if recipes["seed"].any() else "validate"
+        rows = np.arange(len(recipes))[self.rows.get(kind, slice(0, 0))]
+        outcome.lost[rows] = True
+        outcome.results[rows] = np.zeros((), outcome.results.dtype)
+        outcome.warnings = [f"member {row} is lost" for row in rows]
+        lost = breed(task.parents, recipes[rows], task.key, PolicySpec.parse(task.policy), task.mutation)
+        self.genomes = np.concatenate([self.genomes, lost])
+        return outcome
+
+
+def losing(maps, **rows):
+    evolution = begin(maps)
+    evolution.pool = Losing(maps, **rows)
+    evolution.score = lambda results, target: -results["distance"].sum(axis=1)  # who drives nowhere is the best
+    evolution.warn = lambda text: None
+    return evolution
+
+
+def test_who_was_lost_cannot_win_whatever_the_fitness(maps):
+    """Neither in the generation nor in its race: not an elite, not a parent, not tried."""
+    evolution = losing(maps, evolve=slice(3, 24), race=slice(0, 2))
+    go_on(evolution)
+    kept = np.concatenate([evolution.genetic.parents, evolution.elites, evolution.trials.first])
+    assert len(evolution.pool.genomes) == 23 == evolution.lost_chunks
+    assert not {genome.tobytes() for genome in evolution.pool.genomes} & {genome.tobytes() for genome in kept}
+    assert np.isfinite(list(evolution.history[0].values())).all()
+    arrays, meta = evolution.state()
+    resumed = begin(maps)
+    resumed.restore(arrays, meta)
+    assert resumed.lost_chunks == 23
+
+
+@pytest.mark.parametrize(("kind", "stage"), [("evolve", "evolve"), ("race", "race")])
+def test_where_all_are_lost_the_run_stops(maps, kind, stage):
+    with pytest.raises(PoolError, match=rf"^{stage}: nothing is left, all \d+ that were tried killed their workers"):
+        losing(maps, **{kind: slice(0, None)}).step()
+
+
+def test_who_was_lost_in_validation_is_no_champion(maps):
+    evolution = losing(maps, validate=slice(0, None))
+    go_on(evolution)
+    with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
+        evolution.conclude()
+    assert evolution.champion is None

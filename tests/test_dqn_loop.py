@@ -8,8 +8,9 @@ import pytest
 from cluster import dqn_loop
 from cluster.dqn_loop import Dqn
 from cluster.learning import Maps
-from cluster.pool import SerialPool
+from cluster.pool import Chunk, PoolError, SerialPool, new_collected
 from cluster.settings import DqnSettings, SettingsError
+from cluster.worker import Worker
 from gridsim.config import SimConfig
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -117,3 +118,42 @@ def test_settings_that_no_run_can_have(changes, words):
 def test_the_default_replay_fits_a_checkpoint():
     for observation in ("rays", "grid"):
         DqnSettings(observation=observation).check()
+
+
+class Losing(SerialPool):
+    """Loses every `one_in`-th episode, as where each of those killed its workers."""
+
+    one_in = 3
+
+    def collect(self, task, on_progress=None, meanwhile=None):
+        collected, worker = new_collected(task), Worker()
+        maps = [self._build_map(*name) for name in task.maps]
+        for k in range(len(task.episodes)):
+            chunk = Chunk(slice(0, 1), slice(k, k + 1))
+            if k % self.one_in:
+                collected.add(0, chunk, *worker.collect(task, maps, k, k + 1))
+            else:
+                collected.lose(chunk)
+                collected.warnings.append(f"episode {k} is lost")
+        while meanwhile and meanwhile():
+            pass
+        return collected
+
+
+def test_lost_episodes_are_in_no_replay_and_in_no_mean(loop, maps):
+    learning = loop()
+    learning.pool = Losing(maps.build)
+    said: list[str] = []
+    learning.warn = said.append
+    results, rewards = learning._collect()
+    asked = len(said) + len(results)
+    assert len(said) == learning.lost_chunks == -(-asked // 3)
+    assert said[1] == "evaluation 0, collect: episode 3 is lost"
+    assert (results["steps"] > 0).all()
+    assert learning.replay.added == learning.car_steps + len(results)
+    assert learning.episodes == len(results)
+    assert learning._mean_steps == learning.car_steps / len(results)
+    assert np.isfinite(rewards)
+    learning.pool.one_in = 1
+    with pytest.raises(PoolError, match=r"^collect: nothing is left, all \d+ that were tried killed their workers"):
+        learning._collect()

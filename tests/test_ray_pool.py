@@ -12,6 +12,7 @@ import sysconfig
 import textwrap
 import threading
 import time
+import urllib.request
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -448,6 +449,53 @@ def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
             assert len(processes) == 2, "there are two CPUs"
         assert gone(processes) == []
         check_address(address)
+
+
+@pytest.mark.usefixtures("no_pool")
+def test_a_cluster_is_told_how_a_run_is_doing(
+    cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """What Prometheus reads from its node, under the run's name. What tells it there comes with ray[default]."""
+    pytest.importorskip("prometheus_client")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    quick = {"RAY_metrics_report_interval_ms": "500"}
+    for name, value in quick.items():
+        monkeypatch.setenv(name, value)
+    address = cluster(PYTHONPATH=str(Path(__file__).parent), **quick)
+    with contextlib.closing(RayPool(1, never_built, address, worker_factory=Stepping, run="a run")) as pool:
+        pool.evaluate(make_task(), make_recipes(512))
+        os.kill(pool.pids()[0], signal.SIGKILL)
+        pool.evaluate(make_task(), make_recipes(512))
+        import ray
+
+        (node,) = ray.nodes()
+        page = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
+
+        def told() -> dict[str, float]:
+            time.sleep(0.2)
+            pool.evaluate(make_task(), make_recipes(0))
+            with contextlib.suppress(OSError), urllib.request.urlopen(page, timeout=10) as answer:
+                lines = [line for line in answer.read().decode().splitlines() if 'run="a run"' in line]
+                return {line.split("{")[0]: float(line.rsplit(" ", 1)[1]) for line in lines}
+            return {}
+
+        names = {"ray_gridsim_car_steps_total", "ray_gridsim_retries_total", "ray_gridsim_queue", "ray_gridsim_workers"}
+        until = time.monotonic() + 60
+        while not names <= set(found := told()) and time.monotonic() < until:
+            pass
+    assert names <= set(found), found
+    assert found["ray_gridsim_car_steps_total"] == 2 * 512 * 2 * 3
+    assert found["ray_gridsim_retries_total"] >= 1
+    assert "ray_gridsim_lost_chunks_total" not in found
+
+
+class Stepping(Answering):
+    """Three steps an episode."""
+
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        results, seconds = super().evaluate(task, maps, recipes)
+        results["steps"] = 3
+        return results, seconds
 
 
 def test_a_cluster_that_wants_a_token(
