@@ -116,8 +116,8 @@ def unpack_results(raw: bytes | memoryview, widths: np.ndarray) -> np.ndarray:
     packed = np.frombuffer(raw, np.uint8).reshape(-1, _row_bytes(widths))
     values = np.empty((len(packed), len(widths)), dtype=np.uint32)
     _read(packed, widths, values)
-    values = values.reshape(len(packed), len(widths) // _FIELDS, _FIELDS)
-    results = np.zeros(values.shape[:2], dtype=RESULT)
-    results["distance"], results["paced"] = values[..., 0] / PER_METRE, values[..., 1] / PER_METRE
-    results["steps"], results["end"] = values[..., 2], values[..., 3]
+    fields = values.reshape(len(packed), len(widths) // _FIELDS, _FIELDS)
+    results = np.zeros(fields.shape[:2], dtype=RESULT)
+    results["distance"], results["paced"] = fields[..., 0] / PER_METRE, fields[..., 1] / PER_METRE
+    results["steps"], results["end"] = fields[..., 2], fields[..., 3]
     return results
