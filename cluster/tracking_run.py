@@ -39,7 +39,9 @@ def what(settings: RunSettings) -> str:
 
 def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
     """Settings that are not what they are by default, but for those that decide when a run ends."""
-    usual = to_dict(type(settings)(scenario=settings.scenario, observation=settings.observation))
+    kind = type(settings)
+    usual = to_dict(kind(scenario=settings.scenario, observation=settings.observation, traffic=settings.traffic))
+    usual["traffic"] = kind(scenario=settings.scenario).traffic
     left_out = {"seed", *settings.unbound, *without}
     return {name: value for name, value in to_dict(settings).items() if name not in left_out and value != usual[name]}
 

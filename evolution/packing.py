@@ -114,10 +114,10 @@ def unpack_results(raw: bytes | memoryview, widths: np.ndarray) -> np.ndarray:
     """RESULT [n, e] that `pack_results` packed."""
     widths = widths.ravel()
     packed = np.frombuffer(raw, np.uint8).reshape(-1, _row_bytes(widths))
-    read = np.empty((len(packed), len(widths)), dtype=np.uint32)
-    _read(packed, widths, read)
-    values = read.reshape(len(packed), len(widths) // _FIELDS, _FIELDS)
-    results = np.zeros(values.shape[:2], dtype=RESULT)
-    results["distance"], results["paced"] = values[..., 0] / PER_METRE, values[..., 1] / PER_METRE
-    results["steps"], results["end"] = values[..., 2], values[..., 3]
+    values = np.empty((len(packed), len(widths)), dtype=np.uint32)
+    _read(packed, widths, values)
+    fields = values.reshape(len(packed), len(widths) // _FIELDS, _FIELDS)
+    results = np.zeros(fields.shape[:2], dtype=RESULT)
+    results["distance"], results["paced"] = fields[..., 0] / PER_METRE, fields[..., 1] / PER_METRE
+    results["steps"], results["end"] = fields[..., 2], fields[..., 3]
     return results

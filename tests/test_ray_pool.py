@@ -375,7 +375,7 @@ def test_what_a_worker_is_given_and_what_it_has_loaded() -> None:
 
 @pytest.mark.usefixtures("no_pool")
 def test_workers_that_cannot_start_are_given_up() -> None:
-    pool = RayPool(2, never_built, worker_factory=Unfit)
+    pool = RayPool(2, never_built, worker_factory=Unfit, patience_s=300.0)
     with (
         contextlib.closing(pool),
         pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: not in this state"),
