@@ -288,7 +288,9 @@ def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
 def test_a_member_is_told_by_its_recipe() -> None:
     recipes = make_recipes(9)
     recipes["a"][8] = recipes["b"][8] = FRESH
-    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), pack_recipes(recipes[k : k + 1])) for k in (7, 8)]
+    told = [
+        identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), pack_recipes(recipes[k : k + 1])) for k in (7, 8)
+    ]
     assert told == [
         "member 7 (parents 7 and 5, seed 7, key 0x3039)",
         "member 8 (no parents, seed 8, key 0x3039)",
