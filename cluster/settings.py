@@ -129,14 +129,14 @@ class EvolveSettings(RunSettings):
 
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
-    policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"
+    policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"  # on roads that usually have traffic
     unbound: ClassVar[tuple[str, ...]] = ("generations",)
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
-    closer, by default mlp:6,7, in traffic mlp:16,16+motion; on the grid cnn: with the channels of two convolutions, the
-    units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    closer, by default mlp:6,7, in traffic on highway, roundabout and city mlp:16,16+motion; on the grid cnn: with the
+    channels of two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 0
@@ -166,7 +166,8 @@ class EvolveSettings(RunSettings):
             object.__setattr__(self, "generations", 90 if self.traffic else 100)
 
     def default_policy(self) -> str:
-        return self.policy_in_traffic if self.traffic and self.observation == "rays" else super().default_policy()
+        usual = self.traffic and default_traffic(self.scenario) and self.observation == "rays"
+        return self.policy_in_traffic if usual else super().default_policy()
 
     @property
     def algorithm(self) -> str:

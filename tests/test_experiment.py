@@ -107,7 +107,8 @@ def test_finished_runs_are_never_trained_again(tmp_path):
 
 @pytest.mark.parametrize(("observation", "traffic"), [("rays", 0), ("rays", 4), ("grid", 4)])
 def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation, traffic):
-    plan = dataclasses.replace(PLAN, observation=observation, traffic=traffic, learners=LEARNERS)
+    roads = ("highway", "city") if traffic else PLAN.scenarios
+    plan = dataclasses.replace(PLAN, scenarios=roads, observation=observation, traffic=traffic, learners=LEARNERS)
     specs = []
     for cell in plan.cells(tmp_path):
         settings = settings_of(cell)
@@ -115,7 +116,7 @@ def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation, tra
         specs.append(PolicySpec.parse(settings.policy))
     assert {spec.observation for spec in specs} == {observation}
     if observation == "rays":
-        assert {spec.inputs for spec in specs} == {63 if traffic else 32}
+        assert {spec.inputs for spec in specs} == {63 if traffic else 32}, plan
 
 
 def stop_after(done, count):

@@ -46,8 +46,10 @@ def test_what_is_not_given_suits_the_observation():
     assert from_dict(DqnSettings, to_dict(grid)) == grid
 
 
-def test_in_traffic_evolution_sees_motion():
-    assert EvolveSettings().policy == "mlp:6,7"
-    assert EvolveSettings(traffic=2).policy == EvolveSettings(scenario="city").policy == "mlp:16,16+motion"
-    assert EvolveSettings(traffic=2, observation="grid").policy == EvolveSettings(observation="grid").policy
-    assert EvolveSettings(traffic=2, policy="mlp:5").policy == "mlp:5"
+def test_evolution_sees_motion_where_there_usually_is_traffic():
+    for scenario in ("highway", "roundabout", "city"):
+        assert EvolveSettings(scenario).policy == EvolveSettings(scenario, traffic=2).policy == "mlp:16,16+motion"
+        assert EvolveSettings(scenario, traffic=0).policy == "mlp:6,7"
+    assert EvolveSettings(traffic=2).policy == "mlp:6,7"
+    assert EvolveSettings("city", observation="grid").policy == EvolveSettings(observation="grid").policy
+    assert EvolveSettings("city", policy="mlp:5").policy == "mlp:5"

@@ -58,7 +58,7 @@ def test_seeds_are_one_group_and_nothing_else_is():
     assert len({of(), *others}) == 1 + len(others)
     assert of(population=64, sigma=0.1) == "curved evolution mlp:6,7, population 64, sigma 0.1"
     assert of(DqnSettings, observation="grid") == "curved dqn cnn:16,32,256@4"
-    assert of(search="random", traffic=3) == "curved random mlp:16,16+motion 3 cars"
+    assert of(search="random", traffic=3) == "curved random mlp:6,7 3 cars"
 
 
 def test_tags_and_params_name_everything():
@@ -93,7 +93,7 @@ def test_the_description_says_what_came_of_it_and_how_to_watch_it(tmp_path):
     run = new_run(tmp_path, "mine", EvolveSettings("curved", seed=3, traffic=2))
     begun, done = describe(run), describe(run, SUMMARY)
     assert begun.splitlines()[0] == done.splitlines()[0]
-    assert begun.startswith("Evolution of a `mlp:16,16+motion` driver on **curved**, among 2 cars, seed 3.")
+    assert begun.startswith("Evolution of a `mlp:6,7` driver on **curved**, among 2 cars, seed 3.")
     for words in ("48 generations, 96.3 million car-steps and 57 s", "**98.4%**", "7.61 m/s", "collides in 1.6%",
                   f"gridsim-watch {tmp_path}/mine", "champion.mp4", "float32 [n, 32]", "gridsim-curved-evolution",
                   'load_model("runs:/{run_id}/model")'):  # fmt: skip
