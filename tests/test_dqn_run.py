@@ -135,7 +135,7 @@ def test_a_run_of_the_other_learner_is_refused(reference, tmp_path):
         (["--device", "cuda"], "--device cuda"),
         (["--device", "abacus"], "--device"),
         (["--discount", "1.5"], "--discount must be 0 to 1, not 1.5"),
-        (["--batch", "0"], "--batch must be 1 or more, not 0"),
+        (["--batch", "-1"], "--batch must be 1 or more, not -1"),
         (["--replay", "10"], "--replay must be 256"),
         (["--learning-rate", "nan"], "--learning-rate must be above 0, not nan"),
         (["--policy", "cnn"], "policy cnn sees the grid"),
