@@ -30,12 +30,18 @@ class News(NamedTuple):
 
 
 class Actor:
-    """Runs in a worker's process: holds the present task and its maps, answers chunks."""
+    """Runs in a worker's process: holds the present task and its maps, answers chunks.
 
-    def __init__(self, factory: Callable[[], Worker]):
+    Args:
+        factory: makes the worker.
+        own_process: whether nothing else lives in the process, which then ignores Ctrl-C.
+    """
+
+    def __init__(self, factory: Callable[[], Worker], own_process: bool = False):
         # Ctrl-C goes to every process of the terminal; whether the workers stop is the coordinator's business.
-        with contextlib.suppress(ValueError):
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if own_process:
+            with contextlib.suppress(ValueError):
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._worker = factory()
         self._serial = 0
         self._task: Task | CollectTask | None = None

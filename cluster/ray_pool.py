@@ -380,7 +380,7 @@ class RayPool:
             raise PoolError(f"{where}: {reason(self._failure)}") from self._failure
 
     def _start(self, slot: _Slot) -> None:
-        slot.actor = self._actor_class.remote(self._factory)
+        slot.actor = self._actor_class.remote(self._factory, own_process=True)
         slot.hello = slot.actor.hello.remote()
 
     def _replace(self, slot: _Slot, pause_s: float = 0.0) -> None:
