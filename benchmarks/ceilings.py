@@ -94,6 +94,15 @@ def session(
     return Session(run, pool, maps, tracker, time.perf_counter(), initial)
 
 
+def learn(this: Session) -> None:
+    """Learn to the end, and leave neither workers nor an open run behind."""
+    try:
+        this.learn()
+    finally:
+        this.pool.close()
+        this.tracker.close("FINISHED")
+
+
 def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, float]:
     """Members a second that the coordinator selects, writes recipes for, sends and collects; of InstantWorkers.
 
@@ -244,12 +253,8 @@ def coordinate(population: int, generations: int = 12) -> dict[str, float]:
         broadcast: list[int] = []
         this.on_row = lambda step, row: broadcast.append(sum(o.broadcast_bytes for o in this.learning.outcomes))
         begun = time.perf_counter()
-        try:
-            this.learn()
-        finally:
-            pool.close()
-            this.tracker.close("FINISHED")
-            maps.close()
+        learn(this)
+        maps.close()
         seconds = time.perf_counter() - begun
     scale = 1 if sys.platform == "darwin" else 1024
     return {

@@ -47,6 +47,7 @@ from ceilings import (  # beside this file
     children_per_s,
     chunk_costs,
     gene_s,
+    learn,
     memory,
     naps,
     ray_costs,
@@ -92,11 +93,7 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dic
             print(f"\rdefault run: generation {generation} ", end="", file=sys.stderr, flush=True)
 
     this.on_row = keep
-    try:
-        this.learn()
-    finally:
-        pool.close()
-        this.tracker.close("FINISHED")
+    learn(this)
     return states[0]
 
 
@@ -129,12 +126,8 @@ def last_generations(
         begun = time.perf_counter()
 
     this.on_row = measure
-    try:
-        begun = time.perf_counter()
-        this.learn()
-    finally:
-        pool.close()
-        this.tracker.close("FINISHED")
+    begun = time.perf_counter()
+    learn(this)
     curriculum = this.learning.curriculum
     generation = this.learning.steps - 1
     main, race = this.learning.outcomes[0].results, this.learning.outcomes[1].results

@@ -22,7 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ceilings import session  # beside this file
+from ceilings import learn, session  # beside this file
 
 from cluster.champion import load_champion
 from cluster.learning import Maps
@@ -87,12 +87,8 @@ def soak(generations: int, workers: int) -> dict[str, list[int]]:
                 print(f"\rgeneration {generation} ", end="", file=sys.stderr, flush=True)
 
         this.on_row = look
-        try:
-            this.learn()
-        finally:
-            pool.close()
-            this.tracker.close("FINISHED")
-            maps.close()
+        learn(this)
+        maps.close()
     return seen
 
 

@@ -13,10 +13,15 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from cluster.pool import BuildMap, answer
 from cluster.worker import CollectTask, Task, Worker
+from evolution.breeding import RECIPE
+from evolution.packing import pack_recipes
 from gridsim.scenarios import Scenario
 
+NOBODY = pack_recipes(np.zeros(0, RECIPE))
 Name = tuple[str, int]
 """Of a map: scenario and seed."""
 
@@ -48,6 +53,11 @@ class Actor:
         self._maps: dict[Name, Scenario] = {}
 
     def hello(self) -> int:
+        return os.getpid()
+
+    def prepare(self, serial: int, *news: Any) -> int:
+        """Take up a first task and load its kernels, of nobody: who dies of that has not died of a chunk."""
+        self.run(serial, NOBODY, 0, 0, *news)
         return os.getpid()
 
     def run(

@@ -255,6 +255,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         flags = dataclasses.replace(flags, traffic=0)
     check_workers(flags.workers, flags.address, flags.patience)
     if resume:
+        flags = flags.extending(base)
         for f in dataclasses.fields(kind):
             if f.name in ("workers", "address", "patience", "tracking_uri", "experiment"):
                 continue

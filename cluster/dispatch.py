@@ -3,8 +3,10 @@
 * What was sent to a worker that died is sent again, alone, so that the next time it is clear which chunk it was; the
   first time at once, then after a pause that doubles.
 * A chunk that killed twice is split, and so are its pieces that go on killing, down to one member (of a batch of
-  experience: one episode). Whoever costs three workers by itself is lost, with all that it was asked for, and the call
-  goes on without it. So it is the same members that are lost, however many workers there are and however it was cut.
+  experience: one episode), and then to some of its episodes: the shorter a chunk, the less likely do workers that die
+  for another reason die of it. Whoever costs three workers by itself is lost, with all that it was asked for, and the
+  call goes on without it. So it is the same members that are lost, however many workers there are and however it was
+  cut.
 * Stragglers: who has nothing left to do takes a second copy of a chunk that is late. The first answer counts.
 """
 
@@ -56,6 +58,7 @@ class Dispatch:
         self._returns: Counter[int] = Counter()  # how often a chunk came back
         self._not_before: dict[int, float] = {}
         self._suspects: set[int] = set()  # lost with a worker
+        self._narrowest: set[int] = set()  # pieces of one member
 
     def finished(self) -> bool:
         """Whether every chunk is answered, or lost."""
@@ -129,12 +132,11 @@ class Dispatch:
             self._suspects.add(chunk)
             if any(h.chunk == chunk for others in self._held.values() for h in others):
                 continue  # its copy goes on
-            alone = len(self._units(self.parts[chunk])) == 1
-            if alone and self._kills[chunk] >= MAX_KILLS:
+            if (whole := self._is_whole(chunk)) and self._kills[chunk] >= MAX_KILLS:
                 lost = self._lose(chunk)
                 continue
             self.retries += 1
-            if not alone and self._kills[chunk] >= MAX_KILLS - 1:
+            if not whole and self._kills[chunk] >= MAX_KILLS - 1:
                 self._split(chunk)
                 continue
             self._returns[chunk] += 1
@@ -169,19 +171,30 @@ class Dispatch:
         span = part.columns if self._by_episode else part.rows
         return range(span.start, span.stop)
 
+    def _is_whole(self, chunk: int) -> bool:
+        """Whether a chunk is not to be split."""
+        rows, columns = self.parts[chunk]
+        return chunk in self._narrowest or (rows.stop - rows.start == 1 and columns.stop - columns.start == 1)
+
     def _split(self, chunk: int) -> None:
-        """Put pieces in a chunk's place, about as many as each has members."""
+        """Put pieces in a chunk's place, about as many as each has members, or one member's episodes."""
         self._settle(chunk)
         rows, columns = self.parts[chunk]
         units = self._units(self.parts[chunk])
+        narrow = len(units) == 1
+        by_columns = narrow or self._by_episode
+        if narrow:
+            units = range(columns.start, columns.stop)
         size = math.isqrt(len(units))
         for first in range(units.start, units.stop, size):
             piece = slice(first, min(first + size, units.stop))
             self._todo.append(len(self.parts))
             self._suspects.add(len(self.parts))
+            if narrow:
+                self._narrowest.add(len(self.parts))
             # One more death, and it is split again; who is alone has three chances.
-            self._kills[len(self.parts)] = 0 if piece.stop - piece.start == 1 else MAX_KILLS - 2
-            self.parts.append(Chunk(rows, piece) if self._by_episode else Chunk(piece, columns))
+            self._kills[len(self.parts)] = 0 if narrow or piece.stop - piece.start == 1 else MAX_KILLS - 2
+            self.parts.append(Chunk(rows, piece) if by_columns else Chunk(piece, columns))
             self._settled.append(False)
             self._open += 1
 

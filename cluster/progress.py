@@ -66,8 +66,11 @@ class Progress:
         champion = row["validation/success_rate"]
         self._text = self._learning.describe(row) + f"  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
         self._text += f"  champion {champion:.0%}" if champion else ""
-        if total:
-            self._text += f"  ETA {_clock((now - begun) / max(way - first, 1e-9) * max(total - way, 0.0))} at most"
+        ends = [(now - begun) / max(way - first, 1e-9) * max(total - way, 0.0)] if total else []
+        if limit := self._learning.settings.car_steps:
+            ends.append(max(limit - row["car_steps"], 0.0) / row["car_steps_per_s"])
+        if ends:
+            self._text += f"  ETA {_clock(min(ends))} at most"
         self._bar.update(self._task, completed=int(way), text=self._text, way=self._way())
         if not self._live and (now - self._printed > LINE_S or self._learning.done()):
             self._printed = now

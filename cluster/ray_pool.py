@@ -78,7 +78,7 @@ PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 UNKNOWN_S = 10.0  # that a chunk may take where nothing is known of such tasks
 MUTE = 10.0  # times what its chunk should take at most, in which a worker that is only slow has answered
 FIRST_S = 600.0  # for a worker's first answer: it may have to compile the kernels
-MAX_DEATHS = 15  # of workers in a row, without an answer in between: two members that kill cost fewer
+MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill cost fewer
 MAX_FAILED_STARTS = 3  # in a row, each by an exception, while nobody else is up
 MAX_PAUSE_S = 5.0  # before a worker that did not come up is started again
 MAP_BYTES = 512 << 20  # of maps kept there: those of training and validation, or they are sent every generation
@@ -90,7 +90,7 @@ class _Slot:
 
     number: int
     actor: Any = None
-    hello: Any = None  # the answer that says it is up; None once it is
+    hello: Any = None  # the answer that says it is up, then that it is prepared; None once it is
     pid: int = 0
     serial: int = 0  # of the last task that it was told of
     maps: set[Name] = field(default_factory=set)  # that it was told of
@@ -206,7 +206,9 @@ class RayPool:
                     self._start(slot)
                 elif slot.sent and now - slot.heard > self._patience_s:
                     self._give_up_on_the_mute(slot, call)
-            idle = [slot.number for slot in self._slots if slot.pid and not slot.sent]
+                elif slot.pid and slot.hello and now - slot.heard > FIRST_S:
+                    self._replace(slot)
+            idle = [slot.number for slot in self._slots if slot.pid and not slot.hello and not slot.sent]
             for number, chunk in dispatch.give(idle, now, quiet):
                 self._send(self._slots[number], chunk, call)
             if meanwhile and self.pids() and not meanwhile():
@@ -216,7 +218,7 @@ class RayPool:
             quiet = not answered
             for slot in answered:
                 if slot.hello:
-                    self._greet(slot)
+                    self._greet(slot, call)
                 elif self._hear(slot, call) and on_progress:
                     on_progress(*brought.progress())
             if self._metrics:
@@ -238,14 +240,17 @@ class RayPool:
         columns, raw = part.columns, call.payload(part)
         if not slot.sent:
             slot.heard = time.monotonic()
-        news: list[Any] = []
-        if slot.serial != self._serial:
-            maps, gone, refs = self._shared.news(slot.maps, call.task, call.task_ref)
-            news = [maps, gone, *refs]
-        answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, *news)
+        answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, *self._news(slot, call))
         slot.sent.append((self._serial, answered))
-        slot.serial = self._serial
         call.brought.bytes_down += len(raw)
+
+    def _news(self, slot: _Slot, call: _Call) -> list[Any]:
+        """What a worker has to be told of the task, which then counts as told."""
+        if slot.serial == self._serial:
+            return []
+        slot.serial = self._serial
+        maps, gone, refs = self._shared.news(slot.maps, call.task, call.task_ref)
+        return [maps, gone, *refs]
 
     def _answered(self, waiting: dict[Any, _Slot], busy: bool, pause_s: float) -> list[_Slot]:
         """All who have something to say: with many workers a look costs more than an answer.
@@ -396,8 +401,8 @@ class RayPool:
         if slot.actor is not None:
             ray.kill(slot.actor)
 
-    def _greet(self, slot: _Slot) -> None:
-        """A worker is up, or could not start."""
+    def _greet(self, slot: _Slot, call: _Call) -> None:
+        """A worker is up and is to be prepared, or it is prepared, or it could not start."""
         import ray
 
         try:
@@ -411,7 +416,9 @@ class RayPool:
                 raise PoolError(f"no worker can be started: {reason(error)}{self._logs()}") from error
             self._replace(slot, min(BACKOFF_S * 2.0**self._failed_starts, MAX_PAUSE_S))
         else:
-            slot.hello, self._failed_starts, self._last_words = None, 0, ""
+            slot.heard, self._failed_starts, self._last_words = time.monotonic(), 0, ""
+            prepared = slot.serial > 0
+            slot.hello = None if prepared else slot.actor.prepare.remote(self._serial, *self._news(slot, call))
 
     def _logs(self) -> str:
         return f" (logs: {self._session}/logs)" if self._session else ""

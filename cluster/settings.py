@@ -6,8 +6,8 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, TypeVar, get_args, get_type_hints
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
 
 from cluster.checkpoint import MAX_BYTES
 from evolution.curriculum import CurriculumConfig
@@ -25,6 +25,7 @@ REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
+GENERATIONS, CAR_STEPS = 150, 240_000_000  # of evolution, by default
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -87,6 +88,10 @@ class RunSettings:
             return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3)
         return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
 
+    def extending(self, base: RunSettings) -> Self:
+        """These, asked for where a run of `base` goes on: its bounds may be greater."""
+        return self
+
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         """Whether a run that has come so far (`counts`, and `solved`) has nothing left to do."""
         return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
@@ -130,7 +135,7 @@ class EvolveSettings(RunSettings):
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
     policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"  # on roads that usually have traffic
-    unbound: ClassVar[tuple[str, ...]] = ("generations",)
+    unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
@@ -140,7 +145,8 @@ class EvolveSettings(RunSettings):
     population: int = 512
     """Members of a generation."""
     generations: int = 0
-    """Generations at most; a run whose champion is solved stops earlier. 0: 100, in traffic 90."""
+    """Generations at most; a run whose champion is solved stops earlier. 0: 150, and unless --car-steps says otherwise
+    no more than 240 million car-steps: on two cores two minutes, in traffic five."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8
@@ -162,8 +168,10 @@ class EvolveSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.generations:  # two minutes' worth on two cores, in traffic five
-            object.__setattr__(self, "generations", 90 if self.traffic else 100)
+        if not self.generations:
+            object.__setattr__(self, "generations", GENERATIONS)
+            if not self.car_steps:
+                object.__setattr__(self, "car_steps", CAR_STEPS)
 
     def default_policy(self) -> str:
         usual = self.traffic and default_traffic(self.scenario) and self.observation == "rays"
@@ -172,6 +180,11 @@ class EvolveSettings(RunSettings):
     @property
     def algorithm(self) -> str:
         return self.search
+
+    def extending(self, base: RunSettings) -> Self:
+        longer = isinstance(base, EvolveSettings) and self.generations > base.generations
+        # As for a new run that is given its --generations.
+        return replace(self, car_steps=0) if longer and self.car_steps == base.car_steps == CAR_STEPS else self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or int(so_far["generation"]) >= self.generations

@@ -147,6 +147,34 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     assert dispatch.finished()
 
 
+@pytest.mark.parametrize("kills", [False, True])
+def test_a_member_s_long_chunk_is_cut_before_it_is_lost(kills: bool) -> None:
+    """Of 256 episodes: who is unlucky twice in such a long one is not so in a short one, too; who kills goes on."""
+    long = Chunk(slice(4, 5), slice(100, 356))
+    dispatch = new([long, *rows(1)])
+    for now in (0.0, 1.0):
+        assert list(dispatch.give([0], now, False)) == [(0, 0)]
+        assert dispatch.died(0, now + 0.3) == []
+    pieces, deaths, lost = [], 2, []
+    while not dispatch.finished():
+        ((_, chunk),) = dispatch.give([0], 100.0 * (deaths + len(pieces)), False)
+        if kills and dispatch.parts[chunk].rows == long.rows:
+            lost = dispatch.died(0, 100.0 * (deaths + len(pieces)))
+            deaths += 1
+        else:
+            assert dispatch.answered(0, 0.0) == chunk
+            pieces.append(dispatch.parts[chunk])
+    if kills:
+        assert deaths == 2 + MAX_KILLS
+        assert all(dispatch.parts[chunk].rows == long.rows for chunk in lost)
+        assert len(lost) == 16
+        assert len(pieces) == 1
+    else:
+        assert [piece.columns for piece in pieces if piece.rows == long.rows] == [
+            slice(first, first + 16) for first in range(100, 356, 16)
+        ]
+
+
 def test_the_first_time_at_once_then_after_pauses_that_double() -> None:
     dispatch, now, pauses = new(rows(1, 1)), 100.0, []
     for _ in range(8):

@@ -112,7 +112,7 @@ def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
     maps = Maps(settings.scenario, SimConfig())
     first = Evolution(settings, SerialPool(maps.build), maps)
     recipes, key = first.genetic.ask(first._mutation())
-    seed = int(recipes["seed"][4])  # the last has a chunk of its own: it costs three workers, and no more
+    seed = int(recipes["seed"][4])  # the last has a chunk of its own: it costs five workers, and no more
     found = []
     for workers in (0, 1, 2):
         pool = (

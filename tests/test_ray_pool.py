@@ -40,6 +40,7 @@ from gridsim.scenarios import Scenario
 
 pytestmark = pytest.mark.e2e
 
+NOBODY = 1_000_000  # who has a member's orders when there is none: as workers are prepared
 BANNED = ("torch", "mlflow", "pygame", "matplotlib", "tyro", "rich")
 
 
@@ -50,14 +51,15 @@ class Obeying(Answering):
         self._folder = folder
 
     def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
-        self._obey(recipes["seed"])
+        self._obey(recipes["seed"] if len(recipes) else np.array([NOBODY]))
         return super().evaluate(task, maps, recipes)
 
     def collect(
         self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
     ) -> tuple[Experience, np.ndarray, float]:
-        with (self._folder / "collected").open("a") as collected:
-            collected.write(f"{first} {stop}\n")
+        if stop > first:
+            with (self._folder / "collected").open("a") as collected:
+                collected.write(f"{first} {stop}\n")
         self._obey(task.keys[first:stop])
         return super().collect(task, maps, first, stop)
 
@@ -191,6 +193,17 @@ def test_a_member_that_kills_twice_is_sent_a_third_time(pool: RayPool, folder: P
     assert outcome.retries >= 2
 
 
+def test_who_dies_of_a_first_task_before_it_has_a_member_has_died_of_none(pool: RayPool, folder: Path) -> None:
+    pool.evaluate(make_task(), make_recipes(512))
+    (folder / f"kill-{NOBODY}").write_text("2")
+    for pid in pool.pids():
+        os.kill(pid, signal.SIGKILL)
+    outcome = pool.evaluate(make_task(), make_recipes(512))
+    assert (folder / f"kill-{NOBODY}").read_text() <= "0", "both were prepared, and died of it"
+    assert outcome.results.tobytes() == expected(512)
+    assert outcome.retries <= 4, "of the two that were killed with two chunks each"
+
+
 def test_a_member_that_always_kills_is_lost_alone(pool: RayPool, folder: Path) -> None:
     (folder / "kill-300").write_text("100")
     told: list[tuple[int, int]] = []
@@ -206,7 +219,7 @@ def test_a_member_that_always_kills_is_lost_alone(pool: RayPool, folder: Path) -
         "member 300 (parents 4 and 4, seed 300, key 0x3039) killed its worker 3 times and is lost; the last time its "
         "process was killed, crashed, or ran out of memory (logs: "
     )
-    assert 3 <= 100 - int((folder / "kill-300").read_text()) <= 8, "workers that it cost"
+    assert 3 <= 100 - int((folder / "kill-300").read_text()) <= 12, "workers that it cost"
     (folder / "kill-300").unlink()
     assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512), "the pool goes on"
 

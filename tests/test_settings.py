@@ -1,5 +1,7 @@
 """What a run is asked to do: the observation, and the policy that goes with it."""
 
+from dataclasses import replace
+
 import pytest
 
 from cluster.settings import DqnSettings, EvolveSettings, SettingsError, from_dict, to_dict
@@ -44,6 +46,26 @@ def test_what_is_not_given_suits_the_observation():
     assert (rays.batch, rays.updates, rays.replay) == (256, 4.0, 1_000_000)
     assert (grid.batch, grid.updates, grid.replay) == (32, 16.0, 100_000)
     assert from_dict(DqnSettings, to_dict(grid)) == grid
+
+
+def test_evolution_s_default_budget_is_of_generations_and_of_car_steps():
+    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (150, 240_000_000)
+    assert EvolveSettings(generations=2_000).car_steps == 0  # whoever says how long means it
+    assert EvolveSettings(car_steps=7).generations == 150
+    assert EvolveSettings(car_steps=7).car_steps == 7
+    settings = from_dict(EvolveSettings, to_dict(EvolveSettings()))
+    assert settings == EvolveSettings()
+    for generation, car_steps in ((150, 1), (1, 240_000_000)):
+        assert settings.ended({"solved": False, "generation": generation, "car_steps": car_steps})
+    assert not settings.ended({"solved": False, "generation": 149, "car_steps": 239_999_999})
+
+
+def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it():
+    usual, short = EvolveSettings(seed=3), EvolveSettings(generations=9, car_steps=100)
+    assert replace(usual, generations=200).extending(usual) == EvolveSettings(seed=3, generations=200)
+    assert usual.extending(usual) == usual
+    assert replace(short, generations=10).extending(short) == EvolveSettings(generations=10, car_steps=100)
+    assert DqnSettings().extending(DqnSettings()) == DqnSettings()
 
 
 def test_evolution_sees_motion_where_there_usually_is_traffic():
