@@ -45,6 +45,18 @@ def rows(folder):
         return list(csv.DictReader(file))
 
 
+def all_in_mlflow(run):
+    """Whether each generation of a run is in MLflow, in the database beside its folder's folder, once."""
+    from mlflow.tracking import MlflowClient
+
+    ended = summary(run)
+    client = MlflowClient(tracking_uri=f"sqlite:///{run.parent.parent}/mlflow.db")
+    for name in ("fitness/best", "distance_m/mean", "car_steps", "wall_s"):
+        steps = [metric.step for metric in client.get_metric_history(ended["mlflow_run_id"], name)]
+        assert sorted(steps) == list(range(ended["generations"])), f"{name}: lost or doubled"
+    return True
+
+
 def descendants(pid):
     """Processes below a process, by /proc."""
     parents = {}

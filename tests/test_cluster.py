@@ -18,7 +18,7 @@ import hosts
 import jsonschema  # type: ignore[import-untyped]
 import pytest
 import yaml
-from commands import BIN, ray_workers, start, summary, wait_until
+from commands import BIN, all_in_mlflow, ray_workers, rows, start, summary, wait_until
 from hosts import HOME, Host
 from packaging.requirements import Requirement
 
@@ -162,12 +162,14 @@ def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytes
 # --- Two hosts -------------------------------------------------------------------------------------------------------
 
 RAY = BIN / "ray"
-RUN = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "8", "--seed", "5"]
+SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--seed", "5"]
+RUN = [*SMALL, "--generations", "8"]
+CUT_S = 20.0
 UP_S = 300.0  # for what takes half a minute on a quiet machine
 
 
 class Machines:
-    """A laptop, with the switch, and two machines that serve SSH: a head, and a worker without GridSim."""
+    """A laptop, with the switch, and machines that serve SSH: a head, a worker without GridSim, and a spare one."""
 
     def __init__(self, folder: Path, root: Path):
         self.all: list[Host] = []
@@ -181,7 +183,9 @@ class Machines:
             self.all.append(self.worker)
             self.laptop.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/gridsim")
             authorized = (self.laptop.home / ".ssh/gridsim.pub").read_text()
-            for address, host in (("10.77.0.2", self.head), ("10.77.0.3", self.worker)):
+            self.spare = Host(folder / "spare", keep)
+            self.all.append(self.spare)
+            for address, host in (("10.77.0.2", self.head), ("10.77.0.3", self.worker), ("10.77.0.4", self.spare)):
                 host.connect(self.laptop, address)
                 host.serve_ssh(authorized)
                 (host.home / ".bashrc").write_text(f"export GRIDSIM_CACHE_DIR={CACHE_FOLDER.parents[1]}\n")
@@ -243,11 +247,11 @@ def up(machines: Machines, root: Path) -> Machines:
     return machines
 
 
-def drives(host: Host) -> bool:
-    """Whether a worker there has loaded the simulator (its compiler is in its memory), and not only been started."""
-    for pid in ray_workers(host.pid):
+def drives(pid: int) -> bool:
+    """Whether a worker below it has loaded the simulator (its compiler is in its memory), and not only been started."""
+    for worker in ray_workers(pid):
         with contextlib.suppress(OSError):
-            if "llvmlite" in Path(f"/proc/{pid}/maps").read_text():
+            if "llvmlite" in Path(f"/proc/{worker}/maps").read_text():
                 return True
     return False
 
@@ -258,7 +262,8 @@ def test_a_run_on_two_hosts(reference: Path, up: Machines) -> None:
     assert "No module named 'gridsim.config'" in found.finish(60, code=1), "it has no GridSim"
     command = shlex.join(["--address", "auto", "--workers", "2", "--name", "n", *RUN])
     run = up.laptop.start(RAY, "exec", up.config, f"gridsim-evolve {command}")
-    wait_until(lambda: all(map(drives, (up.head, up.worker))) or run.process.poll() is not None, UP_S, pause=0.5)
+    both = up.head.pid, up.worker.pid
+    wait_until(lambda: all(map(drives, both)) or run.process.poll() is not None, UP_S, pause=0.5)
     on_both = run.process.poll() is None
     output = run.finish(UP_S)
     assert on_both, output
@@ -302,6 +307,41 @@ def test_who_can_reach_the_cluster(up: Machines, root: Path) -> None:
     open_ports = up.head.listening()
     assert 6379 in open_ports
     assert open_ports.get(8265, {"127.0.0.1"}) == {"127.0.0.1"}, "the dashboard"
+
+
+@pytest.mark.e2e
+def test_a_cable_out_for_20_s_and_a_machine_without_power(up: Machines, root: Path, tmp_path: Path) -> None:
+    """In one run, on three machines. Neither says goodbye: all at once nothing is heard of it."""
+    longer = [*SMALL, "--generations", "60"]
+    reference = start("gridsim-evolve", "--workers", "0", "--name", "r", *longer, cwd=tmp_path)
+    shutil.copytree(up.laptop.home / ".ray", up.spare.home / ".ray")
+    node = up.spare.start(
+        RAY, "start", "--block", "--address=10.77.0.2:6379", "--num-cpus=1", "--object-store-memory=100000000",
+        GRIDSIM_CACHE_DIR=str(CACHE_FOLDER.parents[1]), PYTHONPATH=str(root), RAY_AUTH_MODE="token",
+    )  # fmt: skip
+    command = shlex.join(["--address", "auto", "--workers", "3", "--name", "f", *longer])
+    run = up.laptop.start(RAY, "exec", up.config, f"gridsim-evolve {command}")
+    three = up.head.pid, up.worker.pid, node.process.pid
+    wait_until(lambda: all(map(drives, three)) or run.process.poll() is not None, UP_S, pause=0.5)
+    history = up.head.home / "runs/f/history.csv"
+    wait_until(lambda: history.exists() or run.process.poll() is not None, UP_S)
+    assert run.process.poll() is None, run.finish(0)
+    up.worker.plug(False)
+    before = len(rows(history.parent))
+    time.sleep(CUT_S)
+    up.worker.plug(True)
+    between = len(rows(history.parent))
+    assert run.process.poll() is None, run.finish(0)
+    up.spare.plug(False)
+    up.spare.close()
+    node.process.wait()
+    output = run.finish(UP_S)
+    print(f"generations: {before} when the cable was pulled, {between} when it was put back\n{output}")
+    assert reference.communicate(timeout=UP_S)[1] == ""
+    ours, theirs = summary(history.parent), summary(tmp_path / "runs/r")
+    assert ours["champion_sha256"] == theirs["champion_sha256"]
+    assert ours["lost_chunks"] == 0
+    assert all_in_mlflow(history.parent)
 
 
 @pytest.mark.e2e

@@ -155,7 +155,8 @@ def test_a_member_s_long_chunk_is_cut_before_it_is_lost(kills: bool) -> None:
     for now in (0.0, 1.0):
         assert list(dispatch.give([0], now, False)) == [(0, 0)]
         assert dispatch.died(0, now + 0.3) == []
-    pieces, deaths, lost = [], 2, []
+    deaths, lost = 2, []
+    pieces: list[Chunk] = []
     while not dispatch.finished():
         ((_, chunk),) = dispatch.give([0], 100.0 * (deaths + len(pieces)), False)
         if kills and dispatch.parts[chunk].rows == long.rows:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import BIN, finish, ray_workers, rows, start, summary, wait_until
+from commands import BIN, all_in_mlflow, finish, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, make_recipes, make_task, never_built
 
 from cluster.coordinator import Evolution
@@ -57,8 +57,6 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def same(run: Path, reference: Path) -> bool:
     """Whether two runs came to the same by the same way, and all of it is in MLflow once."""
-    from mlflow.tracking import MlflowClient
-
     mine, theirs = summary(run), summary(reference)
     assert mine["champion_sha256"] == theirs["champion_sha256"]
     assert mine["car_steps"] == theirs["car_steps"]
@@ -66,11 +64,7 @@ def same(run: Path, reference: Path) -> bool:
     for row, other in zip(rows(run), rows(reference), strict=True):
         for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "race/success_rate"):
             assert row[name] == other[name]
-    client = MlflowClient(tracking_uri=f"sqlite:///{run.parent.parent}/mlflow.db")
-    for name in ("fitness/best", "distance_m/mean", "car_steps", "wall_s"):
-        steps = [metric.step for metric in client.get_metric_history(mine["mlflow_run_id"], name)]
-        assert sorted(steps) == list(range(mine["generations"])), f"{name}: lost or doubled"
-    return True
+    return all_in_mlflow(run)
 
 
 def generations(run: Path) -> int:

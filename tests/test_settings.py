@@ -75,3 +75,7 @@ def test_evolution_sees_motion_where_there_usually_is_traffic():
     assert EvolveSettings(traffic=2).policy == "mlp:6,7"
     assert EvolveSettings("city", observation="grid").policy == EvolveSettings(observation="grid").policy
     assert EvolveSettings("city", policy="mlp:5").policy == "mlp:5"
+    assert EvolveSettings("city").mutation_rate == 0.012
+    for settings in (EvolveSettings("city", traffic=0), EvolveSettings("city", policy="mlp:5")):
+        assert settings.mutation_rate == 0.03
+    assert EvolveSettings("city", mutation_rate=0.5).mutation_rate == 0.5
