@@ -46,7 +46,7 @@ def rows(folder):
 
 
 def all_in_mlflow(run):
-    """Whether each generation of a run is in MLflow, in the database beside its folder's folder, once."""
+    """Whether MLflow, in the database beside the run's folder's folder, has all of it once, and that it is finished."""
     from mlflow.tracking import MlflowClient
 
     ended = summary(run)
@@ -54,7 +54,7 @@ def all_in_mlflow(run):
     for name in ("fitness/best", "distance_m/mean", "car_steps", "wall_s"):
         steps = [metric.step for metric in client.get_metric_history(ended["mlflow_run_id"], name)]
         assert sorted(steps) == list(range(ended["generations"])), f"{name}: lost or doubled"
-    return True
+    return client.get_run(ended["mlflow_run_id"]).info.status == "FINISHED"
 
 
 def descendants(pid):
