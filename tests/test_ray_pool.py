@@ -281,7 +281,8 @@ def test_experience_keeps_its_order_and_a_killed_worker_costs_its_chunk_alone(
     repeated = sum(again.values()) - len(again)
     lost = [(first, stop) for first, stop in again if first <= 150 < stop]
     assert sum(again[chunk] for chunk in lost) == times + 1
-    assert len(lost) == (1 if times < 2 else 2), "the third time in pieces"
+    # The third time in pieces, unless one of the deaths was put down to the chunk before it (see below).
+    assert len(lost) in ((1,) if times < 2 else (1, 2))
     # The answer to the chunk before it may have been on its way when the worker died; nothing is sent with a suspect.
     assert repeated <= times + min(times, 1), "what else was sent to the worker had not been begun"
     assert times <= collected.retries <= 2 * times
