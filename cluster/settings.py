@@ -25,7 +25,7 @@ REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
-GENERATIONS, CAR_STEPS = 150, 240_000_000  # of evolution, by default
+GENERATIONS, CAR_STEPS = 150, 220_000_000  # of evolution, by default
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -146,7 +146,7 @@ class EvolveSettings(RunSettings):
     """Members of a generation."""
     generations: int = 0
     """Generations at most; a run whose champion is solved stops earlier. 0: 150, and unless --car-steps says otherwise
-    no more than 240 million car-steps: on two cores two minutes, in traffic five."""
+    no more than 220 million car-steps: on two cores two minutes, in traffic five."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8

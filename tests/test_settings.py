@@ -49,15 +49,15 @@ def test_what_is_not_given_suits_the_observation():
 
 
 def test_evolution_s_default_budget_is_of_generations_and_of_car_steps():
-    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (150, 240_000_000)
+    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (150, 220_000_000)
     assert EvolveSettings(generations=2_000).car_steps == 0  # whoever says how long means it
     assert EvolveSettings(car_steps=7).generations == 150
     assert EvolveSettings(car_steps=7).car_steps == 7
     settings = from_dict(EvolveSettings, to_dict(EvolveSettings()))
     assert settings == EvolveSettings()
-    for generation, car_steps in ((150, 1), (1, 240_000_000)):
+    for generation, car_steps in ((150, 1), (1, 220_000_000)):
         assert settings.ended({"solved": False, "generation": generation, "car_steps": car_steps})
-    assert not settings.ended({"solved": False, "generation": 149, "car_steps": 239_999_999})
+    assert not settings.ended({"solved": False, "generation": 149, "car_steps": 219_999_999})
 
 
 def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it():
