@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
+from commands import wait_until
 from test_pool import (
     MAPS,
     Answering,
@@ -78,6 +79,7 @@ class Obeying(Answering):
             elif what == "raise":
                 raise ValueError("that member\nis not to be had")
             elif what == "sleep":
+                (self._folder / "sleeper").write_text(f"{os.getpid()} ")
                 time.sleep(float(path.read_text()))
 
 
@@ -184,6 +186,27 @@ def test_a_killed_worker_is_replaced_and_its_chunks_are_sent_again(pool: RayPool
     assert outcome.results.tobytes() == expected(512)
     assert outcome.retries >= 1
     assert before[0] not in pool.pids()
+
+
+def test_what_a_dead_worker_was_at_runs_elsewhere_at_once(pool: RayPool, folder: Path) -> None:
+    pool.evaluate(make_task(), make_recipes(512))
+    (folder / "sleep-300").write_text("600")
+    died = []
+
+    def kill() -> None:
+        wait_until(lambda: (folder / "sleeper").exists() and (folder / "sleeper").read_text().endswith(" "))
+        (folder / "sleep-300").unlink()
+        died.append(time.perf_counter())
+        os.kill(int((folder / "sleeper").read_text()), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    outcome = pool.evaluate(make_task(), make_recipes(512))
+    seconds = time.perf_counter() - died[0]
+    killer.join()
+    assert outcome.results.tobytes() == expected(512)
+    print(f"after a worker's death its chunk was done elsewhere in {seconds:.3f} s")
+    assert seconds < 5.0
 
 
 def test_a_member_that_kills_twice_is_sent_a_third_time(pool: RayPool, folder: Path) -> None:
