@@ -265,10 +265,12 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     try:
         _, first = cluster(1, address)
         wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
+        process.send_signal(signal.SIGSTOP)  # or it may be done before the second host is up
         _, second = cluster(1, address)
-        wait_until(lambda: below(second, "ray::Actor") or process.poll() is not None, LONG_S)
+        wait_until(lambda: below(second, "ray::Actor"), LONG_S)
         done = generations(run)
         end(first)
+        process.send_signal(signal.SIGCONT)
         wait_until(lambda: generations(run) > done + 1 or process.poll() is not None, LONG_S)
         end(second)
         killed = time.monotonic()
