@@ -1,6 +1,6 @@
 """The image and the compose file, without Docker: held against the project, and their commands run as they stand there.
 
-The image's own steps are not run in a fresh root: they fetch two gigabytes of packages, which takes minutes.
+The image's own steps are run in fresh roots by test_image.py, where it is asked to: that takes ten minutes.
 """
 
 import importlib.metadata
