@@ -155,8 +155,8 @@ class EvolveSettings(RunSettings):
     """Size of the mating pool, which bounds what is sent to the workers."""
     crossover: float = 0.5
     """Share of children with two parents."""
-    mutation_rate: float = 0.0
-    """Share of a child's genes that are mutated; 0: 0.03, and of mlp:16,16+motion, which has more, 0.012."""
+    mutation_rate: float = -1.0
+    """Share of a child's genes that are mutated; -1: 0.03, and of mlp:16,16+motion, which has more, 0.012."""
     sigma: float = 0.5
     """Standard deviation of mutation, while episodes are short."""
     bump_rate: float = 0.3
@@ -168,7 +168,7 @@ class EvolveSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.mutation_rate:
+        if self.mutation_rate == -1.0:
             object.__setattr__(self, "mutation_rate", 0.012 if self.policy == self.policy_in_traffic else 0.03)
         if not self.generations:
             object.__setattr__(self, "generations", GENERATIONS)

@@ -78,4 +78,7 @@ def test_evolution_sees_motion_where_there_usually_is_traffic():
     assert EvolveSettings("city").mutation_rate == 0.012
     for settings in (EvolveSettings("city", traffic=0), EvolveSettings("city", policy="mlp:5")):
         assert settings.mutation_rate == 0.03
-    assert EvolveSettings("city", mutation_rate=0.5).mutation_rate == 0.5
+    for rate in (0.0, 0.5):
+        assert EvolveSettings("city", mutation_rate=rate).mutation_rate == rate
+    with pytest.raises(SettingsError, match="--mutation-rate"):
+        EvolveSettings("city", mutation_rate=-0.5).check()
