@@ -60,6 +60,7 @@ from cluster.ray_address import (
     OWN_ENVIRONMENT,
     STORE_BYTES,
     TOKEN,
+    end_at_once,
     environment,
     has_token,
     lean_head,
@@ -360,6 +361,7 @@ class RayPool:
             else:
                 _join(self.address)
             self._connected = True
+            end_at_once()
             self._shared = Shared(ray.put, self._build_map, map_bytes)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             if self.address and ray_worker.global_worker.node.metrics_agent_port > 0:
