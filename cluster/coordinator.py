@@ -104,6 +104,7 @@ class Evolution(Learning):
         race_success = float(success_rate(raced)[order[:8]].mean())
         curriculum.raced(order, raced, race)
         self.genetic.tell(total)
+        self.genetic.admit_mean()
         if self.champion is not None:
             self.genetic.readmit(self.champion.genome)
 

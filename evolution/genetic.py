@@ -125,6 +125,17 @@ class Genetic:
         self.generation += 1
         self._asked = None
 
+    def admit_mean(self) -> None:
+        """Put the mating pool's mean in the place of its last parent but one, and of the last elite but one.
+
+        So it is driven unmodified, and bred from like any other parent. Where there are four of them or more.
+        """
+        mean = self.mean()
+        if len(mean) and len(self.parents) - self.elites >= 4:
+            self.parents[-2] = mean[0]
+            if self.elites >= 4:
+                self.parents[self.elites - 2] = mean[0]
+
     def readmit(self, genome: np.ndarray) -> None:
         """Put a genome [genes] in the place of the last elite, and of the last parent of the mating pool."""
         if self.elites:

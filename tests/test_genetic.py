@@ -232,6 +232,29 @@ def test_the_mean_is_that_of_the_pool_alone():
     assert search.mean().shape == (0, SPEC.size), "random search averages nothing"
 
 
+def test_the_mean_takes_the_places_of_the_last_but_one():
+    config = GeneticConfig(population=40, elites=4, tournament=3, parents=5)
+    genetic = Genetic(SPEC, config, seed=12)
+    told(genetic, first_gene)
+    before, mean = genetic.parents.copy(), genetic.mean()[0]
+    genetic.admit_mean()
+    changed = np.flatnonzero((genetic.parents != before).any(axis=1))
+    assert changed.tolist() == [2, 7]
+    assert genetic.parents[2].tobytes() == genetic.parents[7].tobytes() == mean.tobytes()
+    genetic.ask(MUTATION)
+    assert genetic.genomes(np.array([2]))[0].tobytes() == mean.tobytes(), "it is driven as it is"
+
+
+@pytest.mark.parametrize(("elites", "parents", "rows"), [(3, 4, [5]), (0, 4, [2]), (4, 3, [])])
+def test_few_elites_and_parents_stay_for_the_mean(elites, parents, rows):
+    genetic = Genetic(SPEC, GeneticConfig(population=40, elites=elites, tournament=3, parents=parents), seed=12)
+    genetic.admit_mean()  # of nobody
+    told(genetic, first_gene)
+    before = genetic.parents.copy()
+    genetic.admit_mean()
+    assert np.flatnonzero((genetic.parents != before).any(axis=1)).tolist() == rows
+
+
 def test_a_run_may_begin_with_a_genome():
     genome = np.random.default_rng(1).normal(size=SPEC.size).astype(F)
     genetic = Genetic(SPEC, CONFIG, seed=12)
