@@ -310,6 +310,7 @@ class Session:
         champion.save(path / CHAMPION)
         checkpoint.save(path / ELITES, {"genomes": np.array(learning.elites)}, {"policy": self.run.settings.policy})
         figures = learning.held_out()
+        self.tracker.log_model(path, tracking_run.torch_model(champion, settings, figures))  # while it is drawn
         report.curves(learning.history, path / "curves.png", learning.step_name)
         episodes = held_out_episodes(self.maps, settings.traffic)
         scenario = self.maps.get(episodes.maps[int(episodes.rows[0]["map"])])
@@ -321,7 +322,6 @@ class Session:
             scenario, states, path / "trajectory.png",
             f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
         )  # fmt: skip
-        self.tracker.log_model(path, tracking_run.torch_model(champion, settings, figures))  # while it is filmed
         if self.film:
             self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
         wall = self._wall_s()

@@ -25,7 +25,8 @@ REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
-GENERATIONS, CAR_STEPS = 150, 220_000_000  # of evolution, by default
+# Of evolution, by default: two minutes on two cores, in traffic five.
+GENERATIONS, CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 150, 170_000_000, 200_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -146,7 +147,7 @@ class EvolveSettings(RunSettings):
     """Members of a generation."""
     generations: int = 0
     """Generations at most; a run whose champion is solved stops earlier. 0: 150, and unless --car-steps says otherwise
-    no more than 220 million car-steps: on two cores two minutes, in traffic five."""
+    no more than 170 million car-steps, in traffic 200: on two cores two minutes, in traffic five."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8
@@ -173,11 +174,14 @@ class EvolveSettings(RunSettings):
         if not self.generations:
             object.__setattr__(self, "generations", GENERATIONS)
             if not self.car_steps:
-                object.__setattr__(self, "car_steps", CAR_STEPS)
+                object.__setattr__(self, "car_steps", self.default_car_steps())
 
     def default_policy(self) -> str:
         usual = self.traffic and default_traffic(self.scenario) and self.observation == "rays"
         return self.policy_in_traffic if usual else super().default_policy()
+
+    def default_car_steps(self) -> int:
+        return CAR_STEPS_IN_TRAFFIC if self.traffic else CAR_STEPS
 
     @property
     def algorithm(self) -> str:
@@ -186,7 +190,8 @@ class EvolveSettings(RunSettings):
     def extending(self, base: RunSettings) -> Self:
         longer = isinstance(base, EvolveSettings) and self.generations > base.generations
         # As for a new run that is given its --generations.
-        return replace(self, car_steps=0) if longer and self.car_steps == base.car_steps == CAR_STEPS else self
+        usual = self.car_steps == base.car_steps == self.default_car_steps()
+        return replace(self, car_steps=0) if longer and usual else self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or int(so_far["generation"]) >= self.generations
