@@ -135,14 +135,15 @@ class EvolveSettings(RunSettings):
 
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
-    policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"  # on roads that usually have traffic
+    policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"
+    simple_roads: ClassVar[tuple[str, ...]] = ("curved",)  # where it learns slower than the default one, also in traffic
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
-    closer, by default mlp:6,7, in traffic on highway, roundabout and city mlp:16,16+motion; on the grid cnn: with the
-    channels of two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    closer, by default mlp:6,7, in traffic on all roads but curved mlp:16,16+motion; on the grid cnn: with the channels
+    of two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 512
     """Members of a generation."""
     generations: int = 0
@@ -177,8 +178,8 @@ class EvolveSettings(RunSettings):
                 object.__setattr__(self, "car_steps", self.default_car_steps())
 
     def default_policy(self) -> str:
-        usual = self.traffic and default_traffic(self.scenario) and self.observation == "rays"
-        return self.policy_in_traffic if usual else super().default_policy()
+        busy = self.traffic and self.scenario not in self.simple_roads and self.observation == "rays"
+        return self.policy_in_traffic if busy else super().default_policy()
 
     def default_car_steps(self) -> int:
         return CAR_STEPS_IN_TRAFFIC if self.traffic else CAR_STEPS

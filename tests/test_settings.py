@@ -72,11 +72,12 @@ def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it
     assert DqnSettings().extending(DqnSettings()) == DqnSettings()
 
 
-def test_evolution_sees_motion_where_there_usually_is_traffic():
-    for scenario in ("highway", "roundabout", "city"):
-        assert EvolveSettings(scenario).policy == EvolveSettings(scenario, traffic=2).policy == "mlp:16,16+motion"
+def test_evolution_sees_motion_in_traffic_on_all_roads_but_one():
+    for scenario in ("highway", "seamless", "roundabout", "city"):
+        assert EvolveSettings(scenario, traffic=2).policy == "mlp:16,16+motion"
         assert EvolveSettings(scenario, traffic=0).policy == "mlp:6,7"
-    assert EvolveSettings(traffic=2).policy == "mlp:6,7"
+    assert EvolveSettings("city").policy == "mlp:16,16+motion"
+    assert EvolveSettings("curved", traffic=2).policy == "mlp:6,7"
     assert EvolveSettings("city", observation="grid").policy == EvolveSettings(observation="grid").policy
     assert EvolveSettings("city", policy="mlp:5").policy == "mlp:5"
     assert EvolveSettings("city").mutation_rate == 0.012
