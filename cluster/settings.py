@@ -136,7 +136,7 @@ class EvolveSettings(RunSettings):
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
     policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"
-    simple_roads: ClassVar[tuple[str, ...]] = ("curved",)  # where it learns slower than the default one, also in traffic
+    simple_roads: ClassVar[tuple[str, ...]] = ("curved",)  # where the default one learns faster, even in traffic
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 

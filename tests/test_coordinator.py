@@ -284,7 +284,7 @@ class Losing(SerialPool):
     def __init__(self, maps, **rows):
         super().__init__(maps.build)
         self.rows = rows  # by the call's kind: evolve, race or validate
-        self.genomes = np.zeros((0, 311), dtype=np.float32)  # of who was lost
+        self.genomes = np.zeros((0, PolicySpec.parse(SETTINGS.policy).size), dtype=np.float32)  # of who was lost
 
     def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
         outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
