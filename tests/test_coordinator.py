@@ -20,6 +20,7 @@ from gridsim.config import SimConfig
 from gridsim.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=2, elites=2, parents=8, seed=9)
+GENES = PolicySpec.parse(SETTINGS.policy).size
 
 CROWD = 6  # cars in training
 
@@ -183,14 +184,14 @@ def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("trials_first", lambda a: np.zeros((3, 311), np.float32)),  # contenders are two
-        ("trials_first", lambda a: np.zeros(311, np.float32)),
-        ("trials_last", lambda a: np.zeros((2, 311), np.float32)),
+        ("trials_first", lambda a: np.zeros((3, GENES), np.float32)),  # contenders are two
+        ("trials_first", lambda a: np.zeros(GENES, np.float32)),
+        ("trials_last", lambda a: np.zeros((2, GENES), np.float32)),
         ("trials_tried", lambda a: np.zeros(257, np.uint64)),
         ("trials_tried", lambda a: np.zeros(2, np.int64)),
-        ("parents", lambda a: np.zeros((11, 311), np.float32)),  # 2 elites and 8
+        ("parents", lambda a: np.zeros((11, GENES), np.float32)),  # 2 elites and 8
         ("parents", lambda a: a[:2]),  # elites alone
-        ("champion", lambda a: np.zeros(311, np.float32)),  # of which nothing is known
+        ("champion", lambda a: np.zeros(GENES, np.float32)),  # of which nothing is known
         ("trials", lambda m: [math.inf, 1]),
         ("trials", lambda m: [1]),
         ("generation", lambda m: math.inf),
@@ -284,7 +285,7 @@ class Losing(SerialPool):
     def __init__(self, maps, **rows):
         super().__init__(maps.build)
         self.rows = rows  # by the call's kind: evolve, race or validate
-        self.genomes = np.zeros((0, PolicySpec.parse(SETTINGS.policy).size), dtype=np.float32)  # of who was lost
+        self.genomes = np.zeros((0, GENES), dtype=np.float32)  # of who was lost
 
     def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
         outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
