@@ -79,9 +79,13 @@ class Evolution(Learning):
         self.maps.ahead(curriculum.map_seeds[: generation + 4])
         results, lost = self._evaluate_all(episodes, limits)
         some_left(lost, "evolve")
-        goals = targets(episodes.rows, limits)
-        score = self._score(results, goals)
-        rank = fitness.pareto(fitness.elements(results, goals)) if s.ranking == "pareto" else score
+        groups, n = curriculum.config.groups, results.shape[1]
+        goals = targets(episodes.rows, limits)[:n]  # of any group
+        own = self._score(results, goals)
+        score = fitness.pooled(own, groups)
+        rank = score
+        if s.ranking == "pareto":
+            rank = fitness.pooled(fitness.pareto(fitness.elements(results, goals)), groups)
         rank = np.where(lost, -np.inf, rank)  # whatever a fitness says of somebody who drove nowhere
 
         # The generation's best race on more episodes; who raced comes before who did not.
@@ -93,7 +97,7 @@ class Evolution(Learning):
         driven = self.drive("race", racers, race, race_limits, curriculum.config.rewind)
         some_left(driven.lost, "race")
         raced = driven.results
-        n, m = len(episodes.rows), len(race.rows)
+        m = len(race.rows)
         race_score = (n * score[best] + m * self._score(raced, race_limits.target)) / (n + m)
         race_score = np.where(driven.lost, -np.inf, race_score)
         order = np.argsort(-race_score, kind="stable")
@@ -108,7 +112,7 @@ class Evolution(Learning):
         if self.champion is not None:
             self.genetic.readmit(self.champion.genome)
 
-        if limits.target >= curriculum.config.validation_target:
+        if limits.target >= curriculum.config.validation_target and generation % curriculum.config.validate_every == 0:
             contenders = racers[order[: curriculum.config.contenders - len(mean)]]
             self.trials.enter(np.concatenate([mean, contenders]), generation)
         self.elites.append(racers[order[0]])
@@ -117,8 +121,8 @@ class Evolution(Learning):
         speed = results["distance"].sum(axis=1) / np.maximum(seconds.sum(axis=1), 1e-9)
         row = {
             "fitness/best": float(race_score[top]),
-            "fitness/mean": float(score.mean()),
-            "fitness/std": float(score.std()),
+            "fitness/mean": float(own.mean()),
+            "fitness/std": float(own.std()),
             "distance_m/best": float(raced["distance"][top].mean()),
             "distance_m/mean": float(results["distance"].mean()),
             "speed_mps/best": made_good(raced[top], self.sim.episode.control_period),
@@ -131,32 +135,44 @@ class Evolution(Learning):
         self.history.append(row)
         return row
 
+    def latest(self) -> np.ndarray:
+        """The mating pool's mean, and who won the last race."""
+        return np.concatenate([self.genetic.mean(), self.elites[-1][None]])
+
     def _evaluate_all(self, episodes: Episodes, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
-        """Results RESULT [population, e] of a generation, and who was lost; who is on trial drives beside it."""
+        """Drive a generation, each member on its group's episodes; who is on trial drives beside it.
+
+        Returns: results RESULT [population, a group's episodes], and who was lost.
+        """
         recipes, key = self.genetic.ask(self._mutation())
-        parents, n, e = self.genetic.parents, len(recipes), len(episodes.rows)
-        if not len(self.trials):
-            driven = self._evaluate("evolve", parents, recipes, key, episodes, limits, meanwhile=self.meanwhile)
-            return driven.results, driven.lost
-        trial, asked = self._trial()
-        both = episodes.and_then(trial)
-        asked = [
-            Chunk(slice(n + rows.start, n + rows.stop), slice(e + columns.start, e + columns.stop))
-            for rows, columns in asked
-        ]
+        groups, n = self.curriculum.config.groups, len(recipes)
+        e = len(episodes.rows) // groups
+        # Members of a group come side by side; elites, which are the first, are in all of them.
+        order = np.argsort(np.arange(n) % groups, kind="stable")
+        first = np.searchsorted(order % groups, np.arange(groups + 1))
+        asked = [Chunk(slice(*first[g : g + 2].tolist()), slice(g * e, (g + 1) * e)) for g in range(groups)]
+        parents, members, all_episodes = self.genetic.parents, recipes[order], episodes
+        if len(self.trials):
+            trial, tried = self._trial()
+            at = len(episodes.rows)
+            all_episodes = episodes.and_then(trial)
+            tried = [
+                Chunk(slice(n + rows.start, n + rows.stop), slice(at + columns.start, at + columns.stop))
+                for rows, columns in tried
+            ]
+            asked = [*tried, *asked]  # the longest first
+            members = np.concatenate([members, copies(len(self.trials), len(parents))])
+            parents = np.concatenate([parents, self.trials.first, self.trials.last])
         driven = self._evaluate(
-            "evolve",
-            np.concatenate([parents, self.trials.first, self.trials.last]),
-            np.concatenate([recipes, copies(len(self.trials), len(parents))]),
-            key,
-            both,
-            limits,
-            asked=[*asked, Chunk(slice(0, n), slice(0, e))],  # the longest first
-            meanwhile=self.meanwhile,
+            "evolve", parents, members, key, all_episodes, limits, asked=asked, meanwhile=self.meanwhile
         )
-        self._judge(driven.results[n:, e:], driven.lost[n:])
-        # The rest is not kept, and sums do not depend on the layout.
-        return np.ascontiguousarray(driven.results[:n, :e]), driven.lost[:n]
+        if len(self.trials):
+            self._judge(driven.results[n:, at:], driven.lost[n:])
+        results, lost = np.empty((n, e), dtype=driven.results.dtype), np.empty(n, dtype=bool)
+        for g in range(groups):
+            results[g::groups] = driven.results[first[g] : first[g + 1], g * e : (g + 1) * e]
+        lost[order] = driven.lost[:n]
+        return results, lost
 
     # ------------------------------------------------------------------------------------------------------- state
 

@@ -179,16 +179,26 @@ class Learning(ABC):
         return self.settings.ended({"solved": self.solved, **self.counts()})
 
     def conclude(self) -> None:
-        """Find out about who is still on trial when a run ends, and about the last leader where there is no champion.
+        """Find out about who is still on trial when a run ends, and then about the latest.
 
         What a checkpoint holds is from before: a run that is extended goes on as if it had never ended.
         """
-        if self.champion is None and not len(self.trials):
-            self.trials.enter(self.elites[-1][None], self.steps - 1)
-        while len(self.trials) and not self.solved:
-            self._validate()
+        self._finish_trials()
+        if not self.solved:
+            self.trials.enter(self.latest(), self.steps - 1)
+            self._finish_trials()
         if self.champion is None:
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
+
+    def _finish_trials(self) -> None:
+        while len(self.trials) and not self.solved:
+            self._validate()
+
+    def latest(self) -> np.ndarray:
+        """Networks of the last step that are tried if they were not, float32 [k, genes]."""
+        return np.array([self.elites[-1]] if self.champion is None else [], dtype=np.float32).reshape(
+            -1, self.spec.size
+        )
 
     def _mutation(self) -> Mutation:
         """How bred members differ from their parents."""

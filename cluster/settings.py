@@ -23,6 +23,7 @@ MAX_TRAFFIC = 100
 MAX_REPLAY = 10_000_000
 REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
+LEAST_GROUP = 32  # members of a group, of whom the best are to be good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default: two minutes on two cores, in traffic five.
@@ -153,9 +154,9 @@ class EvolveSettings(RunSettings):
     """Members that go on unmodified."""
     tournament: int = 8
     """Members drawn for each tournament."""
-    parents: int = 64
+    parents: int = 128
     """Size of the mating pool, which bounds what is sent to the workers."""
-    crossover: float = 0.5
+    crossover: float = 1.0
     """Share of children with two parents."""
     mutation_rate: float = -1.0
     """Share of a child's genes that are mutated; -1: 0.03, and of mlp:16,16+motion, which has more, 0.012."""
@@ -187,6 +188,10 @@ class EvolveSettings(RunSettings):
     @property
     def algorithm(self) -> str:
         return self.search
+
+    def curriculum(self) -> CurriculumConfig:
+        usual = super().curriculum()
+        return replace(usual, groups=max(1, min(usual.groups, self.population // LEAST_GROUP)))
 
     def extending(self, base: RunSettings) -> Self:
         longer = isinstance(base, EvolveSettings) and self.generations > base.generations

@@ -1,9 +1,10 @@
 """How the task grows: which episodes a generation meets, who races, and who becomes champion.
 
 Distance and speed alone are deceptive under limited grip: the best member is flat out into the first bend. So episodes
-begin short and double in length as the best succeed; a few of them start just before a crash of a recent leader, where
-there is most to learn; the generation's best are raced on more episodes before anybody is selected; and the champion is
-chosen on validation maps that nobody is trained on, and replaced reluctantly.
+begin short and double in length as the best succeed; half of them start just before a crash of a recent leader, where
+there is most to learn; a generation's members are in groups that meet different episodes, so that who is selected was
+good on many, though each drives few; the generation's best are raced on more episodes before anybody is selected; and
+the champion is chosen on validation maps that nobody is trained on, and replaced reluctantly.
 
 State is arrays and numbers only; all randomness comes from (seed, generation).
 """
@@ -38,8 +39,10 @@ class CurriculumConfig:
     """The curriculum's parameters."""
 
     maps: int = 16  # training maps
-    starts: int = 6  # new episodes a generation
-    crash_starts: int = 6  # short episodes a generation that start before a crash of a recent leader
+    first_maps: int = 6  # of these, how many the first generation meets; each one after it meets one more
+    groups: int = 8  # of members, each with episodes of its own
+    starts: int = 3  # new episodes a group and generation
+    crash_starts: int = 3  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, their length
     crash_memory: int = 64  # crashes that are remembered
     crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
@@ -54,7 +57,8 @@ class CurriculumConfig:
     pace: float = 7.0  # m/s that the time limit of a training episode allows for; this and champion_pace: seamless
     slack: float = 3.0  # s, added to it
     validation_target: float = 300.0  # m, from which on champions are looked for
-    contenders: int = 4  # who is validated each generation: the parents' mean, and racers
+    contenders: int = 4  # who is validated: the parents' mean, and racers
+    validate_every: int = 2  # generations
     first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
@@ -99,7 +103,7 @@ class Curriculum:
 
     def _maps(self, generation: int) -> int:
         """Training maps in use: they come in one by one, so that none needs to be waited for."""
-        return min(self.config.maps, self.config.starts + generation)
+        return min(self.config.maps, self.config.first_maps + generation)
 
     def limits(self) -> Limits:
         """Of training episodes."""
@@ -122,40 +126,52 @@ class Curriculum:
         """Mutation's standard deviation: finer as episodes grow longer."""
         return sigma * (self.config.first_target / self.target) ** 0.35
 
-    def _new_starts(self, generation: int, count: int, purpose: int) -> tuple[list[int], np.ndarray, np.ndarray]:
-        rng = self._rng(generation, purpose)
+    def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Training maps [count], by their place among `map_seeds`; different ones if there are as many."""
         n = self._maps(generation)
-        maps = rng.choice(n, count, replace=count > n)
-        used = sorted({int(m) for m in maps})
-        local = np.array([used.index(int(m)) for m in maps])
-        return used, *lane_starts([self.build(self.map_seeds[m]) for m in used], local, rng, self.crowd)
+        return rng.choice(n, count, replace=count > n)
+
+    def _new_starts(self, maps: np.ndarray, rng: np.random.Generator) -> Episodes:
+        """New episodes on training maps [e]."""
+        used, local = np.unique(maps, return_inverse=True)
+        seeds = [self.map_seeds[m] for m in used]
+        return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
 
     def episodes(self, generation: int) -> Episodes:
-        """What every member of a generation meets: new episodes, and some that start before crashes.
+        """What a generation meets, group by group: new episodes, then some that start before crashes.
 
+        Each group has as many of either.
         Raises: CrashError if the traffic of such a start does not fit its map.
         """
-        used, fresh, worlds = self._new_starts(generation, self.config.starts, 0)
-        if len(self.crashes) and self.config.crash_starts:
-            chosen = self._rng(generation, 1).integers(len(self.crashes), size=self.config.crash_starts)
-            crashes = self.crashes[chosen].copy()
-            self._check(crashes["map"], self.crash_worlds[chosen])
-            for m in sorted({int(m) for m in crashes["map"]} - set(used)):
-                used.append(m)
-            crashes["map"] = [used.index(int(m)) for m in crashes["map"]]
-            target = min(self.config.crash_target, self.target)
-            crashes["target"], crashes["steps"] = target, self._steps(target)
-            fresh = np.concatenate([fresh, crashes])
-            worlds = np.concatenate([worlds, self.crash_worlds[chosen]])
-        return Episodes([self.map_seeds[m] for m in used], fresh, worlds)
+        config, rng = self.config, self._rng(generation, 0)
+        maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
+        fresh = self._new_starts(np.concatenate(maps), rng)
+        if not len(self.crashes) or not config.crash_starts:
+            return fresh
+        chosen = self._rng(generation, 1).integers(len(self.crashes), size=config.groups * config.crash_starts)
+        crashes, worlds = self.crashes[chosen].copy(), self.crash_worlds[chosen]
+        self._check(crashes["map"], worlds)
+        target = min(config.crash_target, self.target)
+        crashes["target"], crashes["steps"] = target, self._steps(target)
+        seeds = [self.map_seeds[m] for m in crashes["map"]]
+        used = sorted({*fresh.maps, *seeds})
+        fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
+        crashes["map"] = np.searchsorted(used, seeds)
+        return Episodes(used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, worlds))
+
+    def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
+        """Each group's share of each kind [e, ...], the groups one after another."""
+        n = self.config.groups
+        parts = [kind.reshape(n, -1, *kind.shape[1:]) for kind in kinds]
+        return np.concatenate(parts, axis=1).reshape(-1, *kinds[0].shape[1:])
 
     def starts(self, batch: int, count: int) -> Episodes:
         """So many new episodes on the training maps, for a learner that takes them in batches."""
         return self._drawn(batch, count, 3)
 
     def _drawn(self, generation: int, count: int, purpose: int) -> Episodes:
-        used, episodes, worlds = self._new_starts(generation, count, purpose)
-        return Episodes([self.map_seeds[m] for m in used], episodes, worlds)
+        rng = self._rng(generation, purpose)
+        return self._new_starts(self._some_maps(generation, count, rng), rng)
 
     def _check(self, maps: np.ndarray, worlds: np.ndarray) -> None:
         """Refuse traffic [n, cars, fields] that is not on its map [n]; only here are the maps at hand for nothing."""

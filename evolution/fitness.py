@@ -33,6 +33,22 @@ def _share(distance: np.ndarray, target: np.ndarray | float) -> np.ndarray:
     return (1.0 - LINEAR_SHARE) * np.log1p(bounded) / np.log1p(target) + LINEAR_SHARE * bounded / target
 
 
+def pooled(scores: np.ndarray, groups: int) -> np.ndarray:
+    """Scores float64 [n], made comparable, of members whose groups (k modulo `groups`) met different episodes.
+
+    Each is what the whole generation has at the member's rank within its group (quantile normalisation), so that as
+    many of each group are among the best, whoever met the harder episodes.
+    """
+    whole = np.sort(scores)
+    ranks = (np.arange(len(scores)) + 0.5) / len(scores)
+    among = np.empty(len(scores))
+    for g in range(groups):
+        group = np.arange(g, len(scores), groups)
+        order = group[np.argsort(scores[group], kind="stable")]
+        among[order] = np.interp((np.arange(len(order)) + 0.5) / len(order), ranks, whole)
+    return among
+
+
 def pareto(values: np.ndarray) -> np.ndarray:
     """Rank key float64 [n] of elements [n, 2], greater is better: front first, crowding within it (Deb et al. 2002).
 

@@ -17,8 +17,8 @@ class GeneticConfig:
     population: int = 512  # members of a generation
     elites: int = 8  # members that go on unmodified
     tournament: int = 8  # members drawn for each tournament
-    parents: int = 64  # size of the mating pool
-    crossover: float = 0.5  # share of children with two parents
+    parents: int = 128  # size of the mating pool
+    crossover: float = 1.0  # share of children with two parents
 
     def check(self) -> None:
         """Raises ValueError with one line for parameters that do not fit each other."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evolution.fitness import elements, pareto, scalar
+from evolution.fitness import elements, pareto, pooled, scalar
 from evolution.rollout import RESULT
 
 TARGET = 500.0
@@ -163,3 +163,33 @@ def test_the_ends_of_a_front_are_loneliest():
     assert set(np.argsort(-key)[:2]) == {0, 4}
     assert np.argsort(-key)[2] == 3  # the one with the widest gap about it
     assert key.argmin() == 5  # dominated
+
+
+@given(
+    scores=st.lists(st.integers(0, 1000), min_size=8, max_size=60).map(lambda k: np.array(k) / 1000.0),
+    groups=st.integers(1, 4),
+)
+def test_pooled_scores_keep_the_order_within_a_group_and_know_no_better_group(scores, groups):
+    among = pooled(scores, groups)
+    whole = [among[g::groups] for g in range(groups)]
+    for g in range(groups):
+        order = np.argsort(scores[g::groups], kind="stable")
+        assert (np.diff(whole[g][order]) >= -1e-12).all()
+    assert scores.min() - 1e-12 <= among.min()
+    assert among.max() <= scores.max() + 1e-12
+    if len(scores) % groups == 0:  # as many in each: the same values in all of them
+        for one_group in whole[1:]:
+            np.testing.assert_array_equal(np.sort(one_group), np.sort(whole[0]))
+
+
+def test_pooled_scores_of_one_group_are_what_they_were():
+    scores = np.random.default_rng(4).random(33)
+    np.testing.assert_allclose(pooled(scores, 1), scores, rtol=1e-12)
+
+
+def test_half_of_the_best_come_from_either_of_two_groups():
+    rng = np.random.default_rng(5)
+    scores = np.where(np.arange(64) % 2, 10.0, 0.0) + rng.random(64)  # the second group met the easier ones
+    best = np.argsort(-pooled(scores, 2), kind="stable")[:16]
+    assert (best % 2).sum() == 8
+    assert set(best[best % 2 == 1] // 2) == set(np.argsort(-scores[1::2])[:8])
