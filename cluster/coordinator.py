@@ -1,4 +1,9 @@
-"""The generation loop of the genetic algorithm: ask, evaluate, race, validate, tell."""
+"""The generation loop of the genetic algorithm: ask, evaluate, race, validate, tell; and which population goes on.
+
+Populations that begin alike end far apart: what the first crude drivers do with their sensors decides for good how well
+their children can drive, and it shows soon. So a run begins with an island, and with another one where its champion is
+not promising; the best of them goes on.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +13,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learning import Learning, copies, made_good, some_left
+from cluster.learning import Champion, Learning, champion_of, copies, made_good, some_left, told
 from cluster.pool import Chunk
-from cluster.settings import EvolveSettings
+from cluster.settings import GENERATIONS, EvolveSettings
 from evolution import fitness
 from evolution.breeding import Mutation
 from evolution.curriculum import success_rate
@@ -22,14 +27,43 @@ from gridsim.world import check_worlds
 COLUMNS = (
     "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
     "speed_mps/mean", "target_m", "race/success_rate", "validation/success_rate", "car_steps", "wall_s",
-    "car_steps_per_s",
+    "car_steps_per_s", "island",
 )  # fmt: skip
 """Columns of history.csv after `generation`; the names that MLflow has them under."""
 
 
+PROMISING = 0.5  # score of an island's champion at which no other island is tried
+
+
+@dataclass
+class Population:
+    """What a generation leaves for the next one.
+
+    Attributes:
+        parents: genomes float32 [parents, genes], elites first.
+        elites: how many of them are elites.
+        crashes: EPISODE [n] that are remembered.
+        worlds: their traffic, float32 [n, cars, world.FIELDS].
+        target: m, the length of its episodes.
+    """
+
+    parents: np.ndarray
+    elites: int
+    crashes: np.ndarray
+    worlds: np.ndarray
+    target: float
+
+
 @dataclass
 class Evolution(Learning):
-    """One run of the genetic algorithm."""
+    """One run of the genetic algorithm.
+
+    Attributes:
+        island: number of the population that evolves, from 0.
+        islands: populations that have had their share, and their champions.
+        settled: whether it is known which of them goes on.
+        island_began: car-steps of the run when this one began.
+    """
 
     columns: ClassVar[tuple[str, ...]] = COLUMNS
     step_name: ClassVar[str] = "generation"
@@ -47,6 +81,10 @@ class Evolution(Learning):
             s.seed,
             random_search=s.search == "random",
         )
+        self._new = self._population()
+        self.island, self.island_began = 0, 0
+        self.islands: list[tuple[Population, Champion | None]] = []
+        self.settled = s.islands == 1 or self.initial is not None or self.genetic.random_search
         if self.initial is not None:
             self.genetic.seed_with(self.initial)
 
@@ -131,8 +169,11 @@ class Evolution(Learning):
             "race/success_rate": race_success,
             "validation/success_rate": self.champion.success_rate if self.champion else 0.0,
             "car_steps": float(self.car_steps),
+            "island": float(self.island),
         }
         self.history.append(row)
+        if not self.settled and self.car_steps - self.island_began >= s.island_car_steps:
+            self._leave_island()
         return row
 
     def latest(self) -> np.ndarray:
@@ -174,6 +215,42 @@ class Evolution(Learning):
         lost[order] = driven.lost[:n]
         return results, lost
 
+    # ------------------------------------------------------------------------------------------------------ islands
+
+    def _population(self) -> Population:
+        genetic, curriculum = self.genetic, self.curriculum
+        return Population(
+            genetic.parents, genetic.elites, curriculum.crashes, curriculum.crash_worlds, curriculum.target
+        )
+
+    def _go_on_with(self, population: Population, champion: Champion | None) -> None:
+        self.genetic.parents, self.genetic.elites = population.parents, population.elites
+        self.curriculum.crashes, self.curriculum.crash_worlds = population.crashes, population.worlds
+        self.curriculum.target = population.target
+        self.champion = champion
+
+    def _leave_island(self) -> None:
+        """Begin another population, or go on with the best of them if there were enough, or this one is promising."""
+        self._settle_trials()
+        if self.solved:
+            return
+        self.islands.append((self._population(), self.champion))
+        self.island_began = self.car_steps
+        score = self.champion.score if self.champion else 0.0
+        if score < PROMISING and len(self.islands) < self.settings.islands:
+            self.island = len(self.islands)
+            self._go_on_with(self._new, None)
+            return
+        self.island = max(range(len(self.islands)), key=lambda k: _quality(self.islands[k][1]))
+        self._go_on_with(*self.islands[self.island])
+        self.islands, self.settled = [], True
+
+    def conclude(self) -> None:
+        self._settle_trials()
+        if not self.solved:
+            self.champion = max([self.champion, *(champion for _, champion in self.islands)], key=_quality)
+        super().conclude()
+
     # ------------------------------------------------------------------------------------------------------- state
 
     def counts(self) -> dict[str, int]:
@@ -183,42 +260,72 @@ class Evolution(Learning):
         return {"generations": self.generation}
 
     def way(self) -> tuple[float, float, str]:
-        return self.generation, self.settings.generations, "generation"
+        s = self.settings
+        if s.car_steps and s.generations == GENERATIONS:  # nobody asked for a number of them
+            return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
+        return self.generation, s.generations, "generation"
 
     def describe(self, row: dict[str, float]) -> str:
+        generation = f"generation {self.generation}  " if self.way()[2] != "generation" else ""
+        island = "" if self.settled else f"island {self.island + 1}  "
         return (
-            f"distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
+            f"{generation}{island}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
             f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"
         )
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays, meta = super().state()
-        arrays |= {
-            "parents": self.genetic.parents,
-            "crashes": _plain(self.curriculum.crashes),
-            "crash_worlds": self.curriculum.crash_worlds,
+        populations = [(self._population(), None), *self.islands]
+        for k, (population, champion) in enumerate(populations):
+            arrays |= {
+                f"parents{k}": population.parents,
+                f"crashes{k}": _plain(population.crashes),
+                f"crash_worlds{k}": population.worlds,
+                f"champion{k}": champion.genome if champion else np.zeros(0, dtype=np.float32),
+            }
+        meta |= {
+            "populations": [[p.elites, p.target, told(champion)] for p, champion in populations],
+            "island": self.island,
+            "island_began": self.island_began,
+            "settled": self.settled,
         }
-        meta |= {"elite_rows": self.genetic.elites, "target_m": self.curriculum.target}
         return arrays, meta
 
     def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        s, genes = self.settings, self.spec.size
         super()._restore(arrays, meta)
-        parents, crashes, worlds = arrays["parents"], arrays["crashes"], arrays["crash_worlds"]
-        generation, elite_rows, target = int(meta["generation"]), int(meta["elite_rows"]), float(meta["target_m"])
-        least = min(self.curriculum.config.first_target, self.curriculum.goal)
+        generation, told_of = int(meta["generation"]), meta["populations"]
+        island, began, settled = int(meta["island"]), int(meta["island_began"]), meta["settled"]
         fits = (
             generation == len(self.history)
-            and parents.ndim == 2
+            and type(settled) is bool
+            and 0 <= island < self.settings.islands
+            and 0 <= began <= self.car_steps
+            and len(told_of) == (1 if settled else island + 1)
+        )
+        if not fits:
+            raise ValueError("its parts do not fit each other")
+        own, *others = [self._restored(arrays, k, *told_of[k]) for k in range(len(told_of))]
+        self._go_on_with(own[0], self.champion)
+        self.genetic.generation, self.islands = generation, others
+        self.island, self.island_began, self.settled = island, began, settled
+
+    def _restored(
+        self, arrays: dict[str, np.ndarray], k: int, elites: int, target: float, figures: list[float]
+    ) -> tuple[Population, Champion | None]:
+        """A population and its champion from a checkpoint. Raises ValueError where it is none."""
+        s, genes, elites, target = self.settings, self.spec.size, int(elites), float(target)
+        parents, crashes, worlds = arrays[f"parents{k}"], arrays[f"crashes{k}"], arrays[f"crash_worlds{k}"]
+        fits = (
+            parents.ndim == 2
             and parents.shape[1] == genes
             and parents.dtype == np.float32
             and len(parents) <= s.elites + s.parents
-            and 0 <= elite_rows <= min(s.elites, max(len(parents) - 1, 0))
+            and 0 <= elites <= min(s.elites, max(len(parents) - 1, 0))
             and crashes.ndim == 2
             and crashes.shape[1] == 6
-            and worlds.shape == (len(crashes), *self.curriculum.crash_worlds.shape[1:])
+            and worlds.shape == (len(crashes), *self._new.worlds.shape[1:])
             and worlds.dtype == np.float32
-            and least <= target <= self.curriculum.goal
+            and self._new.target <= target <= self.curriculum.goal
         )
         if not fits:
             raise ValueError("its parts do not fit each other")
@@ -226,10 +333,12 @@ class Evolution(Learning):
         if not np.isfinite(crashes).all() or not np.isin(crashes[:, 0], maps).all():
             raise ValueError("a crash is nowhere on its maps")
         check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
-        self.genetic.generation, self.genetic.elites = generation, elite_rows
-        self.genetic.parents = parents
-        self.curriculum.target = target
-        self.curriculum.crashes, self.curriculum.crash_worlds = _crashes(crashes), worlds
+        champion = champion_of(arrays[f"champion{k}"], figures, genes)
+        return Population(parents, elites, _crashes(crashes), worlds, target), champion
+
+
+def _quality(champion: Champion | None) -> tuple[float, float]:
+    return (champion.score, champion.distance_m) if champion else (-1.0, 0.0)
 
 
 def _plain(episodes: np.ndarray) -> np.ndarray:

@@ -183,12 +183,15 @@ class Learning(ABC):
 
         What a checkpoint holds is from before: a run that is extended goes on as if it had never ended.
         """
+        self._settle_trials()
+        if self.champion is None:
+            raise PoolError("there is no champion: each network that was to be validated killed its workers")
+
+    def _settle_trials(self) -> None:
         self._finish_trials()
         if not self.solved:
             self.trials.enter(self.latest(), self.steps - 1)
             self._finish_trials()
-        if self.champion is None:
-            raise PoolError("there is no champion: each network that was to be validated killed its workers")
 
     def _finish_trials(self) -> None:
         while len(self.trials) and not self.solved:
@@ -196,9 +199,8 @@ class Learning(ABC):
 
     def latest(self) -> np.ndarray:
         """Networks of the last step that are tried if they were not, float32 [k, genes]."""
-        return np.array([self.elites[-1]] if self.champion is None else [], dtype=np.float32).reshape(
-            -1, self.spec.size
-        )
+        untried = [] if self.champion else self.elites[-1:]
+        return np.array(untried, dtype=np.float32).reshape(-1, self.spec.size)
 
     def _mutation(self) -> Mutation:
         """How bred members differ from their parents."""
@@ -319,9 +321,7 @@ class Learning(ABC):
             **self.counts(),
             "columns": list(self.columns),
             "trials": [self.trials.first_generation, self.trials.last_generation],
-            "champion": [champion.score, champion.success_rate, champion.distance_m, champion.generation]
-            if champion
-            else [],
+            "champion": told(champion),
         }
         return arrays, meta
 
@@ -337,16 +337,13 @@ class Learning(ABC):
     def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         """`restore`; what does not fit raises any of the errors that it names."""
         genes = self.spec.size
-        history, elites, champion = arrays["history"], arrays["elites"], arrays["champion"]
+        history, elites = arrays["history"], arrays["elites"]
         first, last, tried = arrays["trials_first"], arrays["trials_last"], arrays["trials_tried"]
         fits = (
             meta["columns"] == list(self.columns)
             and history.shape == (len(elites), len(self.columns))
             and elites.shape == (len(elites), genes)
             and elites.dtype == np.float32
-            and champion.shape == (genes if meta["champion"] else 0,)
-            and champion.dtype == np.float32
-            and np.isfinite(meta["champion"]).all()
             and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
             and len(first) <= self.curriculum.config.contenders
             and len(last) <= 1
@@ -362,9 +359,7 @@ class Learning(ABC):
         self.elites = list(elites)
         first_generation, last_generation = (int(k) for k in meta["trials"])
         self.trials = Trials(first, last, first_generation, last_generation, tried)
-        if meta["champion"]:
-            score, rate, distance, found = meta["champion"]
-            self.champion = Champion(champion, float(score), float(rate), float(distance), int(found))
+        self.champion = champion_of(arrays["champion"], meta["champion"], genes)
         self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
 
     def history_csv(self) -> bytes:
@@ -375,6 +370,21 @@ class Learning(ABC):
         for k, row in enumerate(self.history):
             writer.writerow([k, *(repr(row[name]) for name in self.columns)])
         return text.getvalue().encode()
+
+
+def told(champion: Champion | None) -> list[float]:
+    """What a checkpoint tells of a champion beside its genome."""
+    return [champion.score, champion.success_rate, champion.distance_m, champion.generation] if champion else []
+
+
+def champion_of(genome: np.ndarray, figures: list[float], genes: int) -> Champion | None:
+    """The champion that was `told` of, if any. Raises: ValueError where it cannot have been."""
+    if genome.shape != (genes if figures else 0,) or genome.dtype != np.float32 or not np.isfinite(figures).all():
+        raise ValueError("its parts do not fit each other")
+    if not figures:
+        return None
+    score, rate, distance, found = figures
+    return Champion(genome, float(score), float(rate), float(distance), int(found))
 
 
 def copies(n: int, first: int = 0) -> np.ndarray:

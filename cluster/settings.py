@@ -23,11 +23,12 @@ MAX_TRAFFIC = 100
 MAX_REPLAY = 10_000_000
 REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
+ISLANDS, MAX_ISLANDS = 4, 1000
 LEAST_GROUP = 32  # members of a group, of whom the best are to be good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default: two minutes on two cores, in traffic five.
-GENERATIONS, CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 150, 170_000_000, 180_000_000
+GENERATIONS, CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 400, 170_000_000, 180_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -148,13 +149,18 @@ class EvolveSettings(RunSettings):
     population: int = 512
     """Members of a generation."""
     generations: int = 0
-    """Generations at most; a run whose champion is solved stops earlier. 0: 150, and unless --car-steps says otherwise
+    """Generations at most; a run whose champion is solved stops earlier. 0: 400, and unless --car-steps says otherwise
     no more than 170 million car-steps, in traffic 180: on two cores two minutes, in traffic five."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8
     """Members drawn for each tournament."""
-    parents: int = 128
+    islands: int = 0
+    """Populations at most that a run begins with, one after another, until one is promising; the best goes on. 0: 4, on
+    the grid 1."""
+    island_car_steps: int = 15_000_000
+    """Car-steps that each of them is given before that is judged."""
+    parents: int = 64
     """Size of the mating pool, which bounds what is sent to the workers."""
     crossover: float = 1.0
     """Share of children with two parents."""
@@ -173,6 +179,8 @@ class EvolveSettings(RunSettings):
         super().__post_init__()
         if self.mutation_rate == -1.0:
             object.__setattr__(self, "mutation_rate", 0.012 if self.policy == self.policy_in_traffic else 0.03)
+        if not self.islands:
+            object.__setattr__(self, "islands", 1 if self.observation == "grid" else ISLANDS)
         if not self.generations:
             object.__setattr__(self, "generations", GENERATIONS)
             if not self.car_steps:
@@ -208,6 +216,10 @@ class EvolveSettings(RunSettings):
             raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
         if self.population > MAX_POPULATION:
             raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
+        if not 1 <= self.islands <= MAX_ISLANDS:
+            raise SettingsError(f"--islands must be 1 to {MAX_ISLANDS}, not {self.islands}")
+        if not 1 <= self.island_car_steps <= MAX_STEPS:
+            raise SettingsError(f"--island-car-steps must be 1 to {MAX_STEPS:,}, not {self.island_car_steps:,}")
         for name in ("crossover", "mutation_rate", "bump_rate"):
             _check_share(self, name)
         if not 0.0 <= self.sigma < math.inf:

@@ -17,7 +17,7 @@ class GeneticConfig:
     population: int = 512  # members of a generation
     elites: int = 8  # members that go on unmodified
     tournament: int = 8  # members drawn for each tournament
-    parents: int = 128  # size of the mating pool
+    parents: int = 64  # size of the mating pool
     crossover: float = 1.0  # share of children with two parents
 
     def check(self) -> None:
