@@ -275,14 +275,15 @@ class Evolution(Learning):
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays, meta = super().state()
-        populations = [(self._population(), None), *self.islands]
+        populations = [(self._population(), self.champion), *self.islands]
         for k, (population, champion) in enumerate(populations):
             arrays |= {
-                f"parents{k}": population.parents,
-                f"crashes{k}": _plain(population.crashes),
-                f"crash_worlds{k}": population.worlds,
-                f"champion{k}": champion.genome if champion else np.zeros(0, dtype=np.float32),
+                f"parents{k or ''}": population.parents,
+                f"crashes{k or ''}": _plain(population.crashes),
+                f"crash_worlds{k or ''}": population.worlds,
             }
+            if k:
+                arrays[f"champion{k}"] = champion.genome if champion else np.zeros(0, dtype=np.float32)
         meta |= {
             "populations": [[p.elites, p.target, told(champion)] for p, champion in populations],
             "island": self.island,
@@ -304,8 +305,8 @@ class Evolution(Learning):
         )
         if not fits:
             raise ValueError("its parts do not fit each other")
-        own, *others = [self._restored(arrays, k, *told_of[k]) for k in range(len(told_of))]
-        self._go_on_with(own[0], self.champion)
+        (own, champion), *others = [self._restored(arrays, k, *told_of[k]) for k in range(len(told_of))]
+        self._go_on_with(own, champion)
         self.genetic.generation, self.islands = generation, others
         self.island, self.island_began, self.settled = island, began, settled
 
@@ -314,7 +315,11 @@ class Evolution(Learning):
     ) -> tuple[Population, Champion | None]:
         """A population and its champion from a checkpoint. Raises ValueError where it is none."""
         s, genes, elites, target = self.settings, self.spec.size, int(elites), float(target)
-        parents, crashes, worlds = arrays[f"parents{k}"], arrays[f"crashes{k}"], arrays[f"crash_worlds{k}"]
+        parents, crashes, worlds = (
+            arrays[f"parents{k or ''}"],
+            arrays[f"crashes{k or ''}"],
+            arrays[f"crash_worlds{k or ''}"],
+        )
         fits = (
             parents.ndim == 2
             and parents.shape[1] == genes
@@ -333,7 +338,7 @@ class Evolution(Learning):
         if not np.isfinite(crashes).all() or not np.isin(crashes[:, 0], maps).all():
             raise ValueError("a crash is nowhere on its maps")
         check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
-        champion = champion_of(arrays[f"champion{k}"], figures, genes)
+        champion = champion_of(arrays[f"champion{k or ''}"], figures, genes)
         return Population(parents, elites, _crashes(crashes), worlds, target), champion
 
 

@@ -162,8 +162,8 @@ class Curriculum:
     def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
         """Each group's share of each kind [e, ...], the groups one after another."""
         n = self.config.groups
-        parts = [kind.reshape(n, -1, *kind.shape[1:]) for kind in kinds]
-        return np.concatenate(parts, axis=1).reshape(-1, *kinds[0].shape[1:])
+        parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
+        return np.concatenate(np.concatenate(parts, axis=1))
 
     def starts(self, batch: int, count: int) -> Episodes:
         """So many new episodes on the training maps, for a learner that takes them in batches."""

@@ -240,8 +240,8 @@ def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):
         ("trials", lambda m: [1]),
         ("generation", lambda m: math.inf),
         ("car_steps", lambda m: math.inf),
-        ("elite_rows", lambda m: 3),
-        ("target_m", lambda m: 5e-324),
+        ("populations", lambda m: [[3, *m[0][1:]]]),
+        ("populations", lambda m: [[m[0][0], 5e-324, m[0][2]]]),
         ("champion", lambda m: [0.5, 0.5, 100.0, 0]),  # of which there are no genes
         ("solved", lambda m: True),  # without a champion
     ],

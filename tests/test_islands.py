@@ -179,6 +179,6 @@ def test_a_checkpoint_of_impossible_islands_is_refused(maps, tmp_path, spoil):
 
 
 def test_islands_are_checked():
-    for wrong in ({"islands": -1}, {"islands": 1001}, {"island_car_steps": 0}):
+    for islands, car_steps in ((-1, 1), (1001, 1), (2, 0)):
         with pytest.raises(SettingsError, match="--island"):
-            dataclasses.replace(SETTINGS, **wrong).check()
+            dataclasses.replace(SETTINGS, islands=islands, island_car_steps=car_steps).check()
