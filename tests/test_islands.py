@@ -7,7 +7,7 @@ import pytest
 
 from cluster import coordinator
 from cluster.checkpoint import CheckpointError, load, save
-from cluster.coordinator import Evolution
+from cluster.coordinator import Evolution, Population
 from cluster.learning import Champion, Maps
 from cluster.pool import SerialPool
 from cluster.settings import EvolveSettings, SettingsError
@@ -51,7 +51,7 @@ def state_of(evolution):
 
 def test_each_begins_from_nothing_and_the_best_goes_on(maps):
     evolution = begin(maps)
-    left = []
+    left: list[tuple[Population, Champion | None]] = []
     while not evolution.settled:
         go_on(evolution)
         if len(evolution.islands) > len(left):  # the next one has just begun
@@ -71,6 +71,7 @@ def test_each_begins_from_nothing_and_the_best_goes_on(maps):
             assert evolution.champion is champion
             assert evolution.genetic.parents is population.parents
         else:
+            assert champion is not None
             assert (evolution.champion.score, evolution.champion.distance_m) >= (champion.score, champion.distance_m)
     go_on(evolution)
     assert evolution.history[-1]["island"] == evolution.island
