@@ -34,7 +34,10 @@ def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tup
 
 
 def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
-    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
+    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG.
+
+    Where another island begins, or the best goes on, there is a line.
+    """
     figure, axes = _figure(15, 3.8, 4)
     step = np.arange(len(history))
 
@@ -62,7 +65,10 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
     plot(axes[3], "validation/success_rate", _BEST, "champion, validation")
     plot(axes[3], success[0], _OTHER, success[1], alpha=0.5)
     axes[3].set(title="success rate", ylim=(-0.02, 1.05))
+    islands = np.array([row.get("island", 0.0) for row in history])
     for axis in axes:
+        for begun in np.flatnonzero(np.diff(islands)):
+            axis.axvline(begun + 0.5, color=_MEAN, linewidth=0.8, linestyle="--")
         axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
         axis.legend(frameon=False, fontsize=8)

@@ -27,7 +27,7 @@ class Task:
         parents: genomes float32 [parents, genes] that the recipes name.
         key: the generation's number for breeding, 64 bits.
         mutation: how children differ from their parents.
-        episodes: EPISODE [episodes], the same for every member.
+        episodes: EPISODE [episodes]; who drives which of them is the call's affair.
         worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
         maps: (scenario, seed) of each map that `episodes` indexes.
         limits: where an episode ends if nothing happens.
