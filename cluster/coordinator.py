@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learning import Champion, Learning, champion_of, copies, made_good, some_left, told
+from cluster.learning import Champion, Learning, champion_of, copies, genes_of, made_good, some_left, told
 from cluster.pool import Chunk
 from cluster.settings import GENERATIONS, EvolveSettings
 from evolution import fitness
@@ -246,9 +246,7 @@ class Evolution(Learning):
         self.islands, self.settled = [], True
 
     def conclude(self) -> None:
-        self._settle_trials()
-        if not self.solved:
-            self.champion = max([self.champion, *(champion for _, champion in self.islands)], key=_quality)
+        self.champion = max([self.champion, *(champion for _, champion in self.islands)], key=_quality)
         super().conclude()
 
     # ------------------------------------------------------------------------------------------------------- state
@@ -275,17 +273,19 @@ class Evolution(Learning):
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays, meta = super().state()
-        populations = [(self._population(), self.champion), *self.islands]
-        for k, (population, champion) in enumerate(populations):
+        populations = [self._population(), *(population for population, _ in self.islands)]
+        champions = [champion for _, champion in self.islands]
+        for k, population in enumerate(populations):
             arrays |= {
-                f"parents{k or ''}": population.parents,
-                f"crashes{k or ''}": _plain(population.crashes),
-                f"crash_worlds{k or ''}": population.worlds,
+                f"parents{k}": population.parents,
+                f"crashes{k}": _plain(population.crashes),
+                f"crash_worlds{k}": population.worlds,
             }
-            if k:
-                arrays[f"champion{k}"] = champion.genome if champion else np.zeros(0, dtype=np.float32)
+        for k, champion in enumerate(champions, 1):
+            arrays[f"champion{k}"] = genes_of(champion)
         meta |= {
-            "populations": [[p.elites, p.target, told(champion)] for p, champion in populations],
+            "populations": [[population.elites, population.target] for population in populations],
+            "champions": [told(champion) for champion in champions],
             "island": self.island,
             "island_began": self.island_began,
             "settled": self.settled,
@@ -294,35 +294,35 @@ class Evolution(Learning):
 
     def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super()._restore(arrays, meta)
-        generation, told_of = int(meta["generation"]), meta["populations"]
-        island, began, settled = int(meta["island"]), int(meta["island_began"]), meta["settled"]
+        generation, island, began = int(meta["generation"]), int(meta["island"]), int(meta["island_began"])
+        settled = meta["settled"]
         fits = (
             generation == len(self.history)
             and type(settled) is bool
             and 0 <= island < self.settings.islands
             and 0 <= began <= self.car_steps
-            and len(told_of) == (1 if settled else island + 1)
+            and len(meta["populations"]) == len(meta["champions"]) + 1 == (1 if settled else island + 1)
         )
         if not fits:
             raise ValueError("its parts do not fit each other")
-        (own, champion), *others = [self._restored(arrays, k, *told_of[k]) for k in range(len(told_of))]
-        self._go_on_with(own, champion)
-        self.genetic.generation, self.islands = generation, others
+        populations = [self._restored(arrays, k, *figures) for k, figures in enumerate(meta["populations"])]
+        champions = [
+            champion_of(arrays[f"champion{k}"], figures, self.spec.size)
+            for k, figures in enumerate(meta["champions"], 1)
+        ]
+        self._go_on_with(populations[0], self.champion)
+        self.islands = list(zip(populations[1:], champions, strict=True))
+        self.genetic.generation = generation
         self.island, self.island_began, self.settled = island, began, settled
 
-    def _restored(
-        self, arrays: dict[str, np.ndarray], k: int, elites: int, target: float, figures: list[float]
-    ) -> tuple[Population, Champion | None]:
-        """A population and its champion from a checkpoint. Raises ValueError where it is none."""
-        s, genes, elites, target = self.settings, self.spec.size, int(elites), float(target)
-        parents, crashes, worlds = (
-            arrays[f"parents{k or ''}"],
-            arrays[f"crashes{k or ''}"],
-            arrays[f"crash_worlds{k or ''}"],
-        )
+    def _restored(self, arrays: dict[str, np.ndarray], k: int, elites: int, target: float) -> Population:
+        """A population from a checkpoint. Raises ValueError where it is none."""
+        s = self.settings
+        parents, crashes, worlds = arrays[f"parents{k}"], arrays[f"crashes{k}"], arrays[f"crash_worlds{k}"]
+        elites, target = int(elites), float(target)
         fits = (
             parents.ndim == 2
-            and parents.shape[1] == genes
+            and parents.shape[1] == self.spec.size
             and parents.dtype == np.float32
             and len(parents) <= s.elites + s.parents
             and 0 <= elites <= min(s.elites, max(len(parents) - 1, 0))
@@ -338,8 +338,7 @@ class Evolution(Learning):
         if not np.isfinite(crashes).all() or not np.isin(crashes[:, 0], maps).all():
             raise ValueError("a crash is nowhere on its maps")
         check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
-        champion = champion_of(arrays[f"champion{k or ''}"], figures, genes)
-        return Population(parents, elites, _crashes(crashes), worlds, target), champion
+        return Population(parents, elites, _crashes(crashes), worlds, target)
 
 
 def _quality(champion: Champion | None) -> tuple[float, float]:

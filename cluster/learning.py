@@ -313,7 +313,7 @@ class Learning(ABC):
             "trials_first": self.trials.first,
             "trials_last": self.trials.last,
             "trials_tried": self.trials.tried,
-            "champion": champion.genome if champion else np.zeros(0, dtype=np.float32),
+            "champion": genes_of(champion),
         }
         meta: dict[str, Any] = {
             "solved": self.solved,
@@ -370,6 +370,11 @@ class Learning(ABC):
         for k, row in enumerate(self.history):
             writer.writerow([k, *(repr(row[name]) for name in self.columns)])
         return text.getvalue().encode()
+
+
+def genes_of(champion: Champion | None) -> np.ndarray:
+    """A champion's genome, float32 [genes], or [0] of none."""
+    return champion.genome if champion else np.zeros(0, dtype=np.float32)
 
 
 def told(champion: Champion | None) -> list[float]:

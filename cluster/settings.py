@@ -157,7 +157,7 @@ class EvolveSettings(RunSettings):
     """Members drawn for each tournament."""
     islands: int = 0
     """Populations at most that a run begins with, one after another, until one is promising; the best goes on. 0: 4, on
-    the grid 1."""
+    the grid 1. With --init, and of random search, there is one."""
     island_car_steps: int = 15_000_000
     """Car-steps that each of them is given before that is judged."""
     parents: int = 64
