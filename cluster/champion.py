@@ -21,7 +21,7 @@ from cluster.checkpoint import CheckpointError
 from cluster.learning import Maps, summarise
 from cluster.settings import MAX_TRAFFIC
 from evolution import convnet
-from evolution.curriculum import HELD_OUT_MAPS, spread_starts
+from evolution.curriculum import HELD_OUT_SEEDS, spread_starts
 from evolution.episodes import Episodes
 from evolution.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from evolution.rollout import Limits
@@ -172,4 +172,5 @@ def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int
         traffic = champion.traffic if name == champion.scenario else default_traffic(name)
     if not 0 <= traffic <= MAX_TRAFFIC:
         raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
-    return spread_starts(maps.get, seed, max(HELD_OUT_MAPS, episodes // 8), episodes, traffic)
+    used = max(len(HELD_OUT_SEEDS), episodes // 8)
+    return spread_starts(maps.get, range(seed, seed + used), episodes, traffic)

@@ -32,6 +32,7 @@ COLUMNS = (
 """Columns of history.csv after `generation`; the names that MLflow has them under."""
 
 
+AHEAD = 3  # generations for which training maps are built
 PROMISING = 0.5  # score of an island's champion at which no other island is tried
 
 
@@ -114,7 +115,7 @@ class Evolution(Learning):
         generation, limits = self.generation, curriculum.limits()
         mean = self.genetic.mean()
         episodes = curriculum.episodes(generation)
-        self.maps.ahead(curriculum.map_seeds[: generation + 4])
+        self._build_ahead(curriculum.map_seeds[: curriculum.maps_in_use(generation + AHEAD)])
         results, lost = self._evaluate_all(episodes, limits)
         some_left(lost, "evolve")
         groups, n = curriculum.config.groups, results.shape[1]

@@ -27,8 +27,9 @@ from cluster.worker import Task
 from evolution.breeding import RECIPE, Mutation
 from evolution.curriculum import (
     HELD_OUT_EPISODES,
-    HELD_OUT_MAPS,
+    HELD_OUT_SEEDS,
     TRIED_KEPT,
+    VALIDATION_SEEDS,
     Curriculum,
     Trials,
     spread_starts,
@@ -39,9 +40,10 @@ from evolution.policy import PolicySpec
 from evolution.rollout import Limits
 from gridsim.config import SimConfig
 from gridsim.ego import End
-from gridsim.scenarios import HELD_OUT_SEED, Scenario, build, map_of
+from gridsim.scenarios import Scenario, build, map_of
 
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
+MAPS_A_STEP = 4  # of the latter two that are begun ahead in a step, so that a short run builds few for nothing
 
 
 class Maps:
@@ -51,14 +53,15 @@ class Maps:
         self._scenario, self._config = scenario, config
         self._built: dict[int, Future[Scenario]] = {}
         self._lock = threading.Lock()
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="maps")
+        self._soon, self._later = (ThreadPoolExecutor(1, thread_name_prefix=f"maps-{k}") for k in range(2))
 
-    def ahead(self, seeds: list[int]) -> None:
-        """Begin to build maps that will be needed, in this order."""
+    def ahead(self, seeds: Sequence[int], later: bool = False) -> None:
+        """Begin to build maps that will be needed, in this order; `later` ones do not keep others waiting."""
+        thread = self._later if later else self._soon
         with self._lock:
             for seed in seeds:
                 if seed not in self._built:
-                    self._built[seed] = self._thread.submit(build, self._scenario, seed, self._config)
+                    self._built[seed] = thread.submit(build, self._scenario, seed, self._config)
 
     def get(self, seed: int) -> Scenario:
         """The map of a seed."""
@@ -78,7 +81,8 @@ class Maps:
 
     def close(self) -> None:
         """Forget what is not yet begun."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        for thread in (self._soon, self._later):
+            thread.shutdown(wait=False, cancel_futures=True)
 
 
 @dataclass
@@ -196,6 +200,12 @@ class Learning(ABC):
     def _finish_trials(self) -> None:
         while len(self.trials) and not self.solved:
             self._validate()
+
+    def _build_ahead(self, seeds: Sequence[int]) -> None:
+        """Begin to build maps that training needs soon, and a few of those for validation and the held-out drives."""
+        self.maps.ahead(seeds)
+        last = [*VALIDATION_SEEDS, *HELD_OUT_SEEDS]
+        self.maps.ahead(last[self.steps * MAPS_A_STEP :][:MAPS_A_STEP], later=True)
 
     def latest(self) -> np.ndarray:
         """Networks of the last step that are tried if they were not, float32 [k, genes]."""
@@ -407,7 +417,7 @@ def some_left(lost: np.ndarray, stage: str) -> None:
 
 def held_out_episodes(maps: Maps, traffic: int) -> Episodes:
     """The 64 episodes that are reported on and never chosen on."""
-    return spread_starts(maps.get, HELD_OUT_SEED, HELD_OUT_MAPS, HELD_OUT_EPISODES, traffic)
+    return spread_starts(maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, traffic)
 
 
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:

@@ -17,7 +17,7 @@ import os
 import re
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -37,7 +37,7 @@ from cluster.tracking_address import TrackingError
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
 from gridsim.maps import map_digest
-from gridsim.scenarios import Scenario, is_map_file, label
+from gridsim.scenarios import is_map_file, label
 
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
@@ -309,21 +309,20 @@ class Session:
         )
         champion.save(path / CHAMPION)
         checkpoint.save(path / ELITES, {"genomes": np.array(learning.elites)}, {"policy": self.run.settings.policy})
-        figures = learning.held_out()
-        self.tracker.log_model(path, tracking_run.torch_model(champion, settings, figures))  # while it is drawn
-        report.curves(learning.history, path / "curves.png", learning.step_name)
         episodes = held_out_episodes(self.maps, settings.traffic)
-        scenario = self.maps.get(episodes.maps[int(episodes.rows[0]["map"])])
-        result, states, _ = drive_trajectory(
-            learning.spec, champion.genome, scenario, episodes.rows[0]["start"], learning.curriculum.goal_limits(),
-            learning.sim, episodes.worlds[0],
-        )  # fmt: skip
-        report.trajectory(
-            scenario, states, path / "trajectory.png",
-            f"{label(self.run.settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
-        )  # fmt: skip
-        if self.film:
-            self._film(champion, scenario, episodes.rows[0]["start"], episodes.worlds[0])
+        seed = episodes.maps[int(episodes.rows[0]["map"])]
+        scenario, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
+        with self._filmed(seed, start, world, f"{champion.scenario}, held-out map {scenario.seed:,}"):
+            figures = learning.held_out()
+            self.tracker.log_model(path, tracking_run.torch_model(champion, settings, figures))  # while it is drawn
+            report.curves(learning.history, path / "curves.png", learning.step_name)
+            result, states, _ = drive_trajectory(
+                learning.spec, champion.genome, scenario, start, learning.curriculum.goal_limits(), learning.sim, world
+            )
+            report.trajectory(
+                scenario, states, path / "trajectory.png",
+                f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
+            )  # fmt: skip
         wall = self._wall_s()
         summary = {
             "name": self.run.name,
@@ -359,18 +358,24 @@ class Session:
         self.tracker.log_artifacts(self.run.path)
         return summary
 
-    def _film(self, champion: Champion, scenario: Scenario, start: np.ndarray, world: np.ndarray) -> None:
-        """Write champion.mp4. A film is no reason to lose a run: why there is none is kept in `lost`."""
-        from cluster.video import VideoError, champion_video
+    @contextlib.contextmanager
+    def _filmed(self, seed: int, start: np.ndarray, world: np.ndarray, title: str) -> Iterator[None]:
+        """Film the champion's drive meanwhile. A film is no reason to lose a run: why there is none is in `lost`."""
+        from cluster.video import Filming, VideoError
 
+        if not self.film:
+            yield
+            return
+        path = self.run.path
+        film = Filming(path / CHAMPION, seed, start, world, path / VIDEO, title)
         try:
-            champion_video(
-                champion, scenario, start, self.run.path / VIDEO,
-                f"{champion.scenario}, held-out map {scenario.seed:,}", self.learning.on_progress, world,
-            )  # fmt: skip
+            yield
+            film.wait(self.learning.on_progress)
         except VideoError as error:
-            (self.run.path / VIDEO).unlink(missing_ok=True)
+            (path / VIDEO).unlink(missing_ok=True)
             self.lost = f"no {VIDEO}: {error}"
+        finally:
+            film.stop()
 
 
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:

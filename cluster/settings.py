@@ -28,7 +28,7 @@ LEAST_GROUP = 32  # members of a group, of whom the best are to be good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default: two minutes on two cores, in traffic five.
-GENERATIONS, CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 400, 145_000_000, 180_000_000
+GENERATIONS, CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 400, 135_000_000, 175_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -150,7 +150,7 @@ class EvolveSettings(RunSettings):
     """Members of a generation."""
     generations: int = 0
     """Generations at most; a run whose champion is solved stops earlier. 0: 400, and unless --car-steps says otherwise
-    no more than 145 million car-steps, in traffic 180: on two cores two minutes, in traffic five."""
+    no more than 135 million car-steps, in traffic 175: on two cores two minutes, in traffic five."""
     elites: int = 8
     """Members that go on unmodified."""
     tournament: int = 8

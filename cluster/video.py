@@ -1,22 +1,29 @@
-"""Films: a champion's drive, kept state by state, drawn picture by picture, written as MP4 or GIF at true speed."""
+"""Films: a champion's drive, kept state by state, drawn picture by picture, written as MP4 or GIF at true speed.
+
+Run as `python -m cluster.video CHAMPION SEED FILM TITLE`, it is a process that draws a run's champion.mp4 while the run
+does what else there is to do at its end (`Filming`).
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from cluster.champion import Champion
+from cluster.champion import Champion, load_champion
+from cluster.checkpoint import CheckpointError
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
 from gridsim.ego import DISTANCE, SPEED, End, X, Y
 from gridsim.render import Renderer, between
-from gridsim.scenarios import Scenario
+from gridsim.scenarios import Scenario, build
 from gridsim.simulator import views
 from gridsim.world import LANE
 
@@ -105,28 +112,85 @@ def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") ->
         yield picture(renderer, drive, k / fps, title)
 
 
-def champion_video(
-    champion: Champion,
-    scenario: Scenario,
-    start: np.ndarray,
-    path: str | os.PathLike[str],
-    title: str,
-    on_progress: Callable[[str, int, int], None] | None = None,
-    world: np.ndarray | None = None,
-) -> Recording:
-    """Film the first SECONDS of a champion's drive, which begins as `record`'s. Raises VideoError with one line."""
-    drive = record(champion, scenario, start, SECONDS, world)
-    renderer = Renderer(scenario, SIZE, config=champion.sim)
+class Filming:
+    """A process that films the first SECONDS of a champion's drive."""
+
+    def __init__(
+        self, champion: str | os.PathLike[str], seed: int, start: np.ndarray, world: np.ndarray,
+        film: str | os.PathLike[str], title: str,
+    ):  # fmt: skip
+        """Begin to film the champion of a file on its scenario's map of a seed; `start` and `world` are `record`'s."""
+        self._film, self._failure = Path(film), ""
+        self._process: subprocess.Popen[bytes] | None = None
+        place = io.BytesIO()
+        np.savez(place, start=start, world=world)
+        command = [sys.executable, "-m", "cluster.video", str(champion), str(seed), str(film), title]
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is ours to handle
+            )
+            assert self._process.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # it says why it left
+                self._process.stdin.write(place.getvalue())
+                self._process.stdin.close()
+        except OSError as error:
+            self._failure = f"no process can be started: {error.strerror or error}"
+
+    def wait(self, on_progress: Callable[[str, int, int], None] | None = None) -> None:
+        """Wait for its end. Raises VideoError with one line where there is no film."""
+        if self._process is None or self._process.stdout is None:
+            raise VideoError(self._failure)
+        said = ""
+        for line in self._process.stdout:
+            words = line.decode(errors="replace").strip()
+            done, _, total = words.partition(" of ")
+            if done.isdecimal() and total.isdecimal():
+                if on_progress:
+                    on_progress(self._film.name, int(done), int(total))
+            elif words:
+                said = words
+        if self._process.wait():
+            raise VideoError(said or f"its process ended with {self._process.returncode}")
+
+    def stop(self) -> None:
+        """End it, if it still goes on; it leaves nothing then."""
+        if self._process is None:
+            return
+        self._process.kill()
+        self._process.wait()
+        with contextlib.suppress(OSError):
+            _temporary(self._film, self._process.pid).unlink()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+
+def film_champion(champion: str, seed: int, film: str, title: str, place: bytes) -> None:
+    """What that process does. Raises VideoError, CheckpointError."""
+    loaded = load_champion(champion)
+    with np.load(io.BytesIO(place), allow_pickle=False) as given:
+        scenario = build(loaded.scenario, seed, loaded.sim)
+        drive = record(loaded, scenario, given["start"], SECONDS, given["world"])
+    renderer = Renderer(scenario, SIZE, config=loaded.sim)
     total = max(1, round(drive.seconds * FPS))
 
     def counted() -> Iterator[np.ndarray]:
         for k, image in enumerate(frames(renderer, drive, FPS, title)):
-            if on_progress and k % FPS == 0:
-                on_progress(Path(path).name, k, total)
+            if k % FPS == 0:
+                print(f"{k} of {total}", flush=True)
             yield image
 
-    write_video(path, counted(), SIZE, FPS)
-    return drive
+    write_video(film, counted(), SIZE, FPS)
+
+
+def _temporary(path: Path, pid: int) -> Path:
+    """Where a process writes a film until it is whole."""
+    return path.with_name(f".{path.name}.{pid}.tmp")
 
 
 def write_video(path: str | os.PathLike[str], pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float) -> int:
@@ -140,7 +204,7 @@ def write_video(path: str | os.PathLike[str], pictures: Iterator[np.ndarray], si
         raise VideoError(f"{path}: a film is written as .mp4 or .gif, not {suffix or 'without a suffix'}")
     if size[0] % 2 or size[1] % 2:
         raise VideoError(f"a film's sides must be even, not {size[0]} x {size[1]}")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _temporary(path, os.getpid())
     if suffix == ".gif":
         one_palette = "split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
         coding = ["-filter_complex", one_palette, "-f", "gif"]
@@ -172,13 +236,16 @@ def _encode(
     except RuntimeError as error:
         raise VideoError("there is no ffmpeg here; install one, or name it with IMAGEIO_FFMPEG_EXE") from error
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
-    process = subprocess.Popen(
-        [program, "-y", "-v", "error", *raw, "-an", *coding, str(path)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C is ours to handle
-    )
+    try:
+        process = subprocess.Popen(
+            [program, "-y", "-v", "error", *raw, "-an", *coding, str(path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C is ours to handle
+        )
+    except OSError as error:
+        raise VideoError(f"ffmpeg cannot be started: {program}: {error.strerror or error}") from error
     assert process.stdin is not None
     assert process.stderr is not None
     count = 0
@@ -199,3 +266,10 @@ def _encode(
         for pipe in (process.stdin, process.stderr):
             with contextlib.suppress(OSError):
                 pipe.close()
+
+
+if __name__ == "__main__":
+    try:
+        film_champion(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4], sys.stdin.buffer.read())
+    except (VideoError, CheckpointError) as error:
+        sys.exit(str(error))

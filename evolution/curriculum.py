@@ -21,12 +21,12 @@ import numpy as np
 from evolution.episodes import Episodes, lane_starts
 from evolution.rollout import EPISODE, Limits
 from gridsim.ego import End
-from gridsim.scenarios import TRAINING_SEED, VALIDATION_SEED, Scenario
+from gridsim.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, Scenario
 from gridsim.world import FIELDS, LANE, check_worlds
 
-HELD_OUT_MAPS = 16
+HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
-VALIDATION_MAPS = 48
+VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
 TRIED_KEPT = 256  # members that are not validated again
 
 
@@ -64,13 +64,11 @@ class CurriculumConfig:
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
 
 
-def spread_starts(
-    build: Callable[[int], Scenario], first_seed: int, maps: int, episodes: int, traffic: int = 0
-) -> Episodes:
-    """Episodes over `maps` maps in turn; the same for every run of a scenario with as much traffic."""
-    seeds = [first_seed + k for k in range(maps)]
-    rng = np.random.default_rng(np.random.SeedSequence([first_seed, episodes]))
-    return Episodes(seeds, *lane_starts([build(seed) for seed in seeds], np.arange(episodes) % maps, rng, traffic))
+def spread_starts(build: Callable[[int], Scenario], seeds: range, episodes: int, traffic: int = 0) -> Episodes:
+    """Episodes over the maps of `seeds` in turn; the same for every run of a scenario with as much traffic."""
+    rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
+    used = np.arange(episodes) % len(seeds)
+    return Episodes(list(seeds), *lane_starts([build(seed) for seed in seeds], used, rng, traffic))
 
 
 class Curriculum:
@@ -101,7 +99,7 @@ class Curriculum:
     def _rng(self, generation: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
 
-    def _maps(self, generation: int) -> int:
+    def maps_in_use(self, generation: int) -> int:
         """Training maps in use: they come in one by one, so that none needs to be waited for."""
         return min(self.config.maps, self.config.first_maps + generation)
 
@@ -128,7 +126,7 @@ class Curriculum:
 
     def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Training maps [count], by their place among `map_seeds`; different ones if there are as many."""
-        n = self._maps(generation)
+        n = self.maps_in_use(generation)
         return rng.choice(n, count, replace=count > n)
 
     def _new_starts(self, maps: np.ndarray, rng: np.random.Generator) -> Episodes:
@@ -216,9 +214,7 @@ class Curriculum:
         It is driven beside a generation's episodes, so that as many cars belong to it; the others are not there.
         """
         if self._validation is None:
-            maps, rows, worlds = spread_starts(
-                self.build, VALIDATION_SEED, VALIDATION_MAPS, self.config.validation, self.traffic
-            )
+            maps, rows, worlds = spread_starts(self.build, VALIDATION_SEEDS, self.config.validation, self.traffic)
             absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
             self._validation = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import time
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -54,6 +55,26 @@ def halfway(maps, tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "checkpoint.npz"
     save(path, *evolution.state())
     return path
+
+
+def test_maps_are_begun_before_they_are_needed():
+    class Watched(Maps):
+        begun: ClassVar[set[int]] = set()
+
+        def ahead(self, seeds, later=False):
+            self.begun.update(seeds)
+            super().ahead(seeds, later)
+
+    maps = Watched("seamless", SimConfig())
+    try:
+        evolution = begin(maps)
+        curriculum = evolution.curriculum
+        for generation in range(2):
+            go_on(evolution)
+            assert set(curriculum.map_seeds[: curriculum.maps_in_use(generation + 2)]) <= maps.begun
+        assert set(range(1_000_000, 1_000_008)) <= maps.begun  # some of validation's
+    finally:
+        maps.close()
 
 
 def test_a_run_among_traffic_goes_on_exactly(maps, halfway):

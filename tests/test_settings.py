@@ -49,17 +49,17 @@ def test_what_is_not_given_suits_the_observation():
 
 
 def test_evolution_s_default_budget_is_of_generations_and_of_car_steps():
-    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (400, 145_000_000)
-    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 180_000_000
-    assert EvolveSettings("highway", traffic=0).car_steps == 145_000_000
+    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (400, 135_000_000)
+    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 175_000_000
+    assert EvolveSettings("highway", traffic=0).car_steps == 135_000_000
     assert EvolveSettings(generations=2_000).car_steps == 0  # whoever says how long means it
     assert EvolveSettings(car_steps=7).generations == 400
     assert EvolveSettings(car_steps=7).car_steps == 7
     settings = from_dict(EvolveSettings, to_dict(EvolveSettings()))
     assert settings == EvolveSettings()
-    for generation, car_steps in ((400, 1), (1, 145_000_000)):
+    for generation, car_steps in ((400, 1), (1, 135_000_000)):
         assert settings.ended({"solved": False, "generation": generation, "car_steps": car_steps})
-    assert not settings.ended({"solved": False, "generation": 399, "car_steps": 144_999_999})
+    assert not settings.ended({"solved": False, "generation": 399, "car_steps": 134_999_999})
 
 
 def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it():

@@ -4,9 +4,11 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -16,8 +18,9 @@ import pytest
 from cluster import checkpoint, video
 from cluster.champion import load_champion
 from cluster.cli import UsageError
-from cluster.video import Recording, VideoError, frames, picture, record, write_video
+from cluster.video import Filming, Recording, VideoError, frames, picture, record, write_video
 from cluster.watch import Elites, watch_main
+from evolution.curriculum import spread_starts
 from gridsim.config import SimConfig
 from gridsim.drive import Recorder, pose, unhurried
 from gridsim.ego import DISTANCE, End
@@ -144,8 +147,58 @@ def test_film_is_whole_or_not_there(drive, tmp_path):
 
 def test_without_ffmpeg_a_film_says_so(drive, tmp_path, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
-    with pytest.raises(VideoError, match=r"none|ffmpeg"):
+    with pytest.raises(VideoError, match=r"ffmpeg cannot be started: .*none: No such file"):
         write_video(tmp_path / "f.mp4", frames(Renderer(drive.scenario, (64, 64)), drive, 1), (64, 64), 1)
+
+
+@pytest.fixture
+def filming(tmp_path):
+    """Begins to film a run's champion on its first held-out drive."""
+    started = []
+
+    def begin():
+        episodes = spread_starts(partial(build, "seamless"), range(2_000_000, 2_000_001), 1)
+        champion = ROOT / "benchmarks/champion.npz"
+        place = episodes.rows[0]["start"], episodes.worlds[0]
+        started.append(Filming(champion, 2_000_000, *place, tmp_path / "f.mp4", "held out"))
+        return started[-1]
+
+    yield begin
+    for film in started:
+        film.stop()
+
+
+def test_a_champion_is_filmed_by_another_process(filming, tmp_path, monkeypatch):
+    seen = []
+    filming().wait(lambda *told: seen.append(told))
+    assert probe(tmp_path / "f.mp4")[2:6] == (*video.SIZE, video.FPS, 60 * video.FPS)
+    assert seen == [("f.mp4", k, 60 * video.FPS) for k in range(0, 60 * video.FPS, video.FPS)]
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    with pytest.raises(VideoError, match="ffmpeg cannot be started") as caught:
+        filming().wait()
+    assert "\n" not in str(caught.value)
+    assert [f.name for f in tmp_path.iterdir()] == ["f.mp4"]
+
+
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_who_films_and_dies_leaves_nothing(filming, tmp_path, how):
+    film = filming()
+    deadline = time.monotonic() + 60.0
+    while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert [f.suffix for f in tmp_path.iterdir()] == [".tmp"]
+    if how == "killed":
+        os.kill(film._process.pid, signal.SIGKILL)
+        with pytest.raises(VideoError, match="-9"):
+            film.wait()
+    film.stop()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_process_to_film_with_says_so(filming, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    with pytest.raises(VideoError, match="no process can be started: No such file"):
+        filming().wait()
 
 
 # -------------------------------------------------------------------------------------------------------- the command
