@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import threading
 import time
 import warnings
@@ -43,7 +44,7 @@ from gridsim.ego import End
 from gridsim.scenarios import Scenario, build, map_of
 
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
-MAPS_A_STEP = 4  # of the latter two that are begun ahead in a step, so that a short run builds few for nothing
+MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
 
 
 class Maps:
@@ -149,6 +150,7 @@ class Learning(ABC):
         )
         none = np.zeros((0, self.spec.size), dtype=np.float32)
         self.trials = Trials(none, none)
+        self._for_validation = iter(VALIDATION_SEEDS)  # maps that are not begun
         self.outcomes: list[Outcome] = []  # of the last step, for statistics
 
     # ------------------------------------------------------------------------------------------------------ the loop
@@ -202,10 +204,9 @@ class Learning(ABC):
             self._validate()
 
     def _build_ahead(self, seeds: Sequence[int]) -> None:
-        """Begin to build maps that training needs soon, and a few of those for validation and the held-out drives."""
+        """Begin to build maps that training needs soon, and some of validation's."""
         self.maps.ahead(seeds)
-        last = [*VALIDATION_SEEDS, *HELD_OUT_SEEDS]
-        self.maps.ahead(last[self.steps * MAPS_A_STEP :][:MAPS_A_STEP], later=True)
+        self.maps.ahead(list(itertools.islice(self._for_validation, MAPS_A_STEP)), later=True)
 
     def latest(self) -> np.ndarray:
         """Networks of the last step that are tried if they were not, float32 [k, genes]."""

@@ -34,6 +34,7 @@ from cluster.pool import WorkerPool
 from cluster.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
 from cluster.tracker import Tracker
 from cluster.tracking_address import TrackingError
+from evolution.curriculum import HELD_OUT_SEEDS
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
 from gridsim.maps import map_digest
@@ -249,6 +250,7 @@ class Session:
         try:
             while not learning.done() and not (learning.steps and self._out_of_time()):
                 row = learning.step()
+                self.maps.ahead(HELD_OUT_SEEDS, later=True)  # `finish` needs them
                 learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
                 self._unsaved = True
                 if self.on_row:
@@ -361,11 +363,11 @@ class Session:
     @contextlib.contextmanager
     def _filmed(self, seed: int, start: np.ndarray, world: np.ndarray, title: str) -> Iterator[None]:
         """Film the champion's drive meanwhile. A film is no reason to lose a run: why there is none is in `lost`."""
-        from cluster.video import Filming, VideoError
-
         if not self.film:
             yield
             return
+        from cluster.video import Filming, VideoError
+
         path = self.run.path
         film = Filming(path / CHAMPION, seed, start, world, path / VIDEO, title)
         try:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -124,7 +125,7 @@ class Filming:
         self._process: subprocess.Popen[bytes] | None = None
         place = io.BytesIO()
         np.savez(place, start=start, world=world)
-        command = [sys.executable, "-m", "cluster.video", str(champion), str(seed), str(film), title]
+        command = [sys.executable, "-P", "-m", "cluster.video", str(champion), str(seed), str(film), title]
         try:
             self._process = subprocess.Popen(
                 command,
@@ -153,15 +154,16 @@ class Filming:
                     on_progress(self._film.name, int(done), int(total))
             elif words:
                 said = words
-        if self._process.wait():
-            raise VideoError(said or f"its process ended with {self._process.returncode}")
+        if code := self._process.wait():
+            raise VideoError(said if said and code > 0 else f"its process ended with {code}")
 
     def stop(self) -> None:
-        """End it, if it still goes on; it leaves nothing then."""
+        """End it and its ffmpeg, if it still goes on; it leaves nothing then."""
         if self._process is None:
             return
-        self._process.kill()
-        self._process.wait()
+        if self._process.poll() is None:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
         with contextlib.suppress(OSError):
             _temporary(self._film, self._process.pid).unlink()
         for pipe in (self._process.stdin, self._process.stdout):
@@ -185,7 +187,7 @@ def film_champion(champion: str, seed: int, film: str, title: str, place: bytes)
                 print(f"{k} of {total}", flush=True)
             yield image
 
-    write_video(film, counted(), SIZE, FPS)
+    write_video(film, counted(), SIZE, FPS, apart=False)  # who stops us stops all of our session
 
 
 def _temporary(path: Path, pid: int) -> Path:
@@ -193,9 +195,12 @@ def _temporary(path: Path, pid: int) -> Path:
     return path.with_name(f".{path.name}.{pid}.tmp")
 
 
-def write_video(path: str | os.PathLike[str], pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float) -> int:
+def write_video(
+    path: str | os.PathLike[str], pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float, apart: bool = True
+) -> int:
     """Write pictures uint8 [h, w, 3] as H.264 in an MP4, or as a GIF, by the path's suffix; whole or not at all.
 
+    Args: whether ffmpeg is in a session of its own, where Ctrl-C does not reach it.
     Returns: how many there were. Raises: VideoError with one line; a file that was there before is then kept.
     """
     path = Path(path)
@@ -215,7 +220,7 @@ def write_video(path: str | os.PathLike[str], pictures: Iterator[np.ndarray], si
     try:
         try:
             temporary.touch()  # what is wrong with the place is said better here than by ffmpeg
-            count = _encode(temporary, pictures, size, fps, coding)
+            count = _encode(temporary, pictures, size, fps, coding, apart)
             os.replace(temporary, path)
         except BaseException:
             temporary.unlink(missing_ok=True)
@@ -226,7 +231,7 @@ def write_video(path: str | os.PathLike[str], pictures: Iterator[np.ndarray], si
 
 
 def _encode(
-    path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float, coding: list[str]
+    path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float, coding: list[str], apart: bool
 ) -> int:  # fmt: skip
     """Pipe pictures through ffmpeg. Raises VideoError where there is none or it fails."""
     import imageio_ffmpeg
@@ -242,7 +247,7 @@ def _encode(
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C is ours to handle
+            start_new_session=apart,  # Ctrl-C is ours to handle
         )
     except OSError as error:
         raise VideoError(f"ffmpeg cannot be started: {program}: {error.strerror or error}") from error
@@ -250,10 +255,13 @@ def _encode(
     assert process.stderr is not None
     count = 0
     try:
-        with contextlib.suppress(BrokenPipeError):  # ffmpeg says below why it left
-            for image in pictures:
+        for image in pictures:
+            try:
                 process.stdin.write(np.ascontiguousarray(image).data)
-                count += 1
+            except BrokenPipeError:  # ffmpeg says below why it left
+                break
+            count += 1
+        with contextlib.suppress(BrokenPipeError):
             process.stdin.close()
         message = process.stderr.read().decode(errors="replace").strip()
         if process.wait() != 0:
@@ -271,5 +279,5 @@ def _encode(
 if __name__ == "__main__":
     try:
         film_champion(sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4], sys.stdin.buffer.read())
-    except (VideoError, CheckpointError) as error:
-        sys.exit(str(error))
+    except (VideoError, CheckpointError, ValueError, OSError) as error:  # a map file may be another one by now
+        sys.exit(" ".join(str(error).split()))

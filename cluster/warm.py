@@ -74,12 +74,12 @@ def begin(settings: RunSettings) -> Warming:
     if warming.done.exists():
         return warming
     what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
-    # Neither the folder it is started from nor Ctrl-C is its own: it is stopped by `stop`.
+    # Neither the folder it is started from (-P) nor Ctrl-C is its own: it is stopped by `stop`.
     for part in ("kernels", "roads"):
         with contextlib.suppress(OSError):
             warming.processes.append(
                 subprocess.Popen(
-                    [sys.executable, "-m", "cluster.warm", part, *what],
+                    [sys.executable, "-P", "-m", "cluster.warm", part, *what],
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.DEVNULL,

@@ -168,7 +168,10 @@ def filming(tmp_path):
         film.stop()
 
 
-def test_a_champion_is_filmed_by_another_process(filming, tmp_path, monkeypatch):
+def test_a_champion_is_filmed_by_another_process(filming, tmp_path, tmp_path_factory, monkeypatch):
+    elsewhere = tmp_path_factory.mktemp("started here")
+    (elsewhere / "numpy.py").write_text("raise ImportError('not this one')\n")  # no part of it, wherever it is started
+    monkeypatch.chdir(elsewhere)
     seen = []
     filming().wait(lambda *told: seen.append(told))
     assert probe(tmp_path / "f.mp4")[2:6] == (*video.SIZE, video.FPS, 60 * video.FPS)
@@ -180,19 +183,40 @@ def test_a_champion_is_filmed_by_another_process(filming, tmp_path, monkeypatch)
     assert [f.name for f in tmp_path.iterdir()] == ["f.mp4"]
 
 
-@pytest.mark.parametrize("how", ["killed", "stopped"])
-def test_who_films_and_dies_leaves_nothing(filming, tmp_path, how):
+def _ends(film, seconds=60.0):
+    """Whether a filming process and its ffmpeg end by themselves."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        film._process.poll()  # else it is a zombie
+        try:
+            os.killpg(film._process.pid, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("begun", [False, True])
+@pytest.mark.parametrize("how", ["killed", "stopped", "its run was killed"])
+def test_who_films_and_dies_leaves_nothing(filming, tmp_path, how, begun):
     film = filming()
     deadline = time.monotonic() + 60.0
-    while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
-        time.sleep(0.05)
+    # Until the file is there, or until there are pictures in it.
+    while not any(f.stat().st_size >= begun for f in tmp_path.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.02)
     assert [f.suffix for f in tmp_path.iterdir()] == [".tmp"]
     if how == "killed":
         os.kill(film._process.pid, signal.SIGKILL)
         with pytest.raises(VideoError, match="-9"):
             film.wait()
+    elif how == "its run was killed":
+        film._process.stdout.close()  # nobody listens any more
+        assert _ends(film)
+        assert list(tmp_path.iterdir()) == []
     film.stop()
-    assert list(tmp_path.iterdir()) == []
+    assert _ends(film)
+    if how != "killed" or begun:
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_no_process_to_film_with_says_so(filming, monkeypatch):
