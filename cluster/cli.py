@@ -402,7 +402,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
             _discard(made)
         fail(prog, message, again if resumable else "", FAILED)
     else:
-        console.print(message)
+        console.print(message, soft_wrap=True)
     return code
 
 
