@@ -18,10 +18,9 @@ import numpy as np
 from cluster.pool import BuildMap, answer
 from cluster.worker import CollectTask, Task, Worker
 from evolution.breeding import RECIPE
-from evolution.packing import pack_recipes
 from gridsim.scenarios import Scenario
 
-NOBODY = pack_recipes(np.zeros(0, RECIPE))
+NOBODY = np.zeros(0, RECIPE).tobytes()
 Name = tuple[str, int]
 """Of a map: scenario and seed."""
 

@@ -20,7 +20,6 @@ from cluster.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_t
 from cluster.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
 from cluster.tracking import Status
 from evolution.curriculum import CrashError
-from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario
 
@@ -137,16 +136,14 @@ def settings_of(cell: Cell) -> RunSettings:
         steps = plan.budget.car_steps or UNBOUND
         usual = DqnSettings.suited[plan.observation]["evaluate_every"]
         every = min(usual, max(steps // EVALUATIONS, 1))
-        if plan.observation == "rays":  # what evolution sees there, and not how the wheels stand
-            seen = PolicySpec.parse(EvolveSettings(**common).policy)
-            common["policy"] = "mlp:64,64" + "+motion" * getattr(seen, "motion", False)
         return DqnSettings(**common, observation=plan.observation, car_steps=steps, evaluate_every=every)
     if plan.population:
         common["population"] = plan.population
     return EvolveSettings(
         **common,
         observation=plan.observation,
-        search=cell.learner,
+        search="random" if cell.learner == "random" else "evolution",
+        recombination="two" if cell.learner == "two-parents" else "all",
         car_steps=plan.budget.car_steps,
         generations=plan.generations or UNBOUND,
     )

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learning import Learning, copies, made_good, some_left
+from cluster.learning import Learning, made_good, some_left, unmodified
 from cluster.settings import DqnSettings
 from cluster.worker import CollectTask
 from evolution.curriculum import success_rate
@@ -173,10 +173,9 @@ class Dqn(Learning):
         # Also who was tried before, where nothing was learned since: its figures are the row's.
         self.trials.first, self.trials.first_generation = network[None], self.steps
         episodes, asked = self._trial()
-        genomes = np.concatenate([self.trials.first, self.trials.last])
         driven = self._evaluate(
-            "validate", genomes, copies(len(genomes)), 0, episodes, self.curriculum.goal_limits(), asked=asked,
-            meanwhile=self._train,
+            "validate", unmodified(np.concatenate([self.trials.first, self.trials.last])), episodes,
+            self.curriculum.goal_limits(), asked=asked, meanwhile=self._train,
         )  # fmt: skip
         some_left(driven.lost, "validate")
         self._judge(driven.results, driven.lost)

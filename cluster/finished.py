@@ -27,7 +27,7 @@ from gridsim.scenarios import label
 if TYPE_CHECKING:
     from gridsim.errors import Series
 
-Learner = Literal["evolution", "dqn", "random"]
+Learner = Literal["evolution", "two-parents", "dqn", "random"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
 ERRORS_KEPT = "errors.json"
 FORMAT = 1  # of that file
@@ -82,7 +82,9 @@ def learner_of(config: Mapping[str, Any]) -> str:
     """Which learner a run's config.json tells of."""
     if config.get("command") == "gridsim-dqn":
         return "dqn"
-    return str(config["settings"].get("search", ""))
+    settings = config["settings"]
+    two = settings.get("search") == "evolution" and settings.get("recombination") == "two"
+    return "two-parents" if two else str(settings.get("search", ""))
 
 
 @dataclass(frozen=True)

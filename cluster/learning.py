@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from cluster.checkpoint import CheckpointError
 from cluster.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.settings import RunSettings
 from cluster.worker import Task
-from evolution.breeding import RECIPE, Mutation
+from evolution.breeding import Kind, Mutation
 from evolution.curriculum import (
     HELD_OUT_EPISODES,
     HELD_OUT_SEEDS,
@@ -39,10 +39,12 @@ from evolution.curriculum import (
 from evolution.episodes import Episodes
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits
+from evolution.search import recipes
 from gridsim.config import SimConfig
 from gridsim.ego import End
 from gridsim.scenarios import Scenario, build, map_of
 
+MAX_TRIED = 4  # members that are on validation's first stage at once
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
 
@@ -116,6 +118,7 @@ class Learning(ABC):
         initial: a genome to start from, float32 [genes].
         history: a row of figures for each step (`columns`).
         elites: the network of each step, float32 [genes].
+        validation_steps: car-steps of these that validation took.
         lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
         warn: told of each of these, in one line.
     """
@@ -133,6 +136,7 @@ class Learning(ABC):
     history: list[dict[str, float]] = field(default_factory=list)
     elites: list[np.ndarray] = field(default_factory=list)
     car_steps: int = 0
+    validation_steps: int = 0
     lost_chunks: int = 0
     wall_before_s: float = 0.0
     warn: Callable[[str], None] = warnings.warn
@@ -213,31 +217,26 @@ class Learning(ABC):
         untried = [] if self.champion else self.elites[-1:]
         return np.array(untried, dtype=np.float32).reshape(-1, self.spec.size)
 
-    def _mutation(self) -> Mutation:
-        """How bred members differ from their parents."""
-        return Mutation()
-
     # ------------------------------------------------------------------------------------------------- evaluating
 
     def _evaluate(
-        self, stage: str, parents: np.ndarray, recipes: np.ndarray, key: int, episodes: Episodes, limits: Limits,
-        rewind: int = 0, asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
+        self, stage: str, bred: Bred, episodes: Episodes, limits: Limits,
+        asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
     ) -> Outcome:  # fmt: skip
         task = Task(
             policy=self.settings.policy,
-            parents=parents,
-            key=key,
-            mutation=self._mutation(),
+            parents=bred.parents,
+            key=bred.key,
+            mutation=bred.mutation,
             episodes=episodes.rows,
             worlds=episodes.worlds,
             maps=tuple((self.settings.scenario, map_of(self.settings.scenario, seed)) for seed in episodes.maps),
             limits=limits,
             config=self.sim,
-            rewind=rewind,
         )
         progress = self.on_progress
         tell = (lambda k, n: progress(stage, k, n)) if progress else None
-        outcome = self.pool.evaluate(task, recipes, tell, asked, meanwhile)
+        outcome = self.pool.evaluate(task, bred.recipes, tell, asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
         self._tell_of_lost(stage, outcome)
@@ -248,9 +247,9 @@ class Learning(ABC):
         for text in brought.warnings:
             self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
 
-    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, rewind: int = 0) -> Outcome:
+    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits) -> Outcome:
         """Results [n, e] of given genomes [n, genes]: recipes that are plain copies."""
-        return self._evaluate(stage, genomes, copies(len(genomes)), 0, episodes, limits, rewind)
+        return self._evaluate(stage, unmodified(genomes), episodes, limits)
 
     def _trial(self) -> tuple[Episodes, list[Chunk]]:
         """Validation's episodes, and who of `trials` drives which of them."""
@@ -265,9 +264,8 @@ class Learning(ABC):
     def _validate(self) -> None:
         """Go on with the trials, with nothing beside them."""
         episodes, asked = self._trial()
-        genomes = np.concatenate([self.trials.first, self.trials.last])
-        recipes, limits = copies(len(genomes)), self.curriculum.goal_limits()
-        tried = self._evaluate("validate", genomes, recipes, 0, episodes, limits, asked=asked)
+        bred = unmodified(np.concatenate([self.trials.first, self.trials.last]))
+        tried = self._evaluate("validate", bred, episodes, self.curriculum.goal_limits(), asked=asked)
         self._judge(tried.results, tried.lost)
 
     def _judge(self, results: np.ndarray, lost: np.ndarray) -> None:
@@ -277,6 +275,7 @@ class Learning(ABC):
             was lost: it is neither.
         """
         trials, score = self.trials, self.curriculum.validation_score
+        self.validation_steps += int(results["steps"].sum())
         stage, k = self.curriculum.config.first_validation, len(self.trials.first)
         if len(trials.last) and not lost[k]:
             whole = results[k:, stage:]
@@ -329,6 +328,7 @@ class Learning(ABC):
         meta: dict[str, Any] = {
             "solved": self.solved,
             "lost_chunks": self.lost_chunks,
+            "validation_steps": self.validation_steps,
             **self.counts(),
             "columns": list(self.columns),
             "trials": [self.trials.first_generation, self.trials.last_generation],
@@ -356,7 +356,7 @@ class Learning(ABC):
             and elites.shape == (len(elites), genes)
             and elites.dtype == np.float32
             and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
-            and len(first) <= self.curriculum.config.contenders
+            and len(first) <= MAX_TRIED
             and len(last) <= 1
             and tried.ndim == 1
             and len(tried) <= TRIED_KEPT
@@ -365,7 +365,7 @@ class Learning(ABC):
         if not fits or not np.isfinite(history).all():
             raise ValueError("its parts do not fit each other")
         self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
-        self.lost_chunks = int(meta.get("lost_chunks", 0))  # of a version that knew none
+        self.lost_chunks, self.validation_steps = int(meta["lost_chunks"]), int(meta["validation_steps"])
         self.history = [dict(zip(self.columns, row.tolist(), strict=True)) for row in history]
         self.elites = list(elites)
         first_generation, last_generation = (int(k) for k in meta["trials"])
@@ -403,11 +403,26 @@ def champion_of(genome: np.ndarray, figures: list[float], genes: int) -> Champio
     return Champion(genome, float(score), float(rate), float(distance), int(found))
 
 
-def copies(n: int, first: int = 0) -> np.ndarray:
-    """Recipes [n] that are plain copies of the parents from `first` on."""
-    recipes = np.zeros(n, dtype=RECIPE)
-    recipes["a"] = recipes["b"] = np.arange(first, first + n)
-    return recipes
+class Bred(NamedTuple):
+    """Members to be driven: what their recipes refer to, and they."""
+
+    parents: np.ndarray  # float32 [p, genes]
+    recipes: np.ndarray  # RECIPE [n]
+    key: int = 0
+    mutation: Mutation = Mutation()
+
+    def and_copies(self, genomes: np.ndarray) -> Bred:
+        """These, and then plain copies of genomes float32 [k, genes]."""
+        copies = recipes(len(genomes))
+        copies["kind"], copies["a"] = Kind.COPY, np.arange(len(self.parents), len(self.parents) + len(genomes))
+        return self._replace(
+            parents=np.concatenate([self.parents, genomes]), recipes=np.concatenate([self.recipes, copies])
+        )
+
+
+def unmodified(genomes: np.ndarray) -> Bred:
+    """Plain copies of genomes float32 [n, genes]."""
+    return Bred(genomes[:0], recipes(0)).and_copies(genomes)
 
 
 def some_left(lost: np.ndarray, stage: str) -> None:

@@ -13,9 +13,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import FRESH
+from evolution.breeding import RECIPE, Kind
 from evolution.experience import Experience, from_bytes, join, to_bytes
-from evolution.packing import pack_results, result_widths, unpack_recipes, unpack_results
 from evolution.policy import PolicySpec
 from evolution.rollout import RESULT, targets
 from gridsim.roads import freeze
@@ -34,7 +33,6 @@ LARGER = 4  # times what is worth sending, where that is more
 WHOLE = 0.6  # of a member's metres, from which on it is not cut
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
 LARGE_BYTES = 16 << 20  # of results, that are kept column by column
-PLAIN, PACKED = 0, 1  # how results travel
 FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
 
 
@@ -82,17 +80,20 @@ class Outcome(Cost):
     """What one call of `evaluate` brought, and what it took.
 
     Attributes:
-        results: `task.row` [members, episodes], in the order of the recipes; zero where nothing was asked for, and
-            for who was lost.
+        results: RESULT [members, episodes], in the order of the recipes; zero where nothing was asked for, and for who
+            was lost.
         lost: bool [members], who killed every worker that tried.
         asked: episodes of members that were asked for.
-        widths: int64 [episodes, fields], bits of each number of a RESULT as workers pack it.
+        rewound: float32 [episodes, 5], of episodes with a `rewind` the state so many steps before the end. One member
+            alone drives such an episode.
+        worlds: float32 [episodes, cars, world.FIELDS], the traffic of then.
     """
 
     results: np.ndarray
     lost: np.ndarray
     asked: int
-    widths: np.ndarray
+    rewound: np.ndarray
+    worlds: np.ndarray
 
     def members(self) -> int:
         """Members that are done, counting the parts of those that are done in part."""
@@ -106,19 +107,26 @@ class Outcome(Cost):
         """Whether every result is there."""
         return self._done >= self.asked
 
-    def add(self, worker: int, chunk: Chunk, results: np.ndarray, seconds: float) -> None:
-        """Take in a chunk's results [rows, columns] and the time that they took."""
+    def add(
+        self, worker: int, chunk: Chunk, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray, seconds: float
+    ) -> None:
+        """Take in what a chunk brought (`Worker.evaluate`) and the time that it took."""
         self.results[chunk.rows, chunk.columns] = results
+        if rewound.size:
+            self.rewound[chunk.columns], self.worlds[chunk.columns] = rewound[0], worlds[0]
         self._count(worker, results.size, seconds)
 
     def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
         """The same of what `answer` made."""
-        body, widths = memoryview(raw)[9:], self.widths[chunk.columns]
-        if raw[8] == PACKED:
-            results = unpack_results(body, widths)
-        else:
-            results = np.frombuffer(body, self.results.dtype).reshape(-1, len(widths))
-        self.add(worker, chunk, results, float(np.frombuffer(raw, np.float64, 1)[0]))
+        rows, columns = (part.stop - part.start for part in chunk)
+        results = np.frombuffer(raw, RESULT, rows * columns, 8).reshape(rows, columns)
+        states = np.frombuffer(raw, np.float32, offset=8 + results.nbytes)
+        k = columns if states.size else 0
+        rewound, worlds = states[: rows * k * 5], states[rows * k * 5 :]
+        self.add(
+            worker, chunk, results, rewound.reshape(rows, k, 5), worlds.reshape(rows, k, *self.worlds.shape[1:]),
+            float(np.frombuffer(raw, np.float64, 1)[0]),
+        )  # fmt: skip
         self.bytes_up += len(raw)
 
     def lose(self, chunk: Chunk) -> None:
@@ -180,20 +188,15 @@ def answer(
 ) -> bytes:
     """What a worker says to a chunk: its seconds as float64, its results, its experience if that is what is asked for.
 
-    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is packed recipes; `first` and `stop` say
-    which of the task's episodes. A byte says whether its results are packed: rewound states are not, nor is what a
-    worker of another kind returns if it does not fit.
+    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is recipes; `first` and `stop` say which of
+    the task's episodes. States some steps before the ends come last, of all of these episodes or of none.
     """
     if isinstance(task, CollectTask):
         experience, results, seconds = worker.collect(task, maps, first, stop)
         return b"".join([np.float64(seconds).tobytes(), results.tobytes(), to_bytes(experience)])
-    part = of_episodes(task, first, stop)
-    results, seconds = worker.evaluate(part, maps, unpack_recipes(payload))
-    packed = None
-    if results.dtype == RESULT:
-        packed = pack_results(results, result_widths(part.episodes, task.limits, task.config))
-    head = np.float64(seconds).tobytes()
-    return head + bytes([PLAIN]) + results.tobytes() if packed is None else head + bytes([PACKED]) + packed
+    recipes = freeze(np.frombuffer(payload, RECIPE).copy())
+    results, rewound, worlds, seconds = worker.evaluate(of_episodes(task, first, stop), maps, recipes)
+    return b"".join([np.float64(seconds).tobytes(), results.tobytes(), rewound.tobytes(), worlds.tobytes()])
 
 
 class WorkerPool(Protocol):
@@ -321,9 +324,10 @@ def size(chunk: Chunk) -> int:
 
 def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outcome:
     """An outcome to be filled, its results all zero."""
-    results = _zeros((len(recipes), len(task.episodes)), task.row)
-    widths = result_widths(task.episodes, task.limits, task.config)
-    return Outcome(results, np.zeros(len(recipes), dtype=bool), sum(size(chunk) for chunk in asked), widths)
+    results = _zeros((len(recipes), len(task.episodes)), RESULT)
+    rewound = np.zeros((len(task.episodes), 5), dtype=np.float32)
+    lost = np.zeros(len(recipes), dtype=bool)
+    return Outcome(results, lost, sum(size(chunk) for chunk in asked), rewound, np.zeros_like(task.worlds))
 
 
 def _zeros(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
@@ -412,9 +416,10 @@ def identify(task: Task | CollectTask, chunk: Chunk, payload: bytes) -> str:
     if isinstance(task, CollectTask):
         k = chunk.columns.start
         return f"episode {k} (key {task.keys[k]:#x}, exploration {task.epsilons[k]:.3g})"
-    recipe = unpack_recipes(payload)[0]
-    parents = f"parents {recipe['a']} and {recipe['b']}" if recipe["a"] != FRESH else "no parents"
-    return f"member {chunk.rows.start} ({parents}, seed {recipe['seed']}, key {task.key:#x})"
+    recipe = np.frombuffer(payload, RECIPE)[0]
+    kind = Kind(int(recipe["kind"])).name.lower()
+    rows = f"rows {recipe['a']} and {recipe['b']}"
+    return f"member {chunk.rows.start} ({kind} of {rows}, seed {recipe['seed']}, key {task.key:#x})"
 
 
 def last_line(error: BaseException) -> str:

@@ -71,7 +71,6 @@ from cluster.ray_address import (
 from cluster.ray_errors import failed_as_it_began, is_to_blame, reason
 from cluster.ray_metrics import RunMetrics
 from cluster.worker import CollectTask, Task, Worker
-from evolution.packing import pack_recipes
 from evolution.rollout import Limits
 
 CONNECT_S = 60.0
@@ -166,7 +165,7 @@ class RayPool:
     ) -> Outcome:  # fmt: skip
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
-        self._work(task, asked, 1, lambda chunk: pack_recipes(recipes[chunk.rows]), outcome, on_progress, meanwhile)
+        self._work(task, asked, 1, lambda chunk: recipes[chunk.rows].tobytes(), outcome, on_progress, meanwhile)
         return outcome
 
     def collect(

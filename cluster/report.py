@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
-_LEARNERS = {"evolution": "#0b7285", "dqn": "#f08c00", "random": "#868e96"}
+_LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00", "random": "#868e96"}
 
 
 def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Any, Any]:
@@ -34,10 +34,7 @@ def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tup
 
 
 def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
-    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG.
-
-    Where another island begins, or the best goes on, there is a line.
-    """
+    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
     figure, axes = _figure(15, 3.8, 4)
     step = np.arange(len(history))
 
@@ -51,7 +48,7 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
         mean, std = plot(axes[0], "fitness/mean", _MEAN, "mean"), np.array([row["fitness/std"] for row in history])
         axes[0].fill_between(step, mean - std, mean + std, color=_MEAN, alpha=0.2, linewidth=0)
         axes[0].set(title="fitness", ylim=(0, 1.05))
-        best, mean_of, success = "best", "mean", ("race/success_rate", "leaders, training")
+        best, mean_of, success = "best", "mean", ("leader/success_rate", "leader, training")
         plot(axes[1], "target_m", _OTHER, "episode length", linestyle=":", drawstyle="steps-mid")
     else:
         plot(axes[0], "q/mean", _BEST, "Q, mean")
@@ -65,10 +62,7 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
     plot(axes[3], "validation/success_rate", _BEST, "champion, validation")
     plot(axes[3], success[0], _OTHER, success[1], alpha=0.5)
     axes[3].set(title="success rate", ylim=(-0.02, 1.05))
-    islands = np.array([row.get("island", 0.0) for row in history])
     for axis in axes:
-        for begun in np.flatnonzero(np.diff(islands)):
-            axis.axvline(begun + 0.5, color=_MEAN, linewidth=0.8, linestyle="--")
         axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
         axis.legend(frameon=False, fontsize=8)

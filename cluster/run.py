@@ -43,7 +43,7 @@ from gridsim.scenarios import is_map_file, label
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
 CONFIG_FORMAT = 1
-NOT_LOGGED = ("target_m", "island")  # columns of the history that are no metric
+NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
 class RunError(Exception):

@@ -12,23 +12,23 @@ from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hin
 from cluster.checkpoint import MAX_BYTES
 from evolution.curriculum import CurriculumConfig
 from evolution.experience import observation_dtype_and_width
-from evolution.genetic import GeneticConfig
 from evolution.policy import Observation, PolicySpec
 from evolution.replay import MAX_N_STEP
+from evolution.search import SearchConfig
 from gridsim.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
 MAX_WORKERS = 10_000
 MAX_POPULATION = 1_000_000
 MAX_TRAFFIC = 100
+MAX_ELITES = 10_000
 MAX_REPLAY = 10_000_000
 REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
-ISLANDS, MAX_ISLANDS = 4, 1000
-LEAST_GROUP = 32  # members of a group, of whom the best are to be good
+LEAST_GROUP = 16  # members of a group, of whom the best are to be good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
-# Of evolution, by default: two minutes on two cores, in traffic five.
-GENERATIONS, CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 400, 135_000_000, 175_000_000
+# Of evolution, by default.
+CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 80_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -136,66 +136,57 @@ class EvolveSettings(RunSettings):
     """What an evolution run depends on."""
 
     command: ClassVar[str] = "gridsim-evolve"
-    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:6,7", "grid": "cnn:8,16,32@1"}
-    policy_in_traffic: ClassVar[str] = "mlp:16,16+motion"
-    simple_roads: ClassVar[tuple[str, ...]] = ("curved",)  # where the default one learns faster, even in traffic
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64", "grid": "cnn:8,16,32@1"}
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
-    closer, by default mlp:6,7, in traffic on all roads but curved mlp:16,16+motion; on the grid cnn: with the channels
-    of two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
-    population: int = 512
+    closer, by default mlp:64, in traffic mlp:64+motion (the paper's is mlp:6,7); on the grid cnn: with the channels of
+    two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    population: int = 256
     """Members of a generation."""
     generations: int = 0
-    """Generations at most; a run whose champion is solved stops earlier. 0: 400, and unless --car-steps says otherwise
-    no more than 135 million car-steps, in traffic 175: on two cores two minutes, in traffic five."""
-    elites: int = 8
-    """Members that go on unmodified."""
+    """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
+    otherwise no more than 30 million car-steps, in traffic 80."""
+    recombination: Literal["all", "two"] = "all"
+    """Whose genes a child has: all winners of the tournaments, averaged into one centre (an evolution strategy), or
+    two parents' (the classic genetic algorithm)."""
     tournament: int = 8
-    """Members drawn for each tournament."""
-    islands: int = 0
-    """Populations at most that a run begins with, one after another, until one is promising; the best goes on. 0: 4, on
-    the grid 1. With --init, and of random search, there is one."""
-    island_car_steps: int = 15_000_000
-    """Car-steps that each of them is given before that is judged."""
-    parents: int = 64
-    """Size of the mating pool, which bounds what is sent to the workers."""
-    crossover: float = 1.0
-    """Share of children with two parents."""
-    mutation_rate: float = -1.0
-    """Share of a child's genes that are mutated; -1: 0.03, and of mlp:16,16+motion, which has more, 0.012."""
-    sigma: float = 0.5
-    """Standard deviation of mutation, while episodes are short."""
-    bump_rate: float = 0.3
-    """Share of children of which one hidden unit's view is changed across neighbouring rays."""
-    ranking: Literal["scalar", "pareto"] = "scalar"
-    """How members are ranked: by one number, or by non-dominated sorting of the two elements."""
+    """Members of a tournament."""
+    sigma: float = 0.0
+    """Standard deviation of mutation, of all winners' centre at the beginning; 0: 1, of two parents' children 0.5."""
+    elites: int = 8
+    """With --recombination two: members that go on unmodified."""
+    mutation_rate: float = 0.03
+    """With --recombination two: share of a child's genes that are mutated."""
     search: Literal["evolution", "random"] = "evolution"
     """random: new random genomes in every generation, the baseline that evolution must beat."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.mutation_rate == -1.0:
-            object.__setattr__(self, "mutation_rate", 0.012 if self.policy == self.policy_in_traffic else 0.03)
-        if not self.islands:
-            object.__setattr__(self, "islands", 1 if self.observation == "grid" else ISLANDS)
-        if not self.generations:
-            object.__setattr__(self, "generations", GENERATIONS)
-            if not self.car_steps:
-                object.__setattr__(self, "car_steps", self.default_car_steps())
+        if not self.sigma:
+            object.__setattr__(self, "sigma", 0.5 if self.recombination == "two" else 1.0)
+        if not self.generations and not self.car_steps:
+            object.__setattr__(self, "car_steps", self.default_car_steps())
 
     def default_policy(self) -> str:
-        busy = self.traffic and self.scenario not in self.simple_roads and self.observation == "rays"
-        return self.policy_in_traffic if busy else super().default_policy()
+        usual = super().default_policy()
+        return usual + "+motion" if self.traffic and self.observation == "rays" else usual
 
     def default_car_steps(self) -> int:
+        """Where neither generations nor car-steps are given."""
         return CAR_STEPS_IN_TRAFFIC if self.traffic else CAR_STEPS
 
     @property
     def algorithm(self) -> str:
         return self.search
+
+    def search_config(self) -> SearchConfig:
+        """The search's parameters."""
+        return SearchConfig(
+            self.population, self.curriculum().groups, self.tournament, self.sigma, self.elites, self.mutation_rate
+        )
 
     def curriculum(self) -> CurriculumConfig:
         usual = super().curriculum()
@@ -208,24 +199,22 @@ class EvolveSettings(RunSettings):
         return replace(self, car_steps=0) if longer and usual else self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
-        return super().ended(so_far) or int(so_far["generation"]) >= self.generations
+        return super().ended(so_far) or 0 < self.generations <= int(so_far["generation"])
 
     def check(self) -> None:
         super().check()
-        if self.generations < 1:
+        if self.generations < 0:
             raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
         if self.population > MAX_POPULATION:
             raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
-        if not 1 <= self.islands <= MAX_ISLANDS:
-            raise SettingsError(f"--islands must be 1 to {MAX_ISLANDS}, not {self.islands}")
-        if not 1 <= self.island_car_steps <= MAX_STEPS:
-            raise SettingsError(f"--island-car-steps must be 1 to {MAX_STEPS:,}, not {self.island_car_steps:,}")
-        for name in ("crossover", "mutation_rate", "bump_rate"):
-            _check_share(self, name)
-        if not 0.0 <= self.sigma < math.inf:
-            raise SettingsError(f"--sigma must be 0 or more, not {self.sigma}")
+        _check_share(self, "mutation_rate")
+        for name in ("elites", "mutation_rate"):
+            if self.recombination == "all" and getattr(self, name) != getattr(EvolveSettings, name):
+                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two")
+        if not 0 <= self.elites <= MAX_ELITES or (self.recombination == "two" and self.elites >= self.population):
+            raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,} and fewer than the population, not {self.elites}")
         try:
-            GeneticConfig(self.population, self.elites, self.tournament, self.parents, self.crossover).check()
+            self.search_config().check()
         except ValueError as error:
             raise SettingsError(str(error)) from error
 

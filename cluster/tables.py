@@ -14,7 +14,7 @@ from cluster.finished import ERROR_FIGURES, RUN_FIGURES, Run
 from cluster.statistics import RESAMPLES, Spread, separation_by_chance, span_coverage, spread
 from gridsim.scenarios import REGISTRY, default_traffic, label
 
-NAMES = {"evolution": "evolution", "dqn": "DQN", "random": "random search"}
+NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
 COLUMNS = (
     "scenario", "traffic", "observation", "learner", "seed", *RUN_FIGURES, *ERROR_FIGURES, "champion_sha256", "run",
 )  # fmt: skip

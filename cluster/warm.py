@@ -21,13 +21,13 @@ from typing import get_args
 import llvmlite.binding
 import numpy as np
 
-from cluster.pool import answer, everything, new_outcome
+from cluster.pool import answer
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import FRESH, RECIPE, Mutation
-from evolution.packing import pack_recipes
+from evolution.breeding import Kind, Mutation
 from evolution.policy import Observation, PolicySpec
 from evolution.rollout import EPISODE, Limits, trajectory
+from evolution.search import recipes
 from gridsim.config import SimConfig
 from gridsim.ego import FIELDS
 from gridsim.jit import CACHE_FOLDER, CONFIG
@@ -98,9 +98,8 @@ def _absent(traffic: int) -> np.ndarray:
 
 def compile_kernels(policy: str, traffic: int, command: str) -> None:
     """Compile, or load from the cache, what evaluates members, and for the DQN also what collects experience."""
-    recipes = np.zeros(2, dtype=RECIPE)
-    recipes["a"] = recipes["b"] = FRESH
-    recipes["seed"] = 1
+    made = recipes(2)
+    made["kind"] = Kind.NEW
     config = SimConfig()
     task = Task(
         policy=policy,
@@ -113,9 +112,7 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
         limits=Limits(1.0, STEPS),
         config=config,
     )
-    everyone = everything(task, recipes)
-    raw = answer(Worker(), task, [blank(config)], pack_recipes(recipes), 0, 1)
-    new_outcome(task, recipes, everyone).take(0, everyone[0], raw)
+    answer(Worker(), task, [blank(config)], made.tobytes(), 0, 1)
     if command == DqnSettings.command:
         Worker().collect(
             CollectTask(

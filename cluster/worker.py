@@ -12,7 +12,7 @@ from evolution.breeding import Mutation, breed
 from evolution.collecting import collect
 from evolution.experience import Experience
 from evolution.policy import PolicySpec
-from evolution.rollout import RESULT, Limits, evaluate, raced_dtype
+from evolution.rollout import Limits, evaluate
 from gridsim.config import SimConfig
 from gridsim.roads import freeze
 from gridsim.scenarios import Scenario
@@ -32,7 +32,6 @@ class Task:
         maps: (scenario, seed) of each map that `episodes` indexes.
         limits: where an episode ends if nothing happens.
         config: the simulator's.
-        rewind: control steps before each episode's end whose state is wanted back; 0 for none.
     """
 
     policy: str
@@ -44,12 +43,6 @@ class Task:
     maps: tuple[tuple[str, int], ...]
     limits: Limits
     config: SimConfig
-    rewind: int = 0
-
-    @property
-    def row(self) -> np.dtype:
-        """What comes back of each member's episode."""
-        return raced_dtype(self.worlds.shape[1]) if self.rewind else RESULT
 
     def __post_init__(self) -> None:
         # What comes out of the object store is read-only. Numba compiles once more for what is not, so no pool has it.
@@ -92,24 +85,18 @@ class CollectTask:
 class Worker:
     """Breeds and drives members, or collects experience. It keeps nothing that a result depends on."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
-        """Results `task.row` [n, episodes] of recipes RECIPE [n], and the seconds it took (for statistics only).
+    def evaluate(
+        self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        """What `rollout.evaluate` returns of recipes RECIPE [n], and the seconds it took (for statistics only).
 
         `maps` are those of `task.maps`, in that order.
         """
         started = time.perf_counter()
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
-        results, rewound, worlds = evaluate(
-            spec, genomes, maps, task.episodes, task.limits, task.config, task.rewind, task.worlds
-        )
-        if task.rewind:
-            raced = np.zeros(results.shape, dtype=task.row)
-            for name in RESULT.names or ():
-                raced[name] = results[name]
-            raced["rewound"], raced["world"] = rewound, worlds
-            results = raced
-        return results, time.perf_counter() - started
+        found = evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.worlds)
+        return *found, time.perf_counter() - started
 
     def collect(
         self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int

@@ -1,10 +1,10 @@
-"""How the task grows: which episodes a generation meets, who races, and who becomes champion.
+"""How the task grows: which episodes a generation meets, and who becomes champion.
 
 Distance and speed alone are deceptive under limited grip: the best member is flat out into the first bend. So episodes
-begin short and double in length as the best succeed; half of them start just before a crash of a recent leader, where
-there is most to learn; a generation's members are in groups that meet different episodes, so that who is selected was
-good on many, though each drives few; the generation's best are raced on more episodes before anybody is selected; and
-the champion is chosen on validation maps that nobody is trained on, and replaced reluctantly.
+begin short and double in length as the leader (the best genome known before a generation) succeeds. Half of them start
+just before a crash of a recent leader, where there is most to learn. A generation's members are in groups that meet
+different episodes, so that selection sees many, though each member drives few. The champion is chosen on validation
+maps that nobody is trained on.
 
 State is arrays and numbers only; all randomness comes from (seed, generation).
 """
@@ -40,25 +40,23 @@ class CurriculumConfig:
 
     maps: int = 16  # training maps
     first_maps: int = 6  # of these, how many the first generation meets; each one after it meets one more
-    groups: int = 8  # of members, each with episodes of its own
-    starts: int = 3  # new episodes a group and generation
-    crash_starts: int = 3  # ... and short ones that start before a crash of a recent leader
+    groups: int = 4  # of members, each with episodes of its own
+    starts: int = 1  # new episodes of a group and generation
+    crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, their length
     crash_memory: int = 64  # crashes that are remembered
     crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
     rewind: int = 64  # control steps before the crash
-    racers: int = 24  # members raced on more episodes
-    race_episodes: int = 16
-    leaders: int = 4  # racers whose crashes are remembered
+    leader_episodes: int = 16  # that the leader drives in each generation
+    leader_stretch: float = 2.5  # their length, in targets
     first_target: float = 150.0  # m, length of the first episodes
     last_target: float = 400.0  # m; what is learned further on is learned as well from another start
-    race_stretch: float = 2.5  # length of a race's episodes, in targets
-    growth: float = 0.6  # share of the race's episodes in which the best 8 must reach the target before it doubles
+    growth: float = 0.6  # share of its episodes in which the leader must reach the target before it doubles
     pace: float = 7.0  # m/s that the time limit of a training episode allows for; this and champion_pace: seamless
     slack: float = 3.0  # s, added to it
-    validation_target: float = 300.0  # m, from which on champions are looked for
-    contenders: int = 4  # who is validated: the parents' mean, and racers
-    validate_every: int = 2  # generations
+    promising: float = 0.5  # share of its episodes that a leader must finish before it is validated ...
+    latest: int = 4  # ... in so many generations together
+    validation_share: float = 0.25  # of all car-steps, above which validation waits
     first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
@@ -72,7 +70,7 @@ def spread_starts(build: Callable[[int], Scenario], seeds: range, episodes: int,
 
 
 class Curriculum:
-    """Episodes, races and champions of one run."""
+    """Episodes and champions of one run."""
 
     def __init__(
         self,
@@ -107,9 +105,9 @@ class Curriculum:
         """Of training episodes."""
         return Limits(self.target, self._steps(self.target))
 
-    def race_limits(self) -> Limits:
-        """Of a race's episodes: longer, so that they tell the best from the good."""
-        target = min(self.config.race_stretch * self.target, self.goal)
+    def leader_limits(self) -> Limits:
+        """Of the leader's episodes: longer, so that it meets what members do not."""
+        target = min(self.config.leader_stretch * self.target, self.goal)
         return Limits(target, self._steps(target))
 
     def _steps(self, target: float) -> int:
@@ -119,10 +117,6 @@ class Curriculum:
     def goal_limits(self) -> Limits:
         """Of a full episode, as those of validation and the held-out ones are."""
         return Limits(self.goal, self.goal_steps)
-
-    def sigma(self, sigma: float) -> float:
-        """Mutation's standard deviation: finer as episodes grow longer."""
-        return sigma * (self.config.first_target / self.target) ** 0.35
 
     def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Training maps [count], by their place among `map_seeds`; different ones if there are as many."""
@@ -181,31 +175,28 @@ class Curriculum:
                 except ValueError as error:
                     raise CrashError(f"a crash in the checkpoint does not fit map {seed}: {error}") from error
 
-    def race(self, generation: int) -> Episodes:
-        """The race that decides among the generation's best."""
-        return self._drawn(generation, self.config.race_episodes, 2)
+    def leader_episodes(self, generation: int) -> Episodes:
+        """What the leader drives beside a generation; the states before its crashes are wanted back."""
+        episodes = self._drawn(generation, self.config.leader_episodes, 2).within(self.leader_limits())
+        episodes.rows["rewind"] = self.config.rewind
+        return episodes
 
-    def raced(self, order: np.ndarray, results: np.ndarray, race: Episodes) -> None:
-        """Learn from a race: remember the leaders' crashes, lengthen the task when the best succeed.
+    def followed(self, episodes: Episodes, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray) -> None:
+        """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
 
-        Args: racers from best to worst; `rollout.raced_dtype` [racers, e], with the states some steps before each end.
+        Args: `leader_episodes`; RESULT [e]; the states some steps before each end, float32 [e, 5], and the traffic of
+        then, float32 [e, cars, world.FIELDS].
         """
-        new, worlds = [], []
-        for racer in order[: self.config.leaders]:
-            for e in range(len(race.rows)):
-                row = results[racer, e]
-                if row["end"] in (End.COLLISION, End.IDLE) and row["steps"] > 10:
-                    start = np.zeros((), dtype=EPISODE)
-                    start["map"] = self.map_seeds.index(race.maps[race.rows[e]["map"]])
-                    start["start"] = row["rewound"]
-                    new.append(start)
-                    worlds.append(row["world"])
-        if new:
+        crashed = np.isin(results["end"], (End.COLLISION, End.IDLE)) & (results["steps"] > 10)
+        if crashed.any():
+            new = np.zeros(np.count_nonzero(crashed), dtype=EPISODE)
+            seeds = np.array(episodes.maps)[episodes.rows["map"][crashed]]
+            new["map"] = [self.map_seeds.index(seed) for seed in seeds]
+            new["start"] = rewound[crashed]
             kept = self.config.crash_memory
-            self.crashes = np.concatenate([self.crashes, np.array(new, dtype=EPISODE)])[-kept:]
-            self.crash_worlds = np.concatenate([self.crash_worlds, np.array(worlds, dtype=np.float32)])[-kept:]
-        best = results[order[:8]]
-        if (best["distance"] >= self.target).mean() >= self.config.growth:
+            self.crashes = np.concatenate([self.crashes, new])[-kept:]
+            self.crash_worlds = np.concatenate([self.crash_worlds, worlds[crashed]])[-kept:]
+        if (results["distance"] >= self.target).mean() >= self.config.growth:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
     def validation(self) -> Episodes:

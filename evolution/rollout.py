@@ -53,18 +53,12 @@ from gridsim.world import FIELDS as TRAFFIC_FIELDS
 _F = np.float32
 
 #: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
-#: its own target (m) and limit (control steps), where these are not 0.
-EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4")])
-
-PER_METRE = 16  # distances in a RESULT are multiples of a metre's sixteenth, so that they travel as few bits
+#: its own target (m) and limit (control steps), where these are not 0; control steps before its end whose state is
+#: wanted back, 0 for none.
+EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
 
 #: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
-
-
-def raced_dtype(traffic: int) -> np.dtype:
-    """RESULT with the state some steps before the end, as a start, and the traffic of then: what a race returns."""
-    return np.dtype([*RESULT.descr, ("rewound", "<f4", 5), ("world", "<f4", (traffic, TRAFFIC_FIELDS))])
 
 
 MAX_STEPS = 65_535
@@ -241,25 +235,19 @@ def _run(setting, packed, layers, bounds, room, world, closing, eye):
 
 
 @leaf
-def rounded(metres):
-    """A distance as a RESULT has it."""
-    return _F(math.floor(metres * _F(PER_METRE) + _F(0.5))) / _F(PER_METRE)
-
-
-@leaf
 def note(car, end, row):
     """Fill a RESULT."""
-    row["distance"] = rounded(car[DISTANCE])
-    row["paced"] = rounded(car[PACED])
+    row["distance"] = car[DISTANCE]
+    row["paced"] = car[PACED]
     row["steps"] = car[STEPS]
     row["end"] = end
 
 
 @njit(nogil=True)
-def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, column, results, rewound, rewound_worlds):
-    """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results[:, column].
+def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, results, rewound, rewound_worlds):
+    """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results [n].
 
-    If rewind > 0 also rewound[:, column] and rewound_worlds[:, column].
+    If rewind > 0 also rewound [n, 5] and rewound_worlds [n, cars, fields].
     """
     room = make_room(setting, layers, rewind, 0 if traffic is None else traffic.shape[0])
     car = room.car
@@ -267,17 +255,17 @@ def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, co
         packed = packed_genome(genomes[i], layers, eye)
         world = None if traffic is None else traffic.copy()
         end = _run(setting, packed, layers, bounds, room, world, closing, eye)
-        note(car, end, results[i, column])
+        note(car, end, results[i])
         if rewind > 0:
             row_back = max(int(car[STEPS]) - rewind, 0) % rewind
             back = room.ring[row_back]
             if traffic is not None:
-                _copy_world(room.world_ring[row_back], rewound_worlds[i, column])
-            rewound[i, column, 0] = back[X]
-            rewound[i, column, 1] = back[Y]
-            rewound[i, column, 2] = math.atan2(back[SIN], back[COS])
-            rewound[i, column, 3] = back[SPEED]
-            rewound[i, column, 4] = back[STEERING]
+                _copy_world(room.world_ring[row_back], rewound_worlds[i])
+            rewound[i, 0] = back[X]
+            rewound[i, 1] = back[Y]
+            rewound[i, 2] = math.atan2(back[SIN], back[COS])
+            rewound[i, 3] = back[SPEED]
+            rewound[i, 4] = back[STEERING]
 
 
 def bounds_of(episode: np.void, limits: Limits) -> Bounds:
@@ -317,7 +305,6 @@ def evaluate(
     episodes: np.ndarray,
     limits: Limits,
     config: SimConfig,
-    rewind: int = 0,
     worlds: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive every genome through every episode.
@@ -326,21 +313,22 @@ def evaluate(
         genomes: float32 [n, spec.size].
         scenarios: the maps that the episodes index.
         episodes: EPISODE [e].
-        rewind: control steps before each end whose state is wanted, 0 for none.
         worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
 
-    Returns: (RESULT [n, e], the states `rewind` steps before the ends, or at the starts of shorter episodes, as starts
-    float32 [n, e, 5] and the traffic of then, float32 [n, e, cars, world.FIELDS]; empty if none are wanted).
+    Returns: (RESULT [n, e]; of the k episodes with a `rewind`, the states so many steps before their ends, or at the
+    starts of shorter ones, as starts float32 [n, k, 5]; and the traffic of then, float32 [n, k, cars, world.FIELDS]).
     Raises: ValueError where shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
     eye, worlds = eye_of(spec, config), checked_worlds(episodes, limits, worlds)
     genomes = freeze(genomes.astype(np.float32, copy=False))
-    results = np.zeros((len(genomes), len(episodes)), dtype=RESULT)
-    rewound = np.zeros((len(genomes), len(episodes), 5 if rewind else 0), dtype=np.float32)
-    cars = worlds.shape[1] if rewind else 0
-    rewound_worlds = np.zeros((len(genomes), len(episodes), cars, TRAFFIC_FIELDS), dtype=np.float32)
+    # By columns: the kernel fills one at a time.
+    results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
+    kept = np.cumsum(episodes["rewind"] > 0) - 1
+    k = int(kept[-1]) + 1 if len(kept) else 0
+    rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
+    rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
     settings = settings_on(scenarios, config)
     for column, episode in enumerate(episodes):
         _rollout(
@@ -351,13 +339,12 @@ def evaluate(
             world_of(worlds, column),
             closing_of(spec, config),
             eye,
-            rewind,
-            column,
-            results,
-            rewound,
-            rewound_worlds,
+            int(episode["rewind"]),
+            results[column],
+            rewound[kept[column]],
+            rewound_worlds[kept[column]],
         )
-    return results, rewound, rewound_worlds
+    return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
 
 
 def no_traffic(episodes: int) -> np.ndarray:
@@ -403,4 +390,4 @@ def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
     _copy(car, room.ring[int(car[STEPS])])
     if traffic is not None:
         _copy_world(world, room.world_ring[int(car[STEPS])])
-    return (rounded(car[DISTANCE]), rounded(car[PACED]), car[STEPS], end), room.ring, room.world_ring
+    return (car[DISTANCE], car[PACED], car[STEPS], end), room.ring, room.world_ring

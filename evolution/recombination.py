@@ -1,0 +1,111 @@
+"""The default search: the tournaments' winners are recombined into one centre, around which the next members lie.
+
+A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
+adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Children come
+in mirrored pairs (Brockhoff et al. 2010) that meet the same episodes. The centre and the champion are the elites.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evolution.breeding import Kind, Mutation, moments
+from evolution.policy import PolicySpec, gene_scales
+from evolution.search import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournament_weights
+
+_CENTRE, _STEPS, _CHAMPION = 0, 1, 2  # rows of the parents that are broadcast
+
+
+class Recombination(Search):
+    """Children are centre + sigma * scales * sqrt(variances) * N(0, 1); the first generation is random.
+
+    Attributes:
+        centre: float64 [genes], or [0] before the first generation.
+        path: float64 [genes], the evolution path: N(0, 1) in each gene where selection has no say, as at the beginning.
+        variances: float64 [genes], diagonal of the covariance, 1 at the beginning.
+        sigma: step size over all genes.
+        champion: float32 [genes], carried beside the centre once there is one.
+    """
+
+    def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
+        super().__init__(spec, config, seed)
+        self.centre = np.zeros(0)
+        # Not 0: the step size would shrink until the path has grown to its expected length.
+        self.path = self._rng(1).standard_normal(spec.size)
+        self.variances = np.ones(spec.size)
+        self.sigma = config.sigma
+        self.champion: np.ndarray | None = None
+
+    def begin_with(self, genome: np.ndarray) -> None:
+        self.centre = genome.astype(np.float64)
+
+    def leader(self) -> np.ndarray | None:
+        return self.centre.astype(np.float32) if len(self.centre) else None
+
+    def candidates(self) -> np.ndarray:
+        return self.centre[None].astype(np.float32)
+
+    def steps(self) -> np.ndarray:
+        """Standard deviation of each gene, float64 [genes]."""
+        return self.sigma * gene_scales(self.spec) * np.sqrt(self.variances)
+
+    def _ask(self, key: int) -> Asked:
+        n = self.config.population
+        made = recipes(n)
+        if not len(self.centre):
+            made["kind"] = Kind.NEW
+            none = np.zeros((0, self.spec.size), dtype=np.float32)
+            return Asked(none, made, key, Mutation(), split(n, self.config.groups))
+        rows = [self.centre, self.steps()]
+        if self.champion is not None:
+            rows.append(self.champion)
+        elites = len(rows) - 1
+        made["kind"], made["a"], made["seed"] = Kind.COPY, _CENTRE, 0
+        made["a"][1:elites] = _CHAMPION
+        child = np.arange(n - elites)
+        made["kind"][elites:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
+        made["b"][elites:] = _STEPS
+        made["seed"][elites:] = child // 2
+        return Asked(np.stack(rows).astype(np.float32), made, key, Mutation(), split(n, self.config.groups, elites))
+
+    def _tell(self, asked: Asked, scores: np.ndarray) -> None:
+        if not len(self.centre):
+            self.centre = self.genomes(np.array([scores.argmax()]))[0].astype(np.float64)
+            return
+        weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
+        effective = 1.0 / float((weights**2).sum())  # mu_eff
+        elites = len(asked.parents) - 1
+        children = np.append(weights[elites:], np.zeros((len(weights) - elites) % 2))
+        plus, minus = children[::2], children[1::2]
+        genes, shift = self.spec.size, plus - minus
+        first, second = moments(np.arange(len(shift)), shift, plus + minus, asked.key, genes)
+        toward = self.steps() * first
+        if elites == 2:
+            toward += weights[1] * (asked.parents[_CHAMPION] - self.centre)
+        self.centre = self.centre + toward
+        # Under random selection, first / norm is N(0, 1) in each gene, whatever the weights of a pair are.
+        norm = math.sqrt(float((shift**2).sum()))
+        if norm > 0.0:
+            rate = (effective + 2.0) / (genes + effective + 5.0)
+            damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
+            expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
+            self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first
+            self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
+        if children.sum() > 0.0:
+            rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
+            rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
+            self.variances *= 1.0 - rate + rate * second / children.sum()
+
+    def state(self) -> tuple[Arrays, dict[str, float]]:
+        return {"centre": self.centre, "path": self.path, "variances": self.variances}, {"sigma": self.sigma}
+
+    def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
+        genes, sigma = (self.spec.size,), float(numbers["sigma"])
+        centre = arrays["centre"]
+        path, variances = (checked(arrays[name], genes, np.float64) for name in ("path", "variances"))
+        if not 0.0 < sigma < math.inf or (variances <= 0.0).any():
+            raise ValueError("its step sizes are not above 0")
+        self.centre = checked(centre, genes if centre.size else (0,), np.float64)
+        self.path, self.variances, self.sigma = path, variances, sigma
