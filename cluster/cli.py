@@ -35,6 +35,18 @@ T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 
+_TWO = "of --recombination two it is fixed, and of all winners there is none"
+REMOVED = {
+    "islands": "a run has one population; use --recombination all, the default, which needs no others",
+    "island-car-steps": "a run has one population; use --car-steps for its budget",
+    "parents": f"the size of the mating pool: {_TWO}; use --tournament for the pressure of selection",
+    "crossover": "all children of --recombination two have two parents; use --recombination",
+    "bump-rate": "mutation is Gaussian; use --sigma for its size",
+    "ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
+}
+"""Flags of gridsim-evolve that went with version 0.1, and what takes their place."""
+
+
 class UsageError(Exception):
     """Wrong use; the message is shown in one line."""
 
@@ -230,6 +242,11 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     from evolution.policy import PolicySpec
 
     prog = kind.command
+    if kind is EvolveFlags:
+        for argument in arguments:
+            flag = argument.partition("=")[0].removeprefix("--").replace("_", "-")
+            if argument.startswith("--") and flag in REMOVED:
+                raise UsageError(f"--{flag} is no more: {REMOVED[flag]}")
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
     if {"-h", "--help"} & set(arguments) or not (resume or config):
         flags = parse(kind, prog, arguments)

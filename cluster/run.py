@@ -42,7 +42,8 @@ from gridsim.scenarios import is_map_file, label
 
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
-CONFIG_FORMAT = 1
+CONFIG_FORMAT = 2
+OLD_FORMATS = (1,)  # GridSim 0.1: other searches, other parameters
 NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
@@ -110,6 +111,10 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         if path.stat().st_size > 1 << 20:
             raise RunError(f"{path}: too large for a run's {CONFIG}")
         config = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(config, dict) and config.get("format") in OLD_FORMATS:
+            raise RunError(
+                f"{path}: of a run of GridSim 0.1, whose search is no more; start a new run (its champion.npz still drives)"
+            )
         if not isinstance(config, dict) or config.get("format") != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim")
         settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))

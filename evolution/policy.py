@@ -15,6 +15,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from evolution.tiles import dense
 from gridsim.grid import CELLS
 from gridsim.jit import leaf, njit
 from gridsim.roads import freeze
@@ -227,7 +228,8 @@ def squash(x):
     )
 
 
-BLOCK = 8  # units computed at once: a layer's outputs are padded to whole blocks
+BLOCK = 8  # a layer's outputs are padded to whole blocks
+_dense_64, _dense_16, _dense_8 = dense(64, 1), dense(16, 2), dense(8, 4)
 
 
 @njit
@@ -250,22 +252,22 @@ def scratch_size(layers):
 
 @njit
 def pack(genome, layers, packed):
-    """Lay a genome out for `forward`.
+    """Lay a genome out for `forward`: of each layer the biases, then a row of weights for each input.
 
-    A layer's outputs stand in blocks of 8; in each block come first the biases, then a row for each input. Missing
-    units have weight 0.
+    A row is as long as whole blocks of units are; missing units have weight 0.
     """
     packed[:] = _F(0.0)
     at, to = 0, 0
     for k in range(layers.shape[0] - 1):
         n, m = layers[k], layers[k + 1]
-        for block in range(0, m, BLOCK):
-            for j in range(min(BLOCK, m - block)):
-                packed[to + j] = genome[at + n * m + block + j]
-                for i in range(n):
-                    packed[to + (i + 1) * BLOCK + j] = genome[at + i * m + block + j]
-            to += (n + 1) * BLOCK
+        width = (m + BLOCK - 1) // BLOCK * BLOCK
+        for j in range(m):
+            packed[to + j] = genome[at + n * m + j]
+        for i in range(n):
+            for j in range(m):
+                packed[to + (i + 1) * width + j] = genome[at + i * m + j]
         at += (n + 1) * m
+        to += (n + 1) * width
 
 
 @leaf
@@ -275,34 +277,26 @@ def forward(packed, layers, scratch):
     Args: genome laid out by `pack`; scratch float32 [2 * (widest layer + 8)], the inputs at its beginning.
     Any not-a-number stays one and reaches the outputs.
     """
-    # Unsigned indices: a signed one might count from the end, and that check would keep this from being vector code.
-    half = _U(scratch.shape[0] // 2)
-    source, at = _U(0), _U(0)
+    half = scratch.shape[0] // 2
+    source, at = 0, 0
     last = layers.shape[0] - 2
     for k in range(last + 1):
         n, m = layers[k], layers[k + 1]
+        width = (m + BLOCK - 1) // BLOCK * BLOCK
         target = half - source
-        for block in range(0, m, BLOCK):
-            a0, a1, a2, a3 = packed[at], packed[at + _U(1)], packed[at + _U(2)], packed[at + _U(3)]
-            a4, a5, a6, a7 = packed[at + _U(4)], packed[at + _U(5)], packed[at + _U(6)], packed[at + _U(7)]
-            for i in range(n):
-                at += _U(BLOCK)
-                value = scratch[source + _U(i)]
-                a0 += value * packed[at]
-                a1 += value * packed[at + _U(1)]
-                a2 += value * packed[at + _U(2)]
-                a3 += value * packed[at + _U(3)]
-                a4 += value * packed[at + _U(4)]
-                a5 += value * packed[at + _U(5)]
-                a6 += value * packed[at + _U(6)]
-                a7 += value * packed[at + _U(7)]
-            at += _U(BLOCK)
-            to = target + _U(block)
-            scratch[to], scratch[to + _U(1)], scratch[to + _U(2)], scratch[to + _U(3)] = a0, a1, a2, a3
-            scratch[to + _U(4)], scratch[to + _U(5)], scratch[to + _U(6)], scratch[to + _U(7)] = a4, a5, a6, a7
-            if k < last:
-                for j in range(BLOCK):
-                    scratch[to + _U(j)] = squash(scratch[to + _U(j)])
+        unit = 0
+        while width - unit >= 64:
+            _dense_64(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            unit += 64
+        while width - unit >= 16:
+            _dense_16(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            unit += 16
+        if width - unit >= 8:
+            _dense_8(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+        if k < last:
+            for j in range(width):
+                scratch[target + j] = squash(scratch[target + j])
+        at += (n + 1) * width
         source = target
     return source
 

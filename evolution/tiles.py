@@ -1,6 +1,7 @@
-"""Vector code for `convnet`: a tile of a layer's output, some positions times some units, held in registers.
+"""Vector code for layers, their sums held in registers: `dense` for some units of a perceptron, `tile` for some positions
+times some units of a convolution.
 
-A position's inputs lie in `planes` x `rows` runs of `run` numbers; `vector_tile` emits LLVM vectors, `plain_tile` is
+For `tile`, a position's inputs lie in `planes` x `rows` runs of `run` numbers; `vector_tile` emits LLVM vectors, `plain_tile` is
 the same arithmetic in plain Python, for `NUMBA_DISABLE_JIT=1` and for the tests.
 """
 
@@ -114,3 +115,81 @@ def tile(positions: int, lanes: int, rectify: bool) -> Any:
     apart. Each output is summed in the order of its inputs, whatever the machine's vectors are.
     """
     return plain_tile(positions, lanes, rectify) if CONFIG.DISABLE_JIT else vector_tile(positions, lanes, rectify)
+
+
+def plain_dense(lanes: int, chains: int) -> Callable[..., None]:
+    """Units of a dense layer in plain Python; see `dense`."""
+
+    def plain(x, x_at, n, w, w_at, width, bias_at, y, y_at):
+        totals = np.zeros((chains, lanes), dtype=np.float32)
+        totals[0] = w[bias_at : bias_at + lanes]
+        for i in range(n):
+            at = w_at + i * width
+            totals[i % chains] += x[x_at + i] * w[at : at + lanes]
+        y[y_at : y_at + lanes] = totals.sum(axis=0)
+
+    return plain
+
+
+def vector_dense(lanes: int, chains: int) -> Any:
+    """Units of a dense layer as an intrinsic for kernels; see `dense`."""
+
+    @intrinsic
+    def vector(typingctx, x, x_at, n, w, w_at, width, bias_at, y, y_at):
+        i = types.int64
+        signature = types.void(x, i, i, w, i, i, i, y, i)
+
+        def codegen(context, builder, sig, args):
+            f32, i32, i64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+            vf = ir.VectorType(f32, lanes)
+            undefined = ir.Constant(vf, ir.Undefined)
+            inputs, weights, outputs = (
+                context.make_array(sig.args[k])(context, builder, args[k]).data for k in (0, 3, 7)
+            )
+            x_at, n, w_at, width, bias_at, y_at = (args[k] for k in (1, 2, 4, 5, 6, 8))
+
+            def vector_at(pointer: ir.Value, at: ir.Value) -> ir.Value:
+                return builder.bitcast(builder.gep(pointer, [at]), vf.as_pointer())
+
+            def load(at: ir.Value) -> ir.Value:
+                value = builder.load(vector_at(weights, at))
+                value.align = 4
+                return value
+
+            def add(total: ir.Value, k: ir.Value) -> None:
+                value = builder.load(builder.gep(inputs, [builder.add(x_at, k)]))
+                one = builder.insert_element(undefined, value, ir.Constant(i32, 0))
+                splat = builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(i32, lanes), [0] * lanes))
+                product = builder.fmul(splat, load(builder.add(w_at, builder.mul(k, width))), flags=("contract",))
+                builder.store(builder.fadd(builder.load(total), product, flags=("contract",)), total)
+
+            totals = [cgutils.alloca_once(builder, vf) for _ in range(chains)]
+            builder.store(load(bias_at), totals[0])
+            for total in totals[1:]:
+                builder.store(ir.Constant(vf, [0.0] * lanes), total)
+            step = ir.Constant(i64, chains)
+            whole = builder.mul(builder.sdiv(n, step), step)
+            with cgutils.for_range_slice(builder, ir.Constant(i64, 0), whole, step, i64) as (k, _):
+                for c, total in enumerate(totals):
+                    add(total, builder.add(k, ir.Constant(i64, c)))
+            with cgutils.for_range_slice(builder, whole, n, ir.Constant(i64, 1), i64) as (k, _):
+                add(totals[0], k)
+            result = builder.load(totals[0])
+            for total in totals[1:]:
+                result = builder.fadd(result, builder.load(total))
+            builder.store(result, vector_at(outputs, y_at)).align = 4
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return vector
+
+
+def dense(lanes: int, chains: int) -> Any:
+    """A function for kernels: biases plus weights times inputs, of `lanes` units of a dense layer.
+
+    Its arguments: float32 [any] inputs x, where they begin and how many they are; weights w, where those of the first
+    input begin, how far the next one's are, where the biases begin; outputs y and where they begin. Inputs are summed
+    in `chains` parts, which do not wait for each other; where few lanes fill a register that is what takes time.
+    """
+    return plain_dense(lanes, chains) if CONFIG.DISABLE_JIT else vector_dense(lanes, chains)

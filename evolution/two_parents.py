@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evolution.breeding import MAX_PARENTS, Kind, Mutation
+from evolution.breeding import Kind, Mutation
 from evolution.policy import PolicySpec
 from evolution.search import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournaments
 
