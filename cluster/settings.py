@@ -212,9 +212,7 @@ class EvolveSettings(RunSettings):
             if self.recombination == "all" and getattr(self, name) != getattr(EvolveSettings, name):
                 raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two")
         if not 0 <= self.elites <= MAX_ELITES or (self.recombination == "two" and self.elites >= self.population):
-            raise SettingsError(
-                f"--elites must be 0 to {MAX_ELITES:,} and fewer than the population, not {self.elites}"
-            )
+            raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
         try:
             self.search_config().check()
         except ValueError as error:

@@ -102,7 +102,7 @@ def _breed(parents, recipes, key, scales, quantiles, rate, sigma, children):
                 child[i] = a[i]
         elif kind == _NEW:
             _normals(quantiles, stream, scales, child)
-        elif kind == _STEP or kind == _MIRRORED:
+        elif kind in (_STEP, _MIRRORED):
             _normals(quantiles, stream, b, child)
             sign = _F(1.0) if kind == _STEP else _F(-1.0)
             for i in range(genes):
