@@ -113,6 +113,8 @@ class Evolution(Learning):
         self.search.tell(score)
         if len(self.trials):
             self._judge(driven.results[on_trial], driven.lost[on_trial.rows])
+            if self.champion is not None:
+                self.search.carry(self.champion.genome)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         row = {
             "fitness/best": led_score,
@@ -198,6 +200,8 @@ class Evolution(Learning):
         searched = {name.removeprefix("search_"): array for name, array in arrays.items() if name.startswith("search_")}
         self.search.restore(searched, meta["search"])
         self.search.generation = generation
+        if self.champion is not None:
+            self.search.carry(self.champion.genome)
         curriculum.crashes, curriculum.crash_worlds, curriculum.target = _crashes(crashes), worlds, target
 
 

@@ -136,14 +136,15 @@ class EvolveSettings(RunSettings):
     """What an evolution run depends on."""
 
     command: ClassVar[str] = "gridsim-evolve"
-    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64", "grid": "cnn:8,16,32@1"}
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:32+steering", "grid": "cnn:8,16,32@1"}
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
-    closer, by default mlp:64, in traffic mlp:64+motion (the paper's is mlp:6,7); on the grid cnn: with the channels of
-    two convolutions, the units of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    closer, +steering if it sees how its own wheels stand; by default mlp:32+steering, in traffic
+    mlp:32+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of
+    a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 256
     """Members of a generation."""
     generations: int = 0
@@ -172,7 +173,7 @@ class EvolveSettings(RunSettings):
 
     def default_policy(self) -> str:
         usual = super().default_policy()
-        return usual + "+motion" if self.traffic and self.observation == "rays" else usual
+        return usual.replace("+", "+motion+") if self.traffic and self.observation == "rays" else usual
 
     def default_car_steps(self) -> int:
         """Where neither generations nor car-steps are given."""

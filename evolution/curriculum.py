@@ -44,7 +44,7 @@ class CurriculumConfig:
     starts: int = 1  # new episodes of a group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, their length
-    crash_memory: int = 64  # crashes that are remembered
+    crash_memory: int = 16  # crashes that are remembered: the latest, as the leader no longer has older ones
     crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
     rewind: int = 64  # control steps before the crash
     leader_episodes: int = 16  # that the leader drives in each generation

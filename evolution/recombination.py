@@ -16,6 +16,7 @@ from evolution.policy import PolicySpec, gene_scales
 from evolution.search import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournament_weights
 
 _CENTRE, _STEPS, _CHAMPION = 0, 1, 2  # rows of the parents that are broadcast
+_KEPT = 0.9  # of the average of centres, in each generation
 
 
 class Recombination(Search):
@@ -26,6 +27,7 @@ class Recombination(Search):
         path: float64 [genes], the evolution path: N(0, 1) in each gene where selection has no say, as at the beginning.
         variances: float64 [genes], diagonal of the covariance, 1 at the beginning.
         sigma: step size over all genes.
+        average: float64 [genes], of the latest centres, each of which weighs 0.9 times the next one.
         champion: float32 [genes], carried beside the centre once there is one.
     """
 
@@ -35,17 +37,21 @@ class Recombination(Search):
         # Not 0: the step size would shrink until the path has grown to its expected length.
         self.path = self._rng(1).standard_normal(spec.size)
         self.variances = np.ones(spec.size)
+        self.average = np.zeros(0)
         self.sigma = config.sigma
         self.champion: np.ndarray | None = None
 
     def begin_with(self, genome: np.ndarray) -> None:
-        self.centre = genome.astype(np.float64)
+        self.centre = self.average = genome.astype(np.float64)
+
+    def carry(self, champion: np.ndarray) -> None:
+        self.champion = champion
 
     def leader(self) -> np.ndarray | None:
         return self.centre.astype(np.float32) if len(self.centre) else None
 
     def candidates(self) -> np.ndarray:
-        return self.centre[None].astype(np.float32)
+        return self.average[None].astype(np.float32)
 
     def steps(self) -> np.ndarray:
         """Standard deviation of each gene, float64 [genes]."""
@@ -72,7 +78,7 @@ class Recombination(Search):
 
     def _tell(self, asked: Asked, scores: np.ndarray) -> None:
         if not len(self.centre):
-            self.centre = self.genomes(np.array([scores.argmax()]))[0].astype(np.float64)
+            self.begin_with(self.genomes(np.array([scores.argmax()]))[0])
             return
         weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
         effective = 1.0 / float((weights**2).sum())  # mu_eff
@@ -85,6 +91,7 @@ class Recombination(Search):
         if elites == 2:
             toward += weights[1] * (asked.parents[_CHAMPION] - self.centre)
         self.centre = self.centre + toward
+        self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
         # Under random selection, first / norm is N(0, 1) in each gene, whatever the weights of a pair are.
         norm = math.sqrt(float((shift**2).sum()))
         if norm > 0.0:
@@ -99,7 +106,8 @@ class Recombination(Search):
             self.variances *= 1.0 - rate + rate * second / children.sum()
 
     def state(self) -> tuple[Arrays, dict[str, float]]:
-        return {"centre": self.centre, "path": self.path, "variances": self.variances}, {"sigma": self.sigma}
+        names = ("centre", "average", "path", "variances")
+        return {name: getattr(self, name) for name in names}, {"sigma": self.sigma}
 
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
         genes, sigma = (self.spec.size,), float(numbers["sigma"])
@@ -107,5 +115,6 @@ class Recombination(Search):
         path, variances = (checked(arrays[name], genes, np.float64) for name in ("path", "variances"))
         if not 0.0 < sigma < math.inf or (variances <= 0.0).any():
             raise ValueError("its step sizes are not above 0")
-        self.centre = checked(centre, genes if centre.size else (0,), np.float64)
+        shape = genes if centre.size else (0,)
+        self.centre, self.average = checked(centre, shape, np.float64), checked(arrays["average"], shape, np.float64)
         self.path, self.variances, self.sigma = path, variances, sigma

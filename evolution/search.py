@@ -65,6 +65,9 @@ class Search(ABC):
     def begin_with(self, genome: np.ndarray) -> None:
         """Begin with a genome float32 [genes] in place of random ones."""
 
+    def carry(self, champion: np.ndarray) -> None:  # noqa: B027
+        """Carry a champion float32 [genes] among the elites, where the search has a place for it."""
+
     @abstractmethod
     def leader(self) -> np.ndarray | None:
         """The best genome known before a generation, float32 [genes]; None before the first."""
