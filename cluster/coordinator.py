@@ -31,7 +31,7 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of history.csv after `generation`; the names that MLflow has them under. `best` is of the leader."""
 
-AHEAD = 3  # generations for which training maps are built
+AHEAD = 8  # generations for which training maps are built
 
 
 @dataclass

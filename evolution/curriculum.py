@@ -39,7 +39,8 @@ class CurriculumConfig:
     """The curriculum's parameters."""
 
     maps: int = 16  # training maps
-    first_maps: int = 6  # of these, how many the first generation meets; each one after it meets one more
+    first_maps: int = 4  # of these, how many the first generation meets ...
+    map_generations: int = 4  # ... and after how many there is one more, so that none needs to be waited for
     groups: int = 4  # of members, each with episodes of its own
     starts: int = 1  # new episodes of a group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
@@ -98,8 +99,8 @@ class Curriculum:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
 
     def maps_in_use(self, generation: int) -> int:
-        """Training maps in use: they come in one by one, so that none needs to be waited for."""
-        return min(self.config.maps, self.config.first_maps + generation)
+        """Training maps in use: they come in one by one."""
+        return min(self.config.maps, self.config.first_maps + generation // self.config.map_generations)
 
     def limits(self) -> Limits:
         """Of training episodes."""
