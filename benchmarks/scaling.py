@@ -127,8 +127,9 @@ def last_generations(
     learning, curriculum = this.learning, this.learning.curriculum
     compile_kernels(settings.policy, settings.traffic, settings.command)
     validation, nobody = curriculum.validation(), np.zeros((1, learning.spec.size), dtype=np.float32)
-    while pool.workers() < workers:  # all are up, and have the maps that they would have by then
-        learning.drive("warm", nobody, validation, curriculum.goal_limits())
+    # Until all are at work, and have the maps that they would have by then.
+    while len(learning.drive("warm", nobody, validation, curriculum.goal_limits()).busy_s) < workers:
+        pass
     learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
     begun = 0.0
