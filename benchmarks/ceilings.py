@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from simulation import ROWS  # beside this file
 
 from cluster.learning import Maps
 from cluster.pool import Chunk, WorkerPool
@@ -28,43 +29,51 @@ from cluster.run import Session, make_tracker, new_run
 from cluster.settings import EvolveSettings
 from cluster.tracking_address import check_uri
 from cluster.worker import Task, Worker
-from evolution.breeding import RECIPE, Mutation, breed
-from evolution.genetic import Genetic, GeneticConfig
+from evolution import fitness
+from evolution.breeding import Kind, Mutation, breed, moments
 from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits, evaluate, no_traffic, targets
+from evolution.recombination import Recombination
+from evolution.rollout import EPISODE, RESULT, Limits, evaluate, no_traffic, targets
+from evolution.search import recipes as some_recipes
 from gridsim.config import SimConfig
 from gridsim.ego import End
 from gridsim.scenarios import build, sample_starts
 
+POLICY = "mlp:6,7"  # 311 genes
 CHILDREN = 100_000  # members that the coordinator alone is timed with
-EPISODES = 12  # of the default run
+EPISODES = 2  # of a member, as in the default run
 CHUNKS = 2_000  # that are sent to see what one costs
 WAITING = 1_000  # workers that are looked at to see what one costs
 SEED = 7  # of the sleeping workers' naps
 
 
 class InstantWorker(Worker):
-    """Answers at once: half of the episodes succeed, the others end on their way."""
+    """Answers at once: most episodes succeed, the others end on their way; whoever crashes, does where it started."""
 
-    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, float]:
-        results = np.zeros((len(recipes), len(task.episodes)), dtype=task.row)
+    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+        results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         goals = targets(task.episodes, task.limits)
-        share = (recipes["seed"][:, None] * 7919 + np.arange(len(goals)) * 104_729) % 512 / 256
+        mark = 2 * recipes["seed"].astype(np.int64) + (recipes["kind"] == Kind.MIRRORED)
+        share = (mark[:, None] * 7919 + np.arange(len(goals)) * 104_729) % 512 / 160
         results["distance"] = np.floor(np.minimum(share, 1.0) * goals)
         results["paced"] = np.floor(results["distance"] / 2)
         results["steps"] = results["distance"]
         results["end"] = np.where(share >= 1.0, End.SUCCESS, End.COLLISION)
-        return results, 0.0
+        back = task.episodes["rewind"] > 0
+        rewound, worlds = (
+            np.repeat(states[back][None], len(recipes), axis=0) for states in (task.episodes["start"], task.worlds)
+        )
+        return results, rewound, worlds, 0.0
 
 
 class SleepingWorker(InstantWorker):
     """Sleeps in place of evaluating: for as long as `naps` says, by a member's seed and an episode's mark."""
 
-    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         started = time.perf_counter()
         columns = task.episodes["start"][:, 4].astype(int)
-        time.sleep(float(naps()[np.ix_(recipes["seed"] - 1, columns)].sum()))
-        return super().evaluate(task, maps, recipes)[0], time.perf_counter() - started
+        time.sleep(float(naps()[np.ix_(recipes["seed"], columns)].sum()))
+        return *super().evaluate(task, maps, recipes)[:3], time.perf_counter() - started
 
 
 def naps(members: int = 400, mean_s: float = 0.02) -> np.ndarray:
@@ -75,13 +84,16 @@ def naps(members: int = 400, mean_s: float = 0.02) -> np.ndarray:
     return shares * (mean_s / shares.mean() / EPISODES)
 
 
-def make_task(parents: np.ndarray, key: int = 1) -> Task:
+def make_task(parents: np.ndarray, key: int = 1, count: int = EPISODES) -> Task:
     """A generation's task without maps; each episode is marked by its number."""
-    episodes = np.zeros(EPISODES, EPISODE)
-    episodes["start"][:, 4] = np.arange(EPISODES)
-    return Task(
-        "mlp:6,7", parents, key, Mutation(), episodes, no_traffic(EPISODES), (), Limits(150.0, 245), SimConfig()
-    )
+    episodes = np.zeros(count, EPISODE)
+    episodes["start"][:, 4] = np.arange(count)
+    return Task(POLICY, parents, key, Mutation(), episodes, no_traffic(count), (), Limits(150.0, 245), SimConfig())
+
+
+def rows(count: int) -> np.ndarray:
+    """Genomes float32 [count, genes] as they are broadcast."""
+    return np.zeros((count, PolicySpec.parse(POLICY).size), dtype=np.float32)
 
 
 def session(
@@ -104,19 +116,22 @@ def learn(this: Session) -> None:
 
 
 def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, float]:
-    """Members a second that the coordinator selects, writes recipes for, sends and collects; of InstantWorkers.
+    """Members a second that the default search asks for, the pool sends and collects and the search recombines.
 
-    And the seconds of its own thread's processor that one takes, without those that it waits for the workers.
+    Of InstantWorkers, whose results come in groups as in a run. And the seconds of the coordinator's own thread's
+    processor that one takes, without those that it waits for the workers.
     """
-    spec = PolicySpec.parse("mlp:6,7")
-    genetic = Genetic(spec, GeneticConfig(population=children), 0)
+    search = Recombination(PolicySpec.parse(POLICY), EvolveSettings(population=children).search_config(), 0)
     rng = np.random.default_rng(0)
     rates, times = [], []
     for _ in range(6):
         begun, before = time.perf_counter(), time.thread_time()
-        recipes, key = genetic.ask(Mutation())
-        results = pool.evaluate(make_task(genetic.parents, key), recipes).results
-        genetic.tell(results["distance"].sum(axis=1) + rng.random(children))
+        asked = search.ask()
+        parts = [Chunk(group, slice(g * EPISODES, (g + 1) * EPISODES)) for g, group in enumerate(asked.groups)]
+        task = make_task(asked.parents, asked.key, EPISODES * len(parts))
+        results = pool.evaluate(task, asked.recipes, asked=parts).results
+        driven = np.concatenate([results[part] for part in parts])
+        search.tell(fitness.scalar(driven, task.limits.target) + 1e-6 * rng.random(children))
         rates.append(children / (time.perf_counter() - begun))
         times.append((time.thread_time() - before) / children)
     return statistics.median(rates[1:]), statistics.median(times[1:])
@@ -139,10 +154,8 @@ def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
         finally:
             looks.append(time.thread_time() - begun)
 
-    recipes = np.zeros(chunks, RECIPE)
-    recipes["seed"] = np.arange(1, chunks + 1)
+    recipes, task = some_recipes(chunks), make_task(rows(1))
     asked = [Chunk(slice(k, k + 1), slice(0, EPISODES)) for k in range(chunks)]
-    task = make_task(np.zeros((1, PolicySpec.parse("mlp:6,7").size), np.float32))
     times = []
     ray.wait = timed
     try:
@@ -185,19 +198,23 @@ def ray_costs(waiting: int = WAITING) -> tuple[float, float]:
     return statistics.median(looks) / waiting, max(byte_s, 0.0)
 
 
-def gene_s(policy: str) -> float:
-    """Seconds to breed a gene."""
-    spec = PolicySpec.parse(policy)
-    count = max(1, 500_000 // spec.size)
-    parents = np.random.default_rng(0).normal(size=(64, spec.size)).astype(np.float32)
-    recipes = np.zeros(count, RECIPE)
-    recipes["seed"], recipes["b"] = np.arange(1, count + 1), 1
-    times = []
-    for _ in range(4):
-        begun = time.perf_counter()
-        breed(parents, recipes, 1, spec, Mutation())
-        times.append(time.perf_counter() - begun)
-    return statistics.median(times[1:]) / (count * spec.size)
+def gene_costs() -> tuple[float, float]:
+    """Seconds to breed a gene of a member, and to recombine it: members come in pairs that share their noise."""
+    spec, pairs = PolicySpec.parse(POLICY), 1_000
+    recipes = some_recipes(2 * pairs)
+    recipes["kind"], recipes["b"], recipes["seed"] = [Kind.STEP, Kind.MIRRORED] * pairs, 1, np.arange(2 * pairs) // 2
+    weights = np.random.default_rng(0).normal(size=pairs)
+    bred, recombined = [], []
+    for _ in range(6):
+        times = [time.perf_counter()]
+        breed(rows(2), recipes, 1, spec, Mutation())
+        times.append(time.perf_counter())
+        moments(np.arange(pairs), weights, weights**2, 1, spec.size)
+        times.append(time.perf_counter())
+        bred.append(times[1] - times[0])
+        recombined.append(times[2] - times[1])
+    genes = 2 * pairs * spec.size
+    return statistics.median(bred[1:]) / genes, statistics.median(recombined[1:]) / genes
 
 
 def step_s(policy: str, members: int = 64) -> float:
@@ -219,9 +236,7 @@ def sleeping_efficiency(workers: int, members: int, generations: int = 3) -> flo
     """Efficiency of so many real Ray actors on whatever cores there are: they sleep, which takes none."""
     maps = Maps("seamless", SimConfig())
     pool = RayPool(workers, maps.build, worker_factory=SleepingWorker)
-    recipes = np.zeros(members, RECIPE)
-    recipes["seed"] = np.arange(1, members + 1)
-    task = make_task(np.zeros((72, PolicySpec.parse("mlp:6,7").size), np.float32))
+    recipes, task = some_recipes(members), make_task(rows(ROWS))
     try:
         while pool.workers() < workers:  # all are up, and it is known how long a metre takes
             pool.evaluate(task, recipes)
@@ -240,8 +255,11 @@ def memory(population: int) -> dict[str, float]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def coordinate(population: int, generations: int = 12) -> dict[str, float]:
-    """Run some generations of InstantWorkers in the longest episodes, saved and logged as always."""
+def coordinate(population: int, generations: int = 16) -> dict[str, float]:
+    """Run some generations of InstantWorkers in the longest episodes, saved and logged as always.
+
+    What is broadcast is that of a generation which needs no new map and tries nobody for champion.
+    """
     settings = EvolveSettings(population=population, generations=generations, until=2.0)
     with tempfile.TemporaryDirectory() as folder:
         maps = Maps(settings.scenario, SimConfig())
@@ -251,7 +269,7 @@ def coordinate(population: int, generations: int = 12) -> dict[str, float]:
         curriculum.config = dataclasses.replace(curriculum.config, first_target=curriculum.config.last_target)
         curriculum.target = curriculum.config.last_target
         broadcast: list[int] = []
-        this.on_row = lambda step, row: broadcast.append(sum(o.broadcast_bytes for o in this.learning.outcomes))
+        this.on_row = lambda step, row: broadcast.append(this.learning.outcomes[0].broadcast_bytes)
         begun = time.perf_counter()
         learn(this)
         maps.close()

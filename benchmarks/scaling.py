@@ -1,16 +1,17 @@
 """How the service scales: python benchmarks/scaling.py [--json] [--quick] [--picture FILE] [--generations N] [--seed N]
 
 On this machine: runs the default job to its end with 2 workers and keeps the state ten generations before it; then
-evolves those ten generations again, with 1 worker and with 2, saving and logging as always. Medians over them:
+evolves those ten generations again, with 1 worker, with 2, and with 2 at population 512, saving and logging as always.
+Medians over them:
 
-    speedup_2_workers               wall clock of a generation with 1 worker over that with 2
+    speedup_2_workers               wall clock of all ten with 1 worker over that with 2
     overhead_ms_per_generation      wall clock less the busiest worker's evaluation, 2 workers, population 512
-    bytes_per_child                 sent per member and generation, both ways, validation beside it included
-    broadcast_bytes_per_generation  put into the object store per generation: parents, racers, episodes
+    bytes_per_child                 sent per member and generation, both ways, leader and validation included
+    broadcast_bytes_per_generation  put into the object store per generation: a few genomes, episodes
 
 The coordinator's ceilings, with workers that answer at once (`ceilings.py`):
 
-    children_per_s                  selection, recipes, dispatch and collection
+    children_per_s                  recipes, dispatch, collection and recombination, mlp:6,7
     coordinator_mib_100k            peak memory of its process at population 100,000, everything in it
     broadcast_bytes_100k            as above, at that population
     chunk_us, look_us, ...          what the simulation is fed with: the coordinator's own time
@@ -28,15 +29,16 @@ cores, so that they sleep in place of evaluating: what is checked is the dispatc
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import statistics
 import sys
 import tempfile
 import time
 from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from ceilings import (  # beside this file
@@ -46,7 +48,7 @@ from ceilings import (  # beside this file
     InstantWorker,
     children_per_s,
     chunk_costs,
-    gene_s,
+    gene_costs,
     learn,
     memory,
     naps,
@@ -55,34 +57,49 @@ from ceilings import (  # beside this file
     sleeping_efficiency,
     step_s,
 )
-from simulation import WORKERS, Call, Costs, Load, at, draw, episodes_of, table
+from ceilings import POLICY as MLP
+from simulation import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, table
 
 from cluster.learning import Maps
+from cluster.pool import Chunk, Meanwhile, Outcome, Progress
 from cluster.ray_pool import RayPool
-from cluster.settings import EvolveSettings
+from cluster.settings import MAX_STEPS, EvolveSettings
 from cluster.warm import compile_kernels
+from cluster.worker import Task
+from evolution.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
 from evolution.policy import PolicySpec
 from evolution.rollout import targets
 from gridsim.config import SimConfig
 
 LAST = 10  # generations that are measured
-MLP, CNN = "mlp:6,7", "cnn:8,16,32@1"
+OVERHEAD = 512  # population that the coordinator's time is measured at
+CNN = "cnn:8,16,32@1"
 ACTORS = (1, 2, 4, 8)  # real ones, that the simulation is checked with
 NAPPING = 40  # members for each of them
 MEMBER_S = 1.0  # of evaluation, in the simulation
 
 
-class Last(NamedTuple):
-    """The last generations of the default run: figures of each, and how the last one's episodes went."""
-
-    figures: dict[str, list[float]]
-    load: Load
+State = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
-def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+class Watched(RayPool):
+    """A pool that remembers what it was asked for last."""
+
+    task: Task
+    asked: Sequence[Chunk]
+
+    def evaluate(
+        self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None,
+        asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
+    ) -> Outcome:  # fmt: skip
+        self.task, self.asked = task, asked or []
+        return super().evaluate(task, recipes, on_progress, asked, meanwhile)
+
+
+def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> State:
     """The state of the default run LAST generations before its end."""
     pool = RayPool(2, maps.build)
-    states: deque[tuple[dict[str, np.ndarray], dict[str, Any]]] = deque(maxlen=LAST + 1)
+    states: deque[State] = deque(maxlen=LAST + 1)
     this = session(folder, "whole", settings, pool, maps)
     compile_kernels(settings.policy, settings.traffic, settings.command)
 
@@ -94,53 +111,52 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> tuple[dic
 
     this.on_row = keep
     learn(this)
+    for seed in (*this.learning.curriculum.map_seeds, *VALIDATION_SEEDS, *HELD_OUT_SEEDS):
+        maps.get(seed)  # a short run ends before all are built, and nothing else is to be built beside what is measured
     return states[0]
 
 
 def last_generations(
-    folder: Path,
-    settings: EvolveSettings,
-    maps: Maps,
-    state: tuple[dict[str, np.ndarray], dict[str, Any]],
-    workers: int,
-) -> Last:
-    """Evolve LAST generations from a state."""
-    pool = RayPool(workers, maps.build)
-    this = session(folder, f"last-{workers}", settings, pool, maps)
-    this.learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
+    folder: Path, settings: EvolveSettings, maps: Maps, state: State, workers: int
+) -> tuple[dict[str, list[float]], Load]:
+    """Evolve LAST generations from a state. Returns: figures of each, and how the last one's episodes went."""
+    # They are counted here: neither a bound of the run nor its champion ends them.
+    settings = replace(settings, generations=0, car_steps=MAX_STEPS, until=2.0)
+    pool = Watched(workers, maps.build)
+    this = session(folder, f"last-{workers}-{settings.population}", settings, pool, maps)
+    learning, curriculum = this.learning, this.learning.curriculum
     compile_kernels(settings.policy, settings.traffic, settings.command)
+    validation, nobody = curriculum.validation(), np.zeros((1, learning.spec.size), dtype=np.float32)
+    # Until all are at work, and have the maps that they would have by then.
+    while len(learning.drive("warm", nobody, validation, curriculum.goal_limits()).busy_s) < workers:
+        pass
+    learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
     begun = 0.0
 
     def measure(generation: int, row: dict[str, float]) -> None:
         nonlocal begun
         end = time.perf_counter()
-        outcomes = this.learning.outcomes
-        busiest = sum(max(o.busy_s.values()) for o in outcomes)
-        main = outcomes[0]
+        (outcome,) = learning.outcomes
         figures["wall"].append(end - begun)
-        figures["overhead"].append(end - begun - busiest)
-        figures["bytes"].append((main.bytes_down + main.bytes_up) / settings.population)
-        figures["broadcast"].append(sum(o.broadcast_bytes for o in outcomes))
-        this.learning.solved = len(figures["wall"]) > LAST
+        figures["overhead"].append(end - begun - max(outcome.busy_s.values()))
+        figures["bytes"].append((outcome.bytes_down + outcome.bytes_up) / settings.population)
+        figures["broadcast"].append(outcome.broadcast_bytes)
+        learning.solved = len(figures["wall"]) > LAST
         begun = time.perf_counter()
 
     this.on_row = measure
     begun = time.perf_counter()
     learn(this)
-    curriculum = this.learning.curriculum
-    generation = this.learning.steps - 1
-    main, race = this.learning.outcomes[0].results, this.learning.outcomes[1].results
-    rows = curriculum.episodes(generation).rows
-    step = curriculum.period  # in the unit of the car's clock; `at` makes it seconds of evaluation
+    n, goals = settings.population, targets(pool.task.episodes, pool.task.limits)
+    seconds = learning.outcomes[0].results["steps"] * curriculum.period  # `at` makes them evaluation
+    groups = [part for part in pool.asked if part.rows.stop <= n]
+    leader = next(part for part in pool.asked if part.rows.start == n)
     load = Load(
-        targets(rows, curriculum.limits()),
-        main["steps"][: settings.population, : len(rows)] * step,
-        np.full(race.shape[1], curriculum.race_limits().target),
-        race["steps"] * step,
-        PolicySpec.parse(settings.policy).size,
-    )
-    return Last({name: values[1:] for name, values in figures.items()}, load)  # the first one waits for Ray
+        goals[groups[0].columns], np.concatenate([seconds[part] for part in groups]),
+        goals[leader.columns], seconds[leader][0], learning.spec.size,
+    )  # fmt: skip
+    return {name: values[1:] for name, values in figures.items()}, load  # the first one puts training's maps
 
 
 def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
@@ -152,7 +168,9 @@ def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
         busy, byte = ray_costs()
     finally:
         pool.close()
-    costs = Costs(child, chunk, look, busy, byte, gene_s(MLP))
+    breed_s, recombine_s = gene_costs()
+    of_genes = recombine_s * PolicySpec.parse(MLP).size
+    costs = Costs(max(child - of_genes, 0.0), recombine_s, chunk, look, busy, byte, breed_s)
     figures = {
         "children_per_s": children,
         "child_us": 1e6 * child,
@@ -160,27 +178,27 @@ def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
         "look_us": 1e6 * look,
         "look_us_per_worker": 1e6 * busy,
         "sent_mib_per_s": 1.0 / max(byte, 1e-12) / 2**20,
-        "gene_ns": 1e9 * costs.gene_s,
+        "gene_ns": 1e9 * breed_s,
+        "recombined_gene_ns": 1e9 * recombine_s,
     }
     return costs, figures
 
 
 def cases(load: Load) -> dict[str, Load]:
     """What is simulated, by name."""
-    cnn = PolicySpec.parse(CNN).size
     steps = load.drives.sum(axis=1).mean() / SimConfig().episode.control_period
     own_s = {policy: float(steps * step_s(policy)) for policy in (MLP, CNN)}
-    second = f"{MEMBER_S:g} s a member"
-    return {
-        f"{MLP}, {second}": at(load, MEMBER_S),
-        f"{MLP}, {second}, genomes": at(load, MEMBER_S, recipes=False),
-        f"{CNN}, {second}": at(load, MEMBER_S, genes=cnn),
-        f"{CNN}, {second}, genomes": at(load, MEMBER_S, genes=cnn, recipes=False),
-        f"{MLP}, {1e3 * own_s[MLP]:.1f} ms": at(load, own_s[MLP]),
-        f"{MLP}, {1e3 * own_s[MLP]:.1f} ms, genomes": at(load, own_s[MLP], recipes=False),
-        f"{CNN}, {1e3 * own_s[CNN]:.0f} ms": at(load, own_s[CNN], genes=cnn),
-        f"{CNN}, {1e3 * own_s[CNN]:.0f} ms, genomes": at(load, own_s[CNN], genes=cnn, recipes=False),
-    }
+    found = {}
+    for policy, seconds, member in (
+        (MLP, MEMBER_S, f"{MEMBER_S:g} s a member"),
+        (CNN, MEMBER_S, f"{MEMBER_S:g} s a member"),
+        (MLP, own_s[MLP], f"{1e3 * own_s[MLP]:.1f} ms"),
+        (CNN, own_s[CNN], f"{1e3 * own_s[CNN]:.0f} ms"),
+    ):
+        genes = PolicySpec.parse(policy).size
+        found[f"{policy}, {member}"] = at(load, seconds, genes)
+        found[f"{policy}, {member}, genomes"] = at(load, seconds, genes, recipes=False)
+    return found
 
 
 def checked(costs: Costs, actors: tuple[int, ...]) -> dict[str, float]:
@@ -190,9 +208,9 @@ def checked(costs: Costs, actors: tuple[int, ...]) -> dict[str, float]:
         members = NAPPING * workers
         figures[f"real_efficiency_{workers}"] = sleeping_efficiency(workers, members)
         drives = naps()[:members]
-        local = dataclasses.replace(costs, latency_s=0.0)
-        goals = np.full(EPISODES, 150.0)
-        call = Call(local, workers, drives, episodes_of(goals), 6.0, 0.0, 72 * 1244 + 4_000)
+        local = replace(costs, latency_s=0.0)
+        broadcast = TASK_BYTES + 4 * PolicySpec.parse(MLP).size * ROWS
+        call = Call(local, workers, drives, np.full(EPISODES, 150.0), broadcast)
         figures[f"simulated_efficiency_{workers}"] = float(drives.sum() / (workers * call.run()))
     return figures
 
@@ -203,41 +221,39 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     parser.add_argument("--quick", action="store_true", help="all of it, on a small scale")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the simulated efficiency")
-    parser.add_argument(
-        "--generations", type=int, default=EvolveSettings().generations, help="of the default run, at most"
-    )
+    parser.add_argument("--generations", type=int, default=0, help="of the default run, at most; 0: its own end")
     parser.add_argument("--seed", type=int, default=0, help="of the default run")
     options = parser.parse_args()
-    if options.generations < 1:
-        parser.error("--generations must be 1 or more")
-    count, population = options.generations, EvolveSettings().population
+    if options.generations < 0:
+        parser.error("--generations must be 0 or more")
+    settings = EvolveSettings(generations=options.generations, seed=options.seed)
     if options.quick:
-        count, population = min(count, 3), 64
-    settings = EvolveSettings(generations=count, seed=options.seed, population=population)
-    longer = EvolveSettings(generations=count + LAST + 2, seed=options.seed, population=population, until=2.0)
+        settings = replace(settings, generations=3, population=64)
     with tempfile.TemporaryDirectory() as folder:
         maps = Maps(settings.scenario, SimConfig())
         state = default_run(Path(folder), settings, maps)
-        one = last_generations(Path(folder), longer, maps, state, 1)
-        two = last_generations(Path(folder), longer, maps, state, 2)
+        one, _ = last_generations(Path(folder), settings, maps, state, 1)
+        two, load = last_generations(Path(folder), settings, maps, state, 2)
+        large, _ = last_generations(Path(folder), replace(settings, population=OVERHEAD), maps, state, 2)
         costs, ceilings = measured_costs(maps, options.quick)
         maps.close()
-    large = memory(2_000 if options.quick else 100_000)
-    loads = cases(two.load)
+    largest = memory(2_000 if options.quick else 100_000)
+    loads = cases(load)
     workers = (1, 10, 1_000) if options.quick else WORKERS
     efficiencies = table(costs, loads, workers)
     median = statistics.median
     figures = {
-        "speedup_2_workers": sum(one.figures["wall"]) / sum(two.figures["wall"]),
-        "overhead_ms_per_generation": 1e3 * median(two.figures["overhead"]),
-        "bytes_per_child": median(two.figures["bytes"]),
-        "broadcast_bytes_per_generation": median(two.figures["broadcast"]),
-        "generation_ms_1_worker": 1e3 * median(one.figures["wall"]),
-        "generation_ms_2_workers": 1e3 * median(two.figures["wall"]),
+        "speedup_2_workers": sum(one["wall"]) / sum(two["wall"]),
+        "overhead_ms_per_generation": 1e3 * median(large["overhead"]),
+        "bytes_per_child": median(two["bytes"]),
+        "broadcast_bytes_per_generation": median(two["broadcast"]),
+        "generation_ms_1_worker": 1e3 * median(one["wall"]),
+        "generation_ms_2_workers": 1e3 * median(two["wall"]),
+        "generation_ms_512": 1e3 * median(large["wall"]),
         **ceilings,
-        "coordinator_mib_100k": large["coordinator_mib"],
-        "broadcast_bytes_100k": large["broadcast_bytes"],
-        "generation_s_100k": large["generation_s"],
+        "coordinator_mib_100k": largest["coordinator_mib"],
+        "broadcast_bytes_100k": largest["broadcast_bytes"],
+        "generation_s_100k": largest["generation_s"],
         "efficiency_1000_workers": next(iter(efficiencies.values()))[workers.index(1_000)],
         **checked(costs, ACTORS[:2] if options.quick else ACTORS),
     }

@@ -2,8 +2,9 @@
 
 The coordinator is one thread, as in `cluster.ray_pool`: it sends chunks to who is free, looks at all who are busy, and
 takes in what has come. The chunks are those of `cluster.pool.cut`. Simulated are its time, the network's latency and
-the bandwidth of its own link, the mating pool on its way to the nodes, the workers' evaluations and the race that
-follows. Not simulated: deaths, and other people's load.
+the bandwidth of its own link, the search's few rows on their way to the nodes, and the evaluation of the members and of
+the leader, whose long episodes go out first. All members count as one group. Not simulated: who is on trial for
+champion, maps, deaths, and other people's load.
 
 Efficiency is the time of evaluation over what all workers had: 1 means that nobody ever waited.
 """
@@ -14,24 +15,22 @@ import heapq
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from cluster.pool import Chunk, cut
+from cluster.pool import Chunk, cut, metres
 from cluster.worker import Task
-from evolution.breeding import Mutation
-from evolution.packing import result_widths
-from evolution.rollout import EPISODE, Limits, no_traffic, targets
+from evolution.breeding import RECIPE, Mutation
+from evolution.rollout import EPISODE, RESULT, Limits, no_traffic
 from gridsim.config import SimConfig
 
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POPULATION = 10_000
 QUEUE = 2  # chunks that a worker holds, as in the pool
-GENERATIONS = 1  # simulated for each figure: with so many members they are all alike
 TASK_BYTES = 4_000  # of a broadcast, beside genomes: episodes, settings, and how they are pickled
-RECIPE_BYTES = 6  # of a packed one at such populations
+ROWS = 4  # genomes in a broadcast: centre, step sizes, champion, leader
 CHUNK_BYTES = 300  # around what is sent, either way: Ray's own description of a call
 
 
@@ -39,7 +38,8 @@ CHUNK_BYTES = 300  # around what is sent, either way: Ray's own description of a
 class Costs:
     """What things cost, in seconds; the last three are assumed and not measured."""
 
-    child_s: float  # of the coordinator's, a member: to select, to score
+    child_s: float  # of the coordinator's, a member: its recipe, its score, its weight
+    recombine_s: float  # and as much again for each of its genes
     chunk_s: float  # of the coordinator's, a chunk: to send it and to take in what it brought
     look_s: float  # of the coordinator's, a look for what has come
     look_worker_s: float  # and as much again for each worker that is busy
@@ -55,20 +55,18 @@ class Load:
     """What a generation asks for.
 
     Attributes:
-        targets: m, of each episode [e].
+        targets: m, of each of a member's episodes [e].
         drives: s, of each member's episodes [n, e]; members are drawn from it.
-        race_targets, race_drives: the same of the race [racers, r], which is held as it is.
+        leader_targets, leader_drives: the same of the leader's episodes [k], which are driven as they are.
         genes: of a network.
-        parents: genomes in a broadcast.
         recipes: whether children are sent as recipes; else as genomes, which the coordinator breeds.
     """
 
     targets: np.ndarray
     drives: np.ndarray
-    race_targets: np.ndarray
-    race_drives: np.ndarray
+    leader_targets: np.ndarray
+    leader_drives: np.ndarray
     genes: int
-    parents: int = 72
     recipes: bool = True
 
 
@@ -78,28 +76,30 @@ class Call:
 
     costs: Costs
     workers: int
-    drives: np.ndarray  # s [n, e]
-    episodes: np.ndarray  # EPISODE [e]
-    member_bytes: float  # sent for each member, in each chunk that it is in
-    member_s: float  # of the coordinator's, for the same
-    broadcast: int  # bytes
+    drives: np.ndarray  # s [n, e]; 0 where nothing is asked for
+    targets: np.ndarray  # m [e]
+    broadcast: int = 0  # bytes
+    asked: Sequence[Chunk] = ()  # what takes longest first; all if empty
+    member_bytes: float = RECIPE.itemsize  # sent for each member, in each chunk that it is in
+    member_s: float = 0.0  # of the coordinator's, for the same
 
     def chunks(self) -> list[Chunk]:
         """As the pool cuts it, which knows from the last generation how long a metre takes."""
-        limits = Limits(1.0, 1)
-        task = Task(
-            "mlp:6,7", np.zeros((1, 1), np.float32), 0, Mutation(), self.episodes, no_traffic(len(self.episodes)), (),
-            limits, SimConfig(),
-        )  # fmt: skip
         n, e = self.drives.shape
-        metres = targets(self.episodes, limits).sum() * n
-        return cut(task, [Chunk(slice(0, n), slice(0, e))], self.workers, max(self.drives.sum() / metres, 1e-12))
+        episodes = np.zeros(e, dtype=EPISODE)
+        episodes["target"] = self.targets
+        task = Task(
+            "mlp:6,7", np.zeros((1, 1), np.float32), 0, Mutation(), episodes, no_traffic(e), (), Limits(1.0, 1),
+            SimConfig(),
+        )  # fmt: skip
+        asked = self.asked or [Chunk(slice(0, n), slice(0, e))]
+        whole = sum(metres(task, part) for part in asked)
+        return cut(task, asked, self.workers, max(self.drives.sum() / whole, 1e-12))
 
     def run(self) -> float:
         """Seconds from its begin to its end."""
         k, chunks = self.costs, self.chunks()
         size = np.concatenate([np.zeros((len(self.drives), 1)), np.cumsum(self.drives, axis=1)], axis=1)
-        answer = np.cumsum(np.concatenate([[0], result_widths(self.episodes, Limits(1.0, 1), SimConfig()).sum(axis=1)]))
         todo = deque(chunks)
         idle = deque(range(self.workers))
         single: deque[int] = deque()  # who holds one chunk, in the order in which they got it
@@ -124,7 +124,7 @@ class Call:
                 broadcast_at[node] = link_s + rounds * (2 * k.latency_s + self.broadcast / k.bandwidth)
             begin = max(link_s + k.latency_s, free_at[worker], broadcast_at[node])
             free_at[worker] = begin + float((size[rows, columns.stop] - size[rows, columns.start]).sum())
-            up = CHUNK_BYTES + members * (answer[columns.stop] - answer[columns.start]) / 8
+            up = CHUNK_BYTES + members * (columns.stop - columns.start) * RESULT.itemsize
             heapq.heappush(coming, (free_at[worker] + k.latency_s + up / k.bandwidth, worker, up))
             held[worker] += 1
             if held[worker] == 1:
@@ -150,48 +150,35 @@ class Call:
         return now
 
 
-def episodes_of(goals: np.ndarray) -> np.ndarray:
-    """EPISODE [e] with these targets (m), as long as they take at 7 m/s."""
-    episodes = np.zeros(len(goals), dtype=EPISODE)
-    episodes["target"], episodes["steps"] = goals, np.ceil(goals / 0.7 + 30)
-    return episodes
-
-
 def generation(costs: Costs, load: Load, workers: int, drives: np.ndarray) -> float:
-    """Seconds of a generation: its members [n, e], then the race."""
-    n = len(drives)
-    genomes = 0 if load.recipes else 4 * load.genes
-    bred = 0.0 if load.recipes else costs.gene_s * load.genes
-    pool = 4 * load.genes * load.parents if load.recipes else 0
-    racers = len(load.race_drives)
-    main = Call(
-        costs, workers, drives, episodes_of(load.targets), genomes or RECIPE_BYTES, bred, TASK_BYTES + pool
+    """Seconds of a generation of members [n, e] and the leader, who comes after them in rows and columns."""
+    n, e = drives.shape
+    k = len(load.leader_drives)
+    both = np.zeros((n + 1, e + k))
+    both[:n, :e], both[n, e:] = drives, load.leader_drives
+    call = Call(
+        costs, workers, both, np.concatenate([load.targets, load.leader_targets]), TASK_BYTES,
+        [Chunk(slice(n, n + 1), slice(e, e + k)), Chunk(slice(0, n), slice(0, e))],
     )  # fmt: skip
-    # Racers are broadcast as they are, whatever children are.
-    race = Call(
-        costs, workers, load.race_drives, episodes_of(load.race_targets), RECIPE_BYTES, 0.0,
-        TASK_BYTES + 4 * load.genes * racers,
-    )  # fmt: skip
-    breeding_racers_and_parents = costs.gene_s * load.genes * (racers + load.parents)
-    return n * costs.child_s + main.run() + breeding_racers_and_parents + race.run()
+    if load.recipes:
+        call.broadcast += 4 * load.genes * ROWS
+    else:
+        call.member_bytes, call.member_s = 4 * load.genes, costs.gene_s * load.genes
+    return n * (costs.child_s + costs.recombine_s * load.genes) + call.run()
 
 
 def efficiency(costs: Costs, load: Load, workers: int, population: int = POPULATION) -> float:
-    """Time of evaluation over what the workers had, of GENERATIONS."""
-    spent = had = 0.0
-    for seed in range(GENERATIONS):
-        rows = np.random.default_rng(seed).integers(len(load.drives), size=population)
-        drives = load.drives[rows]
-        spent += drives.sum() + load.race_drives.sum()
-        had += workers * generation(costs, load, workers, drives)
-    return spent / had
+    """Time of evaluation over what the workers had."""
+    drives = load.drives[np.random.default_rng(0).integers(len(load.drives), size=population)]
+    return (drives.sum() + load.leader_drives.sum()) / (workers * generation(costs, load, workers, drives))
 
 
-def at(load: Load, member_s: float, **changes: object) -> Load:
-    """The same where a member's evaluation takes so long in the mean."""
+def at(load: Load, member_s: float, genes: int, recipes: bool = True) -> Load:
+    """The same with a network of so many genes, where a member's evaluation takes so long in the mean."""
     factor = member_s / load.drives.sum(axis=1).mean()
-    values = {**load.__dict__, "drives": load.drives * factor, "race_drives": load.race_drives * factor, **changes}
-    return Load(**values)
+    return replace(
+        load, drives=load.drives * factor, leader_drives=load.leader_drives * factor, genes=genes, recipes=recipes
+    )
 
 
 def table(costs: Costs, cases: dict[str, Load], workers: Sequence[int] = WORKERS) -> dict[str, list[float]]:

@@ -1,7 +1,7 @@
 """Whether memory grows with the generations: python benchmarks/soak.py [--generations 2000] [--workers 2] [--json]
 
 Evolves a small population from a driver that is trained already, so that everything a long run does is done from the
-start: races, crashes, validation, a checkpoint and an MLflow row each generation. After each, the memory of the
+start: crashes, validation, a checkpoint and an MLflow row each generation. After each, the memory of the
 command and of all that it started (Ray's processes and the workers) is added up as the kernel shares it out (PSS), so
 that what lies in shared memory counts once.
 
@@ -63,9 +63,8 @@ def memory(pid: int) -> int:
 def soak(generations: int, workers: int) -> dict[str, list[int]]:
     """Bytes after each generation: of the command (`own`), and of all that it started (`started`)."""
     champion = load_champion(Path(__file__).with_name("champion.npz"))
-    settings = EvolveSettings(
-        policy=champion.policy, population=32, elites=4, parents=16, generations=generations, until=2.0
-    )
+    # Small steps, so that what is evolved goes on driving well.
+    settings = EvolveSettings(policy=champion.policy, population=32, sigma=0.01, generations=generations, until=2.0)
     seen: dict[str, list[int]] = {"own": [], "started": []}
     with tempfile.TemporaryDirectory() as folder:
         maps = Maps(settings.scenario, SimConfig())
@@ -74,7 +73,7 @@ def soak(generations: int, workers: int) -> dict[str, list[int]]:
         # A short validation: all maps are in use at once, and a generation takes a tenth of a second.
         curriculum = this.learning.curriculum
         curriculum.config = dataclasses.replace(
-            curriculum.config, validation=48, first_validation=24, contenders=1, racers=4, race_episodes=8
+            curriculum.config, leader_episodes=4, validation=48, first_validation=24, validation_share=1.0
         )
         curriculum.target = curriculum.config.last_target
         compile_kernels(settings.policy, settings.traffic, settings.command)
