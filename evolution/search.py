@@ -21,8 +21,8 @@ Arrays = dict[str, np.ndarray]
 class SearchConfig:
     """Parameters of a search; `elites` and `mutation_rate` are those of two parents alone."""
 
-    population: int = 128  # members of a generation
-    groups: int = 8  # of members, each of which meets episodes of its own
+    population: int = 256  # members of a generation
+    groups: int = 4  # of members, each of which meets episodes of its own
     tournament: int = 8  # members of a tournament
     sigma: float = 1.0  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
     elites: int = 8  # members that go on unmodified
