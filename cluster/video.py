@@ -29,7 +29,7 @@ from gridsim.simulator import views
 from gridsim.world import LANE
 
 SUFFIXES = (".mp4", ".gif")
-SIZE, FPS, SECONDS = (640, 360), 15, 60.0  # of champion.mp4, which a run waits for: a few seconds of one core
+SIZE, FPS, SECONDS = (640, 360), 15, 20.0  # of champion.mp4, which a run waits for: a second or two of one core
 
 
 class VideoError(Exception):
