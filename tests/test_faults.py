@@ -106,7 +106,10 @@ def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
     maps = Maps(settings.scenario, SimConfig())
     first = Evolution(settings, SerialPool(maps.build), maps)
     asked = first.search.ask()
-    key, seed = asked.key, int(asked.recipes["seed"][4])  # the last has a chunk of its own: it costs five workers, and no more
+    key, seed = (
+        asked.key,
+        int(asked.recipes["seed"][4]),
+    )  # the last has a chunk of its own: it costs five workers, and no more
     found = []
     for workers in (0, 1, 2):
         pool = (

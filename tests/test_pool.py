@@ -329,9 +329,7 @@ def test_states_before_the_end_are_those_of_the_one_who_drove_there() -> None:
 def test_a_member_is_told_by_its_recipe() -> None:
     recipes = make_recipes(9)
     recipes["kind"][8] = Kind.MIRRORED
-    told = [
-        identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes[k : k + 1].tobytes()) for k in (1, 7, 8)
-    ]
+    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes[k : k + 1].tobytes()) for k in (1, 7, 8)]
     assert told == [
         "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
         "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",
