@@ -190,9 +190,9 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     for _ in range(after):
         go_on(evolution)
     if after == 2:  # one in each stage
-        first = np.random.default_rng(1).normal(size=(2, GENES)).astype(np.float32)
-        evolution.trials.first, evolution.trials.last = first[:1], first[1:]
-    told = {}
+        tried = np.random.default_rng(1).normal(size=(2, GENES)).astype(np.float32)
+        evolution.trials.first, evolution.trials.last = tried[:1], tried[1:]
+    told: dict[str, np.ndarray] = {}
     tell, evolution.search.tell = evolution.search.tell, lambda score: told.update(score=score)
     pool = evolution.pool = Watching(maps.build)
     curriculum, config, leader = evolution.curriculum, evolution.curriculum.config, evolution.search.leader()

@@ -109,7 +109,7 @@ def test_finished_runs_are_never_trained_again(tmp_path):
 def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, traffic):
     roads = ("highway", "city") if traffic else PLAN.scenarios
     plan = dataclasses.replace(PLAN, scenarios=roads, observation=observation, traffic=traffic, learners=LEARNERS)
-    specs = {}
+    specs: dict[str, set[PolicySpec]] = {}
     for cell in plan.cells(tmp_path):
         settings = settings_of(cell)
         settings.check()

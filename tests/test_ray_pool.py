@@ -86,13 +86,13 @@ class Inspecting(Answering):
     """Tells of its process: modules that should not be there, writable inputs, the time that SIGINT is ignored."""
 
     def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
-        results, *others = super().evaluate(task, maps, recipes)
+        results, rewound, worlds, seconds = super().evaluate(task, maps, recipes)
         arrays = [task.parents, task.episodes, recipes, *(m.road.field for m in maps)]
         results["distance"] = sum(name in sys.modules for name in BANNED)
         results["paced"] = sum(array.flags.writeable or not array.flags.aligned for array in arrays)
         results["end"] = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         results["steps"] = os.environ.get("OMP_NUM_THREADS") == "1"
-        return (results, *others)
+        return results, rewound, worlds, seconds
 
 
 class Unfit(Answering):
@@ -529,9 +529,9 @@ class Stepping(Answering):
     """Three steps an episode."""
 
     def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
-        results, *others = super().evaluate(task, maps, recipes)
+        results, rewound, worlds, seconds = super().evaluate(task, maps, recipes)
         results["steps"] = 3
-        return (results, *others)
+        return results, rewound, worlds, seconds
 
 
 def test_a_cluster_that_wants_a_token(

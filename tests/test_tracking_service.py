@@ -24,7 +24,7 @@ pytestmark = pytest.mark.e2e
 
 GENERATIONS = 12
 ROAD = ["--scenario", "curved", "--traffic", "2"]
-SMALL = [*ROAD, "--population", "48", "--generations", str(GENERATIONS), "--seed", "5", "--elites", "4", "--until", "2"]
+SMALL = [*ROAD, "--population", "48", "--generations", str(GENERATIONS), "--seed", "5", "--until", "2"]
 COMMAND = "gridsim-evolve"
 
 
