@@ -190,8 +190,8 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     for _ in range(after):
         go_on(evolution)
     if after == 2:  # one in each stage
-        tried = np.random.default_rng(1).normal(size=(2, GENES)).astype(np.float32)
-        evolution.trials.first, evolution.trials.last = tried[:1], tried[1:]
+        two = np.random.default_rng(1).normal(size=(2, GENES)).astype(np.float32)
+        evolution.trials.first, evolution.trials.last = two[:1], two[1:]
     told: dict[str, np.ndarray] = {}
     tell, evolution.search.tell = evolution.search.tell, lambda score: told.update(score=score)
     pool = evolution.pool = Watching(maps.build)
