@@ -24,7 +24,8 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, 
     settings = {"scenario": scenario, "seed": seed, "traffic": traffic, "observation": "rays", "population": 512}
     config = {"command": "gridsim-dqn" if learner == "dqn" else "gridsim-evolve", "settings": settings}
     if learner != "dqn":
-        settings["search"] = learner
+        settings["search"] = "random" if learner == "random" else "evolution"
+        settings["recombination"] = "two" if learner == "two-parents" else "all"
     summary = {
         "scenario": scenario, "seed": seed, "car_steps": 5000, "wall_s": 12.5, "champion_generation": 1,
         "champion_sha256": champion.sha256, "held_out": HELD_OUT, **more,

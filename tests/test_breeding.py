@@ -1,31 +1,37 @@
 """Children from recipes: what is inherited, what is changed, and that a recipe is its child."""
 
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evolution.breeding import FRESH, RECIPE, Mutation, breed
+from evolution.breeding import QUANTILES, RECIPE, Kind, Mutation, breed, moments
 from evolution.policy import PolicySpec, gene_scales
 
 F = np.float32
-SPEC = PolicySpec.parse("mlp:6,7")
-STILL = Mutation(rate=0.0, sigma=0.0, bump_rate=0.0)
-RAYS = SPEC.inputs - 1
-UNITS = SPEC.hidden[0]
+SPEC, CNN = PolicySpec.parse("mlp:6,7"), PolicySpec.parse("cnn:8,8,16@1")
+STILL = Mutation(rate=0.0, sigma=0.0)
+NOBODY = np.zeros((0, SPEC.size), dtype=F)
+KEYS = [0, 1, 2**31, 2**32, 2**53, 2**53 + 1, 2**63 - 1]
 
 
 def recipes(*rows):
     return np.array(list(rows), dtype=RECIPE)
 
 
-def many(a, b, n, first_seed=1):
+def many(kind, a, b, n, first_seed=0):
     made = np.zeros(n, dtype=RECIPE)
-    made["a"], made["b"], made["seed"] = a, b, np.arange(first_seed, first_seed + n)
+    made["kind"], made["a"], made["b"], made["seed"] = kind, a, b, np.arange(first_seed, first_seed + n)
     return made
+
+
+def everything():
+    """Children of every kind."""
+    return np.concatenate([
+        many(Kind.CROSS, 1, 2, 12), many(Kind.NEW, 0, 0, 4), many(Kind.STEP, 3, 4, 5), many(Kind.MIRRORED, 3, 4, 5),
+        many(Kind.COPY, 0, 0, 2),
+    ])  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -33,44 +39,136 @@ def parents():
     return np.random.default_rng(0).normal(size=(5, SPEC.size)).astype(F)
 
 
+def is_normal(noise):
+    """Whether numbers may be of N(0, 1), by Kolmogorov and Smirnov; one of 4,096 levels is as near as they come."""
+    distance = stats.kstest(np.ravel(noise), "norm").statistic
+    return distance < 1.95 / np.sqrt(np.size(noise)) + 1.0 / len(QUANTILES)
+
+
 # --- What stays as it was --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "mutation",
-    [
-        STILL,
-        Mutation(rate=0.5, sigma=0.0, bump_rate=1.0),  # sigma 0 is the height of noise and bumps
-        Mutation(rate=0.0, sigma=2.0, bump_rate=0.0),
-    ],
-)
-def test_without_mutation_a_child_of_one_parent_is_that_parent(parents, mutation):
-    children = breed(parents, many(3, 3, 50), 123, SPEC, mutation)
-    assert all(child.tobytes() == parents[3].tobytes() for child in children)
-
-
-def test_a_copy_is_bit_identical_whatever_is_mutated(parents):
+def test_a_copy_is_bit_identical(parents):
     odd = parents.copy()
     odd[2, :4] = [-0.0, np.inf, 1e-42, -np.inf]
     odd[2, 4] = np.array([0x7FC12345], dtype=np.uint32).view(F)[0]  # a not-a-number of its own
-    children = breed(odd, recipes((2, 2, 0), (0, 0, 0), (2, 2, 0)), 9, SPEC, Mutation(rate=1.0, bump_rate=1.0))
+    children = breed(odd, recipes((0, 2, 1, 0), (0, 0, 2, 9), (0, 2, 2, 7)), 9, SPEC, Mutation(rate=1.0))
     assert children[0].tobytes() == children[2].tobytes() == odd[2].tobytes()
     assert children[1].tobytes() == odd[0].tobytes()
 
 
+def test_without_mutation_a_child_of_one_parent_twice_is_that_parent(parents):
+    for mutation in (STILL, Mutation(rate=0.5, sigma=0.0), Mutation(rate=0.0, sigma=2.0)):
+        children = breed(parents, many(Kind.CROSS, 3, 3, 50), 123, SPEC, mutation)
+        assert all(child.tobytes() == parents[3].tobytes() for child in children)
+
+
 def test_parents_and_recipes_are_left_alone(parents):
-    before, made = parents.copy(), many(0, 1, 20)
+    before, made = parents.copy(), everything()
     kept = made.copy()
     breed(parents, made, 5, SPEC, Mutation(rate=1.0))
     assert parents.tobytes() == before.tobytes()
     assert made.tobytes() == kept.tobytes()
 
 
+# --- New genomes -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spec", [SPEC, CNN, PolicySpec.parse("mlp:3+motion")], ids=str)
+def test_new_genomes_are_normal_and_as_large_as_genes_are(spec):
+    nobody, n = np.zeros((0, spec.size), dtype=F), 600
+    children = breed(nobody, many(Kind.NEW, 0, 0, n), 1, spec, Mutation()).astype(float)
+    assert len({child.tobytes() for child in children}) == n
+    noise = children / gene_scales(spec)
+    for part in np.array_split(np.arange(spec.size), 8):
+        assert noise[:, part].mean() == pytest.approx(0.0, abs=5.0 / np.sqrt(n * len(part)))
+        assert noise[:, part].std() == pytest.approx(1.0, abs=4.0 / np.sqrt(n * len(part)))
+    assert is_normal(noise[:, :: max(spec.size // 100, 1)])
+
+
+def test_quantiles_are_of_a_standard_normal():
+    assert QUANTILES.shape == (4096,)
+    assert (np.diff(QUANTILES) > 0).all()
+    assert QUANTILES.tobytes() == (-QUANTILES[::-1]).tobytes()
+    assert QUANTILES.astype(float).std() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_neighbouring_genes_seeds_and_keys_have_noise_of_their_own():
+    noise = breed(NOBODY, many(Kind.NEW, 0, 0, 2000), 3, SPEC, Mutation()).astype(float)
+    other = breed(NOBODY, many(Kind.NEW, 0, 0, 2000), 4, SPEC, Mutation()).astype(float)
+    for gap in range(1, 9):  # four numbers are drawn at a time
+        assert abs((noise[:, gap:] * noise[:, :-gap]).mean()) < 5.0 / np.sqrt(noise.size)
+    assert abs((noise[1:] * noise[:-1]).mean()) < 5.0 / np.sqrt(noise.size)
+    assert abs((noise * other).mean()) < 5.0 / np.sqrt(noise.size)
+
+
+# --- Steps from a centre ---------------------------------------------------------------------------------------------
+
+
+def around(rng, spec=SPEC):
+    """A centre, and steps of very different sizes."""
+    return np.stack([rng.normal(size=spec.size), 10.0 ** rng.uniform(-3, 2, spec.size)]).astype(F)
+
+
+@pytest.mark.parametrize("spec", [SPEC, CNN], ids=str)
+def test_a_step_and_its_mirror_image_lie_about_the_centre(spec):
+    parents = around(np.random.default_rng(1), spec)
+    steps, mirrored = (breed(parents, many(kind, 0, 1, 40), 77, spec, STILL) for kind in (Kind.STEP, Kind.MIRRORED))
+    middle, twice = steps.astype(float) + mirrored.astype(float), 2.0 * parents[0].astype(float)
+    size = np.abs(steps) + np.abs(mirrored) + np.abs(twice)
+    assert (np.abs(middle - twice) <= np.finfo(F).eps * size).all()
+    about_zero = np.stack([np.zeros(spec.size), parents[1]]).astype(F)
+    plus, minus = (breed(about_zero, many(kind, 0, 1, 40), 77, spec, STILL) for kind in (Kind.STEP, Kind.MIRRORED))
+    assert plus.tobytes() == (-minus).tobytes()
+
+
+def test_steps_are_normal_and_as_large_as_the_row_of_steps():
+    parents = around(np.random.default_rng(2))
+    children = breed(parents, many(Kind.STEP, 0, 1, 3000), 4, SPEC, STILL).astype(float)
+    noise = (children - parents[0].astype(float)) / parents[1].astype(float)
+    assert np.abs(noise.mean(axis=0)).max() < 5.0 / np.sqrt(3000)
+    assert np.abs(noise.std(axis=0) - 1.0).max() < 5.0 / np.sqrt(2 * 3000)
+    wide = np.flatnonzero(parents[1] > 1e-2)  # the others' noise is rounded beside the centre
+    assert is_normal(noise[:, wide][:, ::5])
+
+
+def test_a_step_of_size_0_stays_at_the_centre(parents):
+    still = np.stack([parents[0], np.zeros(SPEC.size, dtype=F)])
+    children = breed(still, recipes((2, 0, 1, 3), (3, 0, 1, 3)), 1, SPEC, Mutation())
+    assert (children == parents[0]).all()
+
+
+def test_a_step_does_not_know_mutation():
+    parents = around(np.random.default_rng(3))
+    children = [breed(parents, many(Kind.STEP, 0, 1, 9), 4, SPEC, m).tobytes() for m in (STILL, Mutation(1.0, 9.0))]
+    assert children[0] == children[1]
+
+
+@pytest.mark.parametrize("genes", [SPEC.size, 49, 8, 6, 3])  # whole blocks of four numbers, and not
+def test_moments_are_sums_over_the_noise_of_steps(genes):
+    """The noise is that of a child of a zero centre with unit steps."""
+    unit = np.stack([np.zeros(SPEC.size), np.ones(SPEC.size)]).astype(F)
+    rng = np.random.default_rng(4)
+    weights, squares, made = rng.normal(size=30), rng.random(30), many(Kind.STEP, 0, 1, 30)
+    weights[[3, 5]], squares[[3, 7]] = 0.0, 0.0
+    made["seed"] = rng.integers(1 << 32, size=30)
+    z = breed(unit, made, 99, SPEC, STILL).astype(float)[:, :genes]
+    first, second = moments(made["seed"], weights, squares, 99, genes)
+    np.testing.assert_allclose(first, weights @ z, atol=3e-5)
+    np.testing.assert_allclose(second, squares @ z**2, rtol=1e-5)
+
+
+def test_moments_of_nobody_are_0():
+    first, second = moments(np.zeros(0, dtype=int), np.zeros(0), np.zeros(0), 1, 9)
+    assert (first == 0.0).all()
+    assert (second == 0.0).all()
+
+
 # --- Crossover -------------------------------------------------------------------------------------------------------
 
 
 def test_a_child_of_two_has_each_gene_of_one_of_both(parents):
-    children = breed(parents, many(1, 4, 2000), 77, SPEC, STILL)
+    children = breed(parents, many(Kind.CROSS, 1, 4, 2000), 77, SPEC, STILL)
     from_a, from_b = children == parents[1], children == parents[4]
     assert (from_a ^ from_b).all()
     share = from_b.mean()
@@ -89,122 +187,38 @@ def test_a_child_of_two_has_each_gene_of_one_of_both(parents):
 @pytest.mark.parametrize(("rate", "sigma"), [(0.03, 0.5), (0.2, 2.0), (1.0, 1.0)])
 def test_mutation_is_gaussian_at_its_rate(rate, sigma):
     zero = np.zeros((1, SPEC.size), dtype=F)
-    children = breed(zero, many(0, 0, 2000), 4, SPEC, Mutation(rate=rate, sigma=sigma, bump_rate=0.0))
+    children = breed(zero, many(Kind.CROSS, 0, 0, 2000), 4, SPEC, Mutation(rate=rate, sigma=sigma))
     changed = children != 0.0
     n = changed.size
     assert abs(changed.mean() - rate) < 4 * np.sqrt(rate * (1 - rate) / n) + 1e-6
     assert np.abs(changed.mean(axis=0) - rate).max() < 5 * np.sqrt(rate * (1 - rate) / 2000) + 1e-6
-    noise = children[changed][:20_000].astype(float)
-    assert stats.kstest(noise / sigma, "norm").pvalue > 1e-3
-
-
-def test_mutation_adds_to_the_crossed_gene(parents):
-    children = breed(parents, many(0, 1, 500), 4, SPEC, Mutation(rate=0.1, sigma=1e-3, bump_rate=0.0))
-    away = np.minimum(np.abs(children - parents[0]), np.abs(children - parents[1]))
-    assert away.max() < 6e-3
-    assert 0.08 < (away > 0).mean() < 0.12
-
-
-def test_a_bump_is_smooth_over_neighbouring_rays_of_one_unit():
-    zero = np.zeros((1, SPEC.size), dtype=F)
-    mutation = Mutation(rate=0.0, sigma=0.5, bump_rate=0.3, bump_width=4.0)
-    children = breed(zero, many(0, 0, 4000), 8, SPEC, mutation).astype(float)
-    bumped = (children != 0).any(axis=1)
-    assert abs(bumped.mean() - 0.3) < 4 * np.sqrt(0.3 * 0.7 / 4000)
-    assert (children[:, RAYS * UNITS :] == 0).all()  # neither the speed's weights, nor biases, nor later layers
-    first = children[bumped, : RAYS * UNITS].reshape(-1, RAYS, UNITS)
-    units = (first != 0).any(axis=1)
-    assert (units.sum(axis=1) == 1).all()
-    assert units.sum(axis=0).min() > 0.5 * bumped.sum() / UNITS
-    profiles = first[np.arange(len(first)), :, units.argmax(axis=1)]
-    heights, widths = [], []
-    for profile in profiles:
-        size = np.abs(profile)
-        assert (np.sign(profile[size > 1e-9]) == np.sign(profile[size.argmax()])).all()
-        # A Gaussian's logarithm is a parabola: its second difference is -1 / width^2 everywhere.
-        clear = np.flatnonzero(size > 1e-6 * size.max())
-        if len(clear) >= 3 and size.max() > 1e-3:
-            bend = np.diff(np.log(size[clear]), 2)
-            assert np.ptp(bend) < 0.01 * np.abs(bend).max() + 2e-3
-            widths.append(1 / np.sqrt(-bend.mean()))
-        heights.append(profile[size.argmax()])
-    assert 0.65 < min(widths) < 1.2
-    assert 3.5 < max(widths) < 4.1
-    assert abs(np.mean(heights)) < 0.1
-    assert 0.4 < np.std(heights) < 0.55
-
-
-# --- New genomes -----------------------------------------------------------------------------------------------------
-
-
-def test_new_genomes():
-    nobody = np.zeros((0, SPEC.size), dtype=F)
-    children = breed(nobody, many(FRESH, FRESH, 3000), 1, SPEC, Mutation()).astype(float)
-    assert np.isfinite(children).all()
-    assert len({child.tobytes() for child in children}) == 3000
-    first = children[:, : RAYS * UNITS].reshape(-1, RAYS, UNITS)
-    # Smooth across rays: neighbours are alike, rays far apart are not.
-    near = np.corrcoef(first[:, 10].ravel(), first[:, 11].ravel())[0, 1]
-    far = np.corrcoef(first[:, 3].ravel(), first[:, 27].ravel())[0, 1]
-    assert near > 0.85
-    assert abs(far) < 0.3
-    assert np.abs(first.mean(axis=(0, 2))).max() < 0.05
-    # The second layer's genes are normal with variance 1 / inputs.
-    at = (SPEC.inputs + 1) * UNITS
-    second = children[:, at : at + (UNITS + 1) * SPEC.hidden[1]]
-    assert stats.kstest(second.ravel()[:20_000] * np.sqrt(UNITS), "norm").pvalue > 1e-3
-
-
-def test_new_genomes_grow_with_their_scale():
-    nobody = np.zeros((0, SPEC.size), dtype=F)
-    one, two = (
-        breed(nobody, many(FRESH, FRESH, 50), 1, SPEC, Mutation(first_scale=scale)).astype(float)
-        for scale in (1.0, 2.0)
-    )
-    assert two == pytest.approx(2 * one, rel=1e-4, abs=1e-6)
-
-
-# --- Convolutional networks ------------------------------------------------------------------------------------------
-
-CNN = PolicySpec.parse("cnn:8,8,16@1")
-EDGES = np.cumsum([0, *((n + 1) * m for n, m in CNN.shapes())])
-
-
-def test_new_convolutional_genomes_are_as_large_as_genes_are():
-    children = breed(np.zeros((0, CNN.size), dtype=F), many(FRESH, FRESH, 300), 1, CNN, Mutation()).astype(float)
-    assert len({child.tobytes() for child in children}) == 300
-    scaled = children / gene_scales(CNN)
-    for first, last in itertools.pairwise(EDGES):
-        assert scaled[:, first:last].mean() == pytest.approx(0.0, abs=0.05)
-        assert scaled[:, first:last].std() == pytest.approx(1.0, abs=0.05)
-    assert stats.kstest(scaled[:, ::20].ravel(), "norm").pvalue > 1e-3
+    assert is_normal(children[changed][:20_000].astype(float) / sigma)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 2.0])
 def test_a_mutation_is_as_large_as_its_gene(sigma):
     zero = np.zeros((1, CNN.size), dtype=F)
-    children = breed(zero, many(0, 0, 200), 4, CNN, Mutation(rate=0.2, sigma=sigma, bump_rate=0.0)).astype(float)
+    children = breed(zero, many(Kind.CROSS, 0, 0, 200), 4, CNN, Mutation(rate=0.2, sigma=sigma)).astype(float)
     changed = children != 0
     assert changed.mean() == pytest.approx(0.2, abs=0.01)
-    noise = (children / gene_scales(CNN))[changed]
-    assert stats.kstest(noise[:20_000] / sigma, "norm").pvalue > 1e-3
+    assert is_normal((children / gene_scales(CNN))[changed][::31] / sigma)
 
 
-def test_bumps_are_for_rays_alone():
-    zero = np.zeros((1, CNN.size), dtype=F)
-    assert (breed(zero, many(0, 0, 50), 8, CNN, Mutation(rate=0.0, bump_rate=1.0)) == 0.0).all()
+def test_mutation_adds_to_the_crossed_gene(parents):
+    children = breed(parents, many(Kind.CROSS, 0, 1, 500), 4, SPEC, Mutation(rate=0.1, sigma=1e-3))
+    away = np.minimum(np.abs(children - parents[0]), np.abs(children - parents[1]))
+    assert away.max() < 6e-3
+    assert 0.08 < (away > 0).mean() < 0.12
 
 
-def test_convolutional_children_are_their_recipes():
-    parents = np.random.default_rng(5).normal(size=(4, CNN.size)).astype(F)
-    made = np.concatenate([many(1, 2, 6), many(FRESH, FRESH, 3), recipes((0, 0, 0), (3, 3, 7))])
-    whole = breed(parents, made, 11, CNN, Mutation(bump_rate=0.5))
-    assert whole[9].tobytes() == parents[0].tobytes()
-    for chosen in ([3], [10, 0, 7], [8, 8, 2]):
-        assert breed(parents, made[chosen], 11, CNN, Mutation(bump_rate=0.5)).tobytes() == whole[chosen].tobytes()
-    still = breed(parents, many(1, 2, 200), 3, CNN, STILL)
-    assert ((still == parents[1]) | (still == parents[2])).all()
-    assert (still == parents[2]).mean() == pytest.approx(0.5, abs=0.01)
+def test_mutation_and_inheritance_are_independent(parents):
+    two = np.stack([np.full(SPEC.size, -100.0), np.full(SPEC.size, 100.0)]).astype(F)
+    children = breed(two, many(Kind.CROSS, 0, 1, 2000), 5, SPEC, Mutation(rate=0.5, sigma=1.0)).astype(float)
+    inherited = children > 0
+    noise = children - np.where(inherited, 100.0, -100.0)
+    mutated = np.abs(noise) > 1e-4
+    assert mutated[inherited].mean() == pytest.approx(mutated[~inherited].mean(), abs=0.01)
+    assert noise[inherited & mutated].mean() == pytest.approx(0.0, abs=0.02)
 
 
 # --- A recipe is its child -------------------------------------------------------------------------------------------
@@ -212,50 +226,73 @@ def test_convolutional_children_are_their_recipes():
 
 @settings(max_examples=30, derandomize=True)
 @given(data=st.data())
-def test_the_same_recipe_is_the_same_child_in_any_chunk(parents, data):
-    made = np.concatenate([many(1, 2, 12), many(FRESH, FRESH, 4), recipes((0, 0, 0), (3, 3, 7))])
+def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data):
+    made = everything()
     key = data.draw(st.integers(0, 2**63 - 1))
-    mutation = Mutation(rate=0.1, bump_rate=0.5)
-    whole = breed(parents, made, key, SPEC, mutation)
+    whole = breed(parents, made, key, SPEC, Mutation(rate=0.1))
     chosen = data.draw(st.lists(st.integers(0, len(made) - 1), min_size=1, max_size=20))
-    assert breed(parents, made[chosen], key, SPEC, mutation).tobytes() == whole[chosen].tobytes()
+    assert breed(parents, made[chosen], key, SPEC, Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()
 
 
-def test_key_and_seed_make_the_child(parents):
-    mutation = Mutation(rate=0.5)
-    made = recipes((0, 1, 1), (0, 1, 2), (0, 1, 1), (FRESH, FRESH, 1), (FRESH, FRESH, 2))
-    one, other = breed(parents, made, 1, SPEC, mutation), breed(parents, made, 2, SPEC, mutation)
+def test_convolutional_children_are_their_recipes():
+    parents = np.random.default_rng(5).normal(size=(5, CNN.size)).astype(F)
+    made = everything()
+    whole = breed(parents, made, 11, CNN, Mutation())
+    assert whole[-1].tobytes() == parents[0].tobytes()
+    for chosen in ([3], [26, 0, 17], [21, 21, 2], [12, 16]):
+        assert breed(parents, made[chosen], 11, CNN, Mutation()).tobytes() == whole[chosen].tobytes()
+
+
+@pytest.mark.parametrize("kind", [Kind.NEW, Kind.STEP, Kind.MIRRORED, Kind.CROSS])
+def test_key_and_seed_make_the_child(parents, kind):
+    made = many(kind, 0, 1, 3)
+    made["seed"] = [1, 2, 1]
+    one, other = (breed(parents, made, key, SPEC, Mutation(rate=0.5)) for key in (1, 2))
     assert one[0].tobytes() == one[2].tobytes()
     assert one[0].tobytes() != one[1].tobytes()
-    assert one[3].tobytes() != one[4].tobytes()
     assert all(a.tobytes() != b.tobytes() for a, b in zip(one, other, strict=True))
-    assert breed(parents, made, 1, SPEC, mutation).tobytes() == one.tobytes()
+    assert breed(parents, made, 1, SPEC, Mutation(rate=0.5)).tobytes() == one.tobytes()
 
 
-def test_keys_of_63_bits_are_told_apart(parents):
-    keys = [0, 1, 2**31, 2**32, 2**53, 2**53 + 1, 2**63 - 1]
-    children = [breed(parents, many(0, 0, 1), key, SPEC, Mutation(rate=1.0)).tobytes() for key in keys]
-    assert len(set(children)) == len(keys)
+@pytest.mark.parametrize("kind", [Kind.NEW, Kind.STEP, Kind.CROSS])
+def test_keys_of_63_bits_are_told_apart(parents, kind):
+    children = [breed(parents, many(kind, 0, 1, 1), key, SPEC, Mutation(rate=1.0)).tobytes() for key in KEYS]
+    assert len(set(children)) == len(KEYS)
+    assert len({moments(np.zeros(1), np.ones(1), np.ones(1), key, 40)[0].tobytes() for key in KEYS}) == len(KEYS)
+
+
+def test_seeds_of_32_bits_are_told_apart(parents):
+    made = many(Kind.NEW, 0, 0, 5)
+    made["seed"] = [0, 1, 1 << 16, 1 << 31, (1 << 32) - 1]
+    assert len({child.tobytes() for child in breed(parents, made, 1, SPEC, STILL)}) == 5
 
 
 # --- Wrong use -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("row", [(5, 0, 1), (0, 5, 1), (5, 5, 0), (65_534, 0, 1)])
+@pytest.mark.parametrize("row", [(4, 5, 0, 1), (2, 0, 5, 1), (0, 5, 5, 0), (3, 65_534, 0, 1), (1, 5, 0, 1)])
 def test_a_parent_that_is_not_there_is_refused(parents, row):
-    with pytest.raises(ValueError, match="parent"):
-        breed(parents, recipes((0, 0, 1), row), 1, SPEC, STILL)
+    with pytest.raises(ValueError, match="beyond the 5 there are"):
+        breed(parents, recipes((0, 0, 0, 1), row), 1, SPEC, STILL)
+
+
+@pytest.mark.parametrize("kind", [Kind.COPY, Kind.STEP, Kind.MIRRORED, Kind.CROSS])
+def test_without_parents_all_are_new(kind):
+    with pytest.raises(ValueError, match="needs parents"):
+        breed(NOBODY, recipes((1, 0, 0, 1), (kind, 0, 0, 1)), 1, SPEC, STILL)
+    with pytest.raises(ValueError, match="beyond the 0 there are"):
+        breed(NOBODY, recipes((1, 1, 0, 1)), 1, SPEC, STILL)
 
 
 @pytest.mark.parametrize("shape", [(5, SPEC.size - 1), (SPEC.size,), (5, SPEC.size, 1)])
 def test_parents_of_another_shape_are_refused(shape):
     with pytest.raises(ValueError, match="parents of mlp:6,7"):
-        breed(np.zeros(shape, dtype=F), recipes((0, 0, 1)), 1, SPEC, STILL)
+        breed(np.zeros(shape, dtype=F), recipes((0, 0, 0, 1)), 1, SPEC, STILL)
 
 
 def test_no_recipes_no_children(parents):
     assert breed(parents, recipes(), 1, SPEC, STILL).shape == (0, SPEC.size)
 
 
-def test_a_recipe_is_eight_bytes():
-    assert RECIPE.itemsize == 8
+def test_a_recipe_is_nine_bytes():
+    assert RECIPE.itemsize == 9

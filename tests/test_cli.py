@@ -1,11 +1,13 @@
 """The commands as a user runs them: installed scripts, real Ray workers, real kills."""
 
+import dataclasses
 import json
 import os
 import re
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -14,9 +16,14 @@ import numpy as np
 import pytest
 from commands import BIN, descendants, finish, rows, start, summary, wait_until
 
+from cluster.checkpoint import save
+from cluster.cli import REMOVED, EvolveFlags, evolve_main
+from cluster.run import RunFolder
+from cluster.settings import EvolveSettings
+
 # Of all maps these are built fastest.
 ROAD = ["--scenario", "curved", "--traffic", "2"]
-SMALL = [*ROAD, "--population", "48", "--generations", "6", "--seed", "5", "--elites", "4"]
+SMALL = [*ROAD, "--population", "48", "--generations", "6", "--seed", "5"]
 
 
 def evolve(*arguments, cwd, **env):
@@ -41,7 +48,7 @@ def test_champion_is_the_same_for_any_number_of_workers(reference, tmp_path, wor
     assert done.stderr == ""  # no warning of Ray's or MLflow's reaches the user
     assert summary(tmp_path / "runs/w")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
     for mine, theirs in zip(rows(tmp_path / "runs/w"), rows(reference / "runs/ref"), strict=True):
-        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "race/success_rate"):
+        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
             assert mine[name] == theirs[name]
 
 
@@ -148,19 +155,8 @@ def test_config_repeats_and_init_continues(reference, tmp_path):
     assert done.returncode == 0, done.stderr
     assert summary(tmp_path / "runs/again")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
     champion = reference / "runs/ref/champion.npz"
-    arguments = [
-        "--workers",
-        "0",
-        *ROAD,
-        "--population",
-        "24",
-        "--generations",
-        "1",
-        "--sigma",
-        "0",
-        "--bump-rate",
-        "0",
-    ]
+    arguments = ["--workers", "0", *ROAD, "--population", "24", "--generations", "1"]
+    arguments += ["--recombination", "two", "--mutation-rate", "0"]
     done = evolve(*arguments, "--init", str(champion), "--name", "warm", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     # Without mutation every member is the one it started from.
@@ -175,7 +171,10 @@ WRONG = {
     "unknown scenario": (["--scenario", "moon"], "unknown scenario"),
     "unknown flag": (["--frobnicate"], "frobnicate"),
     "not a number": (["--population", "many"], "--population"),
-    "population below elites": (["--population", "8", "--elites", "8"], "larger than"),
+    "population below elites": (["--recombination", "two", "--population", "8"], "--elites must be"),
+    "elites of one centre": (["--elites", "4"], "--recombination two"),
+    "other recombination": (["--recombination", "three"], "--recombination"),
+    "islands, which are no more": (["--islands=4"], "--recombination all"),
     "negative workers": (["--workers", "-1"], "--workers"),
     "no patience": (["--patience", "-1"], "--patience must be 0 or more"),
     "output that cannot be written": (["--output", "/proc/nowhere"], "--output"),
@@ -209,6 +208,90 @@ def test_wrong_use_is_one_clear_line(name, tmp_path):
     assert done.stdout == ""
     assert time.monotonic() - began < 30
     assert list(tmp_path.iterdir()) == []  # nothing half-written
+
+
+def said_by(monkeypatch, capsys, *arguments):
+    """What gridsim-evolve says on its standard error where it refuses to begin."""
+    monkeypatch.setattr(sys, "argv", ["gridsim-evolve", *arguments, "--workers", "0"])
+    with pytest.raises(SystemExit) as ended:
+        evolve_main()
+    assert ended.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("gridsim-evolve: error: ")
+    return err.splitlines()
+
+
+INSTEAD = {
+    "islands": "--recombination all",
+    "island-car-steps": "--car-steps",
+    "parents": "--tournament",
+    "crossover": "--recombination",
+    "bump-rate": "--sigma",
+    "ranking": "fitness",
+}
+
+
+def test_every_flag_that_went_is_known():
+    assert set(REMOVED) == set(INSTEAD)
+    assert not {name.replace("-", "_") for name in REMOVED} & {f.name for f in dataclasses.fields(EvolveFlags)}
+
+
+@pytest.mark.parametrize("form", ["--{} 3", "--{}=3", "--{}", "--{} 3 --help", "--seed 1 --{}=a=b"])
+@pytest.mark.parametrize("flag", INSTEAD)
+def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(flag, form, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for spelling in (flag, flag.replace("-", "_")):
+        (line,) = said_by(monkeypatch, capsys, *form.format(spelling).split())
+        assert line.startswith(f"gridsim-evolve: error: --{flag} is no more: ")
+        assert INSTEAD[flag] in line.split("no more: ")[1]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("value", ["parents", "crossover"])
+def test_a_value_that_is_called_as_a_flag_that_went_is_a_value(value, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    lines = said_by(monkeypatch, capsys, "--name", value, "--population", "3")
+    assert "population must be 4 or more" in lines[0]
+
+
+def old_run(folder):
+    """A run of version 0.1, as it left it."""
+    folder.mkdir()
+    settings = {"scenario": "curved", "population": 512, "parents": 64, "crossover": 0.0, "islands": 4}
+    config = {"format": 1, "command": "gridsim-evolve", "gridsim": "0.1.0", "settings": settings}
+    (folder / "config.json").write_text(json.dumps(config))
+    save(folder / "checkpoint.npz", {"parents0": np.zeros((2, 3), dtype=np.float32)}, {"generation": 7})
+    return folder
+
+
+@pytest.mark.parametrize(("flag", "path"), [("--resume", "old"), ("--config", "old/config.json")])
+def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    folder = old_run(tmp_path / "old")
+    before = {entry.name: entry.read_bytes() for entry in folder.iterdir()}
+    for form in ([flag, path], [f"{flag}={path}"]):
+        (line,) = said_by(monkeypatch, capsys, *form)
+        assert "old/config.json is of a run of GridSim 0.1" in line
+        assert "start a new run" in line
+    assert {entry.name: entry.read_bytes() for entry in folder.iterdir()} == before
+    assert os.listdir(tmp_path) == ["old"]
+
+
+@pytest.mark.parametrize("number", [0, 3, "1", None, True, [1], {}])
+def test_a_config_of_another_format_is_refused_in_one_line(number, monkeypatch, capsys, tmp_path):
+    folder = old_run(tmp_path / "old")
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"format": number}))
+    (line,) = said_by(monkeypatch, capsys, "--resume", str(folder))
+    assert "config.json" in line
+
+
+def test_a_checkpoint_of_the_version_before_is_refused_beside_a_new_config(monkeypatch, capsys, tmp_path):
+    folder = old_run(tmp_path / "old")
+    RunFolder(folder, EvolveSettings("curved")).write_config()
+    (line,) = said_by(monkeypatch, capsys, "--resume", str(folder))
+    assert "do not belong together" in line
 
 
 @pytest.mark.e2e

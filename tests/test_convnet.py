@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evolution import convnet
-from evolution.breeding import FRESH, RECIPE, Mutation, breed
+from evolution.breeding import RECIPE, Kind, Mutation, breed
 from evolution.episodes import lane_starts
 from evolution.policy import CnnSpec, PolicySpec
-from evolution.rollout import Limits, evaluate, rounded, trajectory
-from evolution.tiles import plain_tile, vector_tile
+from evolution.rollout import Limits, evaluate, trajectory
+from evolution.tiles import plain_dense, plain_tile, vector_dense, vector_tile
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.ego import DISTANCE, STEPS, End
 from gridsim.grid import grid_table, grids, push_frames
@@ -52,8 +52,7 @@ def cnn(text):
 
 def new_genomes(spec, n, seed=1):
     recipes = np.zeros(n, dtype=RECIPE)
-    recipes["a"] = recipes["b"] = FRESH
-    recipes["seed"] = np.arange(1, n + 1)
+    recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
     return breed(np.zeros((0, spec.size), dtype=F), recipes, seed, spec, Mutation())
 
 
@@ -122,6 +121,32 @@ def test_vector_code_is_the_plain_tile(positions, lanes, rectify):
     x[4] = math.nan
     compiled(x, w, seen)
     assert np.isnan(seen).any()
+
+
+@pytest.mark.parametrize(("lanes", "chains"), [(64, 1), (16, 2), (8, 4)])
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 4, 5, 31, 32])
+def test_vector_code_is_the_plain_dense_layer(lanes, chains, n):
+    plain, vector = plain_dense(lanes, chains), vector_dense(lanes, chains)
+
+    @numba.njit
+    def compiled(x, n, w, y):
+        vector(x, 3, n, w, 5 + lanes, lanes + 8, 2, y, 6)
+
+    rng = np.random.default_rng(3)
+    x, w = rng.normal(size=40).astype(F), rng.normal(size=5 + lanes + 33 * (lanes + 8)).astype(F)
+    wanted, seen = (np.full(lanes + 13, 7.0, dtype=F) for _ in range(2))
+    plain(x, 3, n, w, 5 + lanes, lanes + 8, 2, wanted, 6)
+    compiled(x, n, w, seen)
+    assert seen == pytest.approx(wanted, abs=2e-5)
+    assert (seen[:6] == 7.0).all()
+    assert (seen[-7:] == 7.0).all()
+    rows = w[5 + lanes :][: n * (lanes + 8)].reshape(n, lanes + 8)[:, :lanes].astype(float)
+    assert seen[6:-7] == pytest.approx(w[2 : 2 + lanes] + x[3 : 3 + n] @ rows, abs=2e-5)
+    for k in range(n):
+        spoilt = x.copy()
+        spoilt[3 + k] = math.nan
+        compiled(spoilt, n, w, seen)
+        assert np.isnan(seen[6:-7]).all()
 
 
 def test_a_gene_that_is_not_a_number_is_no_action():
@@ -202,11 +227,11 @@ def test_a_rollout_is_the_simulator_the_grid_and_the_network(task, text):
             scenario = maps[episode["map"]]
             state = by_hand(spec, genomes[member], scenario, episode["start"], limits, config)
             assert (row["steps"], row["end"]) == (state.cars[0, 11], state.ends[0])
-            assert row["distance"] == rounded(state.cars[0, DISTANCE])
+            assert row["distance"] == state.cars[0, DISTANCE]
     one, states, _ = trajectory(spec, genomes[longest[0]], maps[0], episodes[0]["start"], limits, config)
     assert one == results[longest[0], 0]
     assert len(states) == one["steps"] + 1  # the last is where it ended
-    assert (rounded(states[-1, DISTANCE]), states[-1, STEPS]) == (one["distance"], one["steps"])
+    assert (states[-1, DISTANCE], states[-1, STEPS]) == (one["distance"], one["steps"])
 
 
 @given(data=st.data())
@@ -215,10 +240,12 @@ def test_results_do_not_depend_on_the_chunk(task, data):
     maps, episodes = task
     spec, limits, config = cnn("cnn:8,8,8@2"), Limits(80.0, 100), SimConfig()
     genomes = new_genomes(spec, 12, seed=8)
-    whole, rewound, _ = evaluate(spec, genomes, maps, episodes, limits, config, rewind=8)
+    episodes = episodes.copy()
+    episodes["rewind"] = 8
+    whole, rewound, _ = evaluate(spec, genomes, maps, episodes, limits, config)
     members = data.draw(st.lists(st.integers(0, 11), min_size=1, max_size=5))
     columns = data.draw(st.lists(st.integers(0, 5), min_size=1, max_size=4))
-    part, back, _ = evaluate(spec, genomes[members], maps, episodes[columns], limits, config, rewind=8)
+    part, back, _ = evaluate(spec, genomes[members], maps, episodes[columns], limits, config)
     assert part.tobytes() == whole[np.ix_(members, columns)].tobytes()
     assert back.tobytes() == rewound[np.ix_(members, columns)].tobytes()
 
@@ -227,7 +254,9 @@ def test_a_rewound_state_is_on_the_way(task):
     maps, episodes = task
     spec, limits, config = cnn("cnn:8,8,8@1"), Limits(80.0, 100), SimConfig()
     genomes = new_genomes(spec, 16, seed=9)
-    results, rewound, _ = evaluate(spec, genomes, maps, episodes, limits, config, rewind=10)
+    wanted = episodes.copy()
+    wanted["rewind"] = 10
+    results, rewound, _ = evaluate(spec, genomes, maps, wanted, limits, config)
     member, column = np.unravel_index(results["steps"].argmax(), results.shape)
     steps = int(results["steps"][member, column])
     assert steps > 20

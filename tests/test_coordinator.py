@@ -10,18 +10,23 @@ import pytest
 
 from cluster.checkpoint import CheckpointError, load, save
 from cluster.coordinator import Evolution
-from cluster.learning import Maps
+from cluster.learning import MAX_TRIED, Champion, Maps
 from cluster.pool import PoolError, SerialPool
 from cluster.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
 from cluster.settings import EvolveSettings
-from evolution.breeding import breed
+from evolution.breeding import RECIPE, Kind, breed
 from evolution.curriculum import CrashError
 from evolution.episodes import Episodes
 from evolution.policy import PolicySpec
+from evolution.recombination import Recombination
+from evolution.rollout import targets
+from evolution.two_parents import TwoParents
 from gridsim.config import SimConfig
 from gridsim.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
 
-SETTINGS = EvolveSettings(traffic=3, population=32, generations=2, elites=2, parents=8, seed=9)
+SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
+TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
+RANDOM = dataclasses.replace(SETTINGS, search="random")
 GENES = PolicySpec.parse(SETTINGS.policy).size
 
 CROWD = 6  # cars in training
@@ -38,7 +43,7 @@ def begin(maps, settings=SETTINGS):
     """A run with a short validation."""
     evolution = Evolution(settings, SerialPool(maps.build), maps)
     curriculum = evolution.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4, contenders=2)
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4)
     return evolution
 
 
@@ -49,8 +54,9 @@ def go_on(evolution):
 
 @pytest.fixture(scope="module")
 def halfway(maps, tmp_path_factory):
-    """The file of a run after the first of two generations."""
+    """The file of a run after two of three generations: there is a leader from the second on."""
     evolution = begin(maps)
+    go_on(evolution)
     go_on(evolution)
     path = tmp_path_factory.mktemp("run") / "checkpoint.npz"
     save(path, *evolution.state())
@@ -77,26 +83,62 @@ def test_maps_are_begun_before_they_are_needed():
         maps.close()
 
 
-def test_a_run_among_traffic_goes_on_exactly(maps, halfway):
-    straight = begin(maps)
-    go_on(straight)
-    go_on(straight)
-    resumed = begin(maps)
-    resumed.restore(*load(halfway))
-    go_on(resumed)
-    arrays, meta = straight.state()
-    again, same = resumed.state()
-    assert same == meta
-    for name, array in arrays.items():
-        assert again[name].tobytes() == array.tobytes()
+def state_of(evolution):
+    arrays, meta = evolution.state()
+    return {name: array.tobytes() for name, array in arrays.items()}, meta
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
+def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
+    """From every generation of three, also where somebody is on trial."""
+    straight = begin(maps, settings)
+    for generation in range(3):
+        save(tmp_path / f"{generation}.npz", *straight.state())
+        straight.settings = settings
+        eager(straight)
+        go_on(straight)
+    assert len(straight.trials) or straight.champion  # somebody was tried
+    for generation in range(3):
+        resumed = begin(maps, settings)
+        eager(resumed)
+        resumed.restore(*load(tmp_path / f"{generation}.npz"))
+        assert resumed.generation == generation
+        while resumed.generation < 3:
+            go_on(resumed)
+        assert state_of(resumed) == state_of(straight)
     for run in (straight, resumed):
-        assert run.champion is None  # nobody drives far enough yet to be tried ...
-        run.conclude()  # ... but at the end there is one
+        run.conclude()
+    assert straight.champion is not None
     assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
     assert resumed.champion.score == straight.champion.score
-    latest = {genome.tobytes() for genome in straight.latest()}
-    assert len(latest) == 2
-    assert straight.champion.genome.tobytes() in latest
+
+
+def eager(evolution):
+    """Whoever leads is tried for champion, at once and always."""
+    curriculum = evolution.curriculum
+    curriculum.config = dataclasses.replace(curriculum.config, promising=0.0, latest=1, validation_share=1.0)
+
+
+def test_a_search_is_what_was_asked_for(maps):
+    assert isinstance(begin(maps).search, Recombination)
+    for settings, random in ((TWO, False), (RANDOM, True)):
+        search = begin(maps, settings).search
+        assert isinstance(search, TwoParents)
+        assert search.random == random
+    for settings in (SETTINGS, TWO, RANDOM):
+        evolution = begin(maps, settings)
+        assert evolution.search.config == settings.search_config()
+        assert len(evolution.search.ask().groups) == evolution.curriculum.config.groups == 2
+        assert evolution.search.seed == settings.seed
+
+
+def test_a_run_may_begin_with_a_champion(maps):
+    genome = np.random.default_rng(3).normal(size=GENES).astype(np.float32)
+    for settings in (SETTINGS, TWO):
+        evolution = Evolution(settings, SerialPool(maps.build), maps, genome)
+        go_on(evolution)
+        assert evolution.elites[0].tobytes() == genome.tobytes()
+        assert np.isfinite(list(evolution.history[0].values())).all()
 
 
 def test_what_ends_a_run_does_not_change_how_it_would_have_gone_on(maps, halfway):
@@ -116,13 +158,13 @@ def test_what_ends_a_run_does_not_change_how_it_would_have_gone_on(maps, halfway
 
 def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     arrays, _ = load(halfway)
-    worlds = arrays["crash_worlds0"]
-    assert len(worlds) == len(arrays["crashes0"]) > 0
+    worlds = arrays["crash_worlds"]
+    assert len(worlds) == len(arrays["crashes"]) > 0
     assert worlds.shape[1:] == (CROWD, FIELDS)
     assert (worlds[..., LANE] >= 0).any()
     evolution = begin(maps)
     evolution.restore(*load(halfway))
-    episodes = evolution.curriculum.episodes(1)
+    episodes = evolution.curriculum.episodes(2)
     starts = evolution.curriculum.config.crash_starts
     remembered = {world.tobytes() for world in worlds}
     config = evolution.curriculum.config
@@ -131,60 +173,150 @@ def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     assert len(episodes.worlds) == len(episodes.rows)
 
 
-def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(maps):
-    """Who drives in the first generations, also beside validation, is told the same as somebody who drives alone."""
-    evolution = begin(maps, dataclasses.replace(SETTINGS, population=50))
-    config = evolution.curriculum.config = dataclasses.replace(evolution.curriculum.config, groups=3)
-    for generation in range(2):
-        if generation:  # half as many episodes again, and two are on trial
-            go_on(evolution)
-            evolution.trials.enter(evolution.genetic.parents[:2], 0)
-        episodes = evolution.curriculum.episodes(generation)
-        limits = evolution.curriculum.limits()
-        e = len(episodes.rows) // config.groups
-        assert e == config.starts + generation * config.crash_starts
-        assert len({row.tobytes() for row in episodes.rows}) > 2 * config.groups
-        results, lost = evolution._evaluate_all(episodes, limits)
-        assert results.shape == (50, e)
-        assert not lost.any()
-        for member in (0, 1, 2, 17, 48, 49):
-            g = member % config.groups
-            own = Episodes(episodes.maps, episodes.rows[g * e : g * e + e], episodes.worlds[g * e : g * e + e])
-            alone = evolution.drive("alone", evolution.genetic.genomes(np.array([member])), own, limits)
-            assert alone.results[0].tobytes() == results[member].tobytes()
-        assert len({row.tobytes() for row in results}) > 25
-        evolution.genetic._asked = None
-        assert not len(evolution.trials.first)
+class Watching(SerialPool):
+    """Remembers what it was asked and what came of it."""
+
+    def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
+        outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
+        self.seen = task, recipes, asked, outcome
+        return outcome
 
 
-def test_champions_are_looked_for_every_second_generation(maps):
-    evolution = begin(maps)
-    evolution.curriculum.target = evolution.curriculum.config.validation_target
-    tried = []
-    for _ in range(4):
+@pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(maps, settings, after):
+    """Also with the leader beside them, and two on trial: each is told the same as somebody who drives alone."""
+    evolution = begin(maps, dataclasses.replace(settings, population=50))
+    for _ in range(after):
         go_on(evolution)
-        tried.append(len(evolution.trials.first))
-    assert tried[0] > 0
-    assert tried[2] > 0
-    assert tried[1] == tried[3] == 0
+    if after == 2:  # one in each stage
+        two = np.random.default_rng(1).normal(size=(2, GENES)).astype(np.float32)
+        evolution.trials.first, evolution.trials.last = two[:1], two[1:]
+    told: dict[str, np.ndarray] = {}
+    tell, evolution.search.tell = evolution.search.tell, lambda score: told.update(score=score)
+    pool = evolution.pool = Watching(maps.build)
+    curriculum, config, leader = evolution.curriculum, evolution.curriculum.config, evolution.search.leader()
+    limits, long = curriculum.limits(), curriculum.leader_limits()
+    episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
+    row = evolution.step()
+    task, recipes, _, outcome = pool.seen
+    asked = evolution.search.asked
+    groups, e = asked.groups, len(episodes.rows) // len(asked.groups)
+    assert len(groups) == config.groups == 3
+    assert e == config.starts + (after == 2) * config.crash_starts  # nobody led the first
+    assert len({r.tobytes() for r in episodes.rows}) == len(episodes.rows)
+    genomes = evolution.search.genomes(np.arange(50))
+    score = np.zeros(50)
+    for g, group in enumerate(groups):
+        own = Episodes(episodes.maps, episodes.rows[g * e : g * e + e], episodes.worlds[g * e : g * e + e])
+        alone = evolution.drive("alone", genomes[group], own, limits)
+        assert alone.results.tobytes() == outcome.results[group, g * e : g * e + e].tobytes()
+        score[group] = evolution._score(alone.results, targets(own.rows, limits))
+    assert told["score"].tobytes() == score.tobytes()
+    others = np.ones(len(episodes.rows), dtype=bool)
+    others[:e] = False
+    assert not outcome.results[groups[0], : len(episodes.rows)][:, others]["steps"].any()  # nor anybody else's
+    if leader is None:
+        assert len(recipes) == 50
+        assert evolution.elites[-1].tobytes() == genomes[score.argmax()].tobytes()
+        assert row["fitness/best"] == score.max()
+    else:
+        first = len(episodes.rows)
+        alone = evolution.drive("alone", leader[None], followed, long)
+        led = outcome.results[50, first : first + len(followed.rows)]
+        assert len(led) == config.leader_episodes
+        assert alone.results[0].tobytes() == led.tobytes()
+        assert alone.rewound.tobytes() == outcome.rewound[first : first + len(led)].tobytes()
+        assert alone.worlds.tobytes() == outcome.worlds[first : first + len(led)].tobytes()
+        assert evolution.elites[-1].tobytes() == leader.tobytes()
+        assert row["distance_m/best"] == led["distance"].mean()
+        assert row["fitness/best"] == evolution._score(alone.results, long.target)[0]
+        assert row["fitness/mean"] == score.mean()
+    if after == 2:
+        assert len(recipes) == 53
+        validation = curriculum.validation().within(curriculum.goal_limits())
+        alone = evolution.drive("alone", first_two(task, recipes), validation, curriculum.goal_limits())
+        tried = outcome.results[51:, -config.validation :]
+        assert tried[0, :4].tobytes() == alone.results[0, :4].tobytes()
+        assert tried[1, 4:].tobytes() == alone.results[1, 4:].tobytes()
+        assert not tried[0, 4:]["steps"].any()
+        assert not tried[1, :4]["steps"].any()
+    assert outcome.whole()
+    tell(score)
 
 
-def test_the_parents_mean_is_on_trial_beside_the_best(maps):
+def first_two(task, recipes):
+    """The genomes of the last two members."""
+    return breed(task.parents, recipes[-2:], task.key, PolicySpec.parse(task.policy), task.mutation)
+
+
+def test_who_leads_is_what_the_search_knows(maps):
+    """A generation's elite is the genome that was best known before it."""
     evolution = begin(maps)
     go_on(evolution)
-    go_on(evolution)
-    evolution.curriculum.target = evolution.curriculum.config.validation_target
-    mean = evolution.genetic.mean()
-    go_on(evolution)
-    assert len(evolution.trials.first) == evolution.curriculum.config.contenders == 2
-    assert evolution.trials.first[0].tobytes() == mean[0].tobytes()
-    assert evolution.trials.first[1].tobytes() == evolution.elites[-1].tobytes()
+    for _ in range(2):
+        centre = evolution.search.centre.astype(np.float32)
+        go_on(evolution)
+        assert evolution.elites[-1].tobytes() == centre.tobytes()
+
+
+def test_champions_are_looked_for_when_the_leader_does_well(maps):
+    evolution = begin(maps)
+    config = evolution.curriculum.config
+    evolution.history = [{"leader/success_rate": config.promising}] * config.latest
+    evolution.car_steps = 1000
+    assert evolution._promising()
+    for spoil in (
+        lambda: setattr(evolution, "validation_steps", 251),
+        lambda: evolution.history.append({"leader/success_rate": config.promising - 0.01}),
+        lambda: setattr(evolution, "champion", champion_of_rate(config.promising + 0.1)),
+        lambda: evolution.trials.enter(np.zeros((1, GENES), dtype=np.float32), 0),
+    ):
+        before = evolution.validation_steps, list(evolution.history), evolution.champion
+        spoil()
+        assert not evolution._promising()
+        evolution.validation_steps, evolution.history, evolution.champion = before
+    evolution.trials.first = evolution.trials.first[:0]
+    assert evolution._promising()
+    evolution.history = evolution.history[: config.latest - 1]
+    assert not evolution._promising()  # not in so many generations yet
+
+
+def champion_of_rate(rate):
+    return Champion(np.zeros(GENES, dtype=np.float32), rate, rate, 100.0, 0)
+
+
+def test_validation_takes_no_more_than_its_share(maps):
+    """It waits until what it took is a quarter of all, and one trial more."""
+    evolution = begin(maps)
+    curriculum = evolution.curriculum
+    curriculum.config = dataclasses.replace(curriculum.config, promising=0.0, latest=1, validation_share=0.25)
+    began = []
+    for _ in range(8):
+        share = evolution.validation_steps / max(evolution.car_steps, 1)
+        before = len(evolution.trials.first)
+        go_on(evolution)
+        if len(evolution.trials.first) and not before:
+            began.append(evolution.validation_steps / evolution.car_steps)
+        assert share <= 1.0
+    assert began
+    assert max(began) <= 0.25
+    assert 0 < evolution.validation_steps < evolution.car_steps
+
+
+def test_who_was_tried_is_not_tried_again(maps):
+    evolution = begin(maps)
+    genomes = np.random.default_rng(1).normal(size=(3, GENES)).astype(np.float32)
+    evolution.trials.enter(genomes[[0, 1, 0]], 0)
+    assert len(evolution.trials.first) == 2
+    evolution.trials.enter(genomes, 1)
+    assert evolution.trials.first.tobytes() == genomes[2:].tobytes()
 
 
 def test_training_is_among_more_cars_than_validation(maps):
     """Twice as many as were asked for; champions are chosen, and measured, among those that were."""
     curriculum = begin(maps).curriculum
-    for episodes in (curriculum.episodes(0), curriculum.race(0)):
+    for episodes in (curriculum.episodes(0), curriculum.leader_episodes(0)):
         assert episodes.worlds.shape[1:] == (CROWD, FIELDS)
         assert (episodes.worlds[..., LANE] >= 0).mean() > 0.95
     there = curriculum.validation().worlds[..., LANE] >= 0
@@ -199,7 +331,7 @@ def test_training_is_among_more_cars_than_validation(maps):
 )
 def test_crash_worlds_that_do_not_fit_are_refused(maps, halfway, spoil):
     arrays, meta = load(halfway)
-    arrays["crash_worlds0"] = spoil(arrays["crash_worlds0"])
+    arrays["crash_worlds"] = spoil(arrays["crash_worlds"])
     with pytest.raises(CheckpointError, match="does not belong to this run"):
         begin(maps).restore(arrays, meta)
 
@@ -207,23 +339,23 @@ def test_crash_worlds_that_do_not_fit_are_refused(maps, halfway, spoil):
 @pytest.mark.parametrize(
     ("name", "field", "number"),
     [
-        ("crash_worlds0", LANE, -2.0),
-        ("crash_worlds0", LANE, 0.5),
-        ("crash_worlds0", NEXT, -1.0),
-        ("crash_worlds0", ALONG, -1.0),
-        ("crash_worlds0", SPEED, 1e9),
-        ("crash_worlds0", FIELDS - 1, np.nan),
-        ("crashes0", 0, 16.0),
-        ("crashes0", 0, -1.0),
-        ("crashes0", 0, 0.5),
-        ("crashes0", 1, np.inf),
+        ("crash_worlds", LANE, -2.0),
+        ("crash_worlds", LANE, 0.5),
+        ("crash_worlds", NEXT, -1.0),
+        ("crash_worlds", ALONG, -1.0),
+        ("crash_worlds", SPEED, 1e9),
+        ("crash_worlds", FIELDS - 1, np.nan),
+        ("crashes", 0, 16.0),
+        ("crashes", 0, -1.0),
+        ("crashes", 0, 0.5),
+        ("crashes", 1, np.inf),
     ],
 )
 def test_crashes_on_no_road_are_refused(maps, halfway, name, field, number):
     arrays, meta = load(halfway)
-    there = arrays["crash_worlds0"][..., LANE] >= 0
+    there = arrays["crash_worlds"][..., LANE] >= 0
     arrays[name] = arrays[name].copy()
-    arrays[name][there if name == "crash_worlds0" else ..., field] = number
+    arrays[name][there if name == "crash_worlds" else ..., field] = number
     with pytest.raises(CheckpointError, match="does not belong to this run") as error:
         begin(maps).restore(arrays, meta)
     assert "\n" not in str(error.value)
@@ -232,8 +364,8 @@ def test_crashes_on_no_road_are_refused(maps, halfway, name, field, number):
 @pytest.mark.parametrize(("field", "number"), [(LANE, 1e6), (NEXT, 1e6), (PAST, 1e6), (ALONG, 1e4)])
 def test_a_crash_that_does_not_fit_its_map_is_refused_when_it_is_to_be_driven(maps, halfway, field, number):
     arrays, meta = load(halfway)
-    arrays["crash_worlds0"] = arrays["crash_worlds0"].copy()
-    arrays["crash_worlds0"][arrays["crash_worlds0"][..., LANE] >= 0, field] = number
+    arrays["crash_worlds"] = arrays["crash_worlds"].copy()
+    arrays["crash_worlds"][arrays["crash_worlds"][..., LANE] >= 0, field] = number
     evolution = begin(maps)
     evolution.restore(arrays, meta)
     with pytest.raises(CrashError, match=r"a crash in the checkpoint does not fit map \d+: traffic's ") as error:
@@ -249,20 +381,30 @@ def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("trials_first", lambda a: np.zeros((3, GENES), np.float32)),  # contenders are two
+        ("trials_first", lambda a: np.zeros((MAX_TRIED + 1, GENES), np.float32)),
         ("trials_first", lambda a: np.zeros(GENES, np.float32)),
         ("trials_last", lambda a: np.zeros((2, GENES), np.float32)),
         ("trials_tried", lambda a: np.zeros(257, np.uint64)),
         ("trials_tried", lambda a: np.zeros(2, np.int64)),
-        ("parents0", lambda a: np.zeros((11, GENES), np.float32)),  # 2 elites and 8
-        ("parents0", lambda a: a[:2]),  # elites alone
+        ("search_centre", lambda a: a[:-1]),
+        ("search_centre", lambda a: a.astype(np.float32)),
+        ("search_path", lambda a: np.full(GENES, np.nan)),
+        ("search_variances", lambda a: np.zeros(GENES)),
         ("champion", lambda a: np.zeros(GENES, np.float32)),  # of which nothing is known
+        ("elites", lambda a: np.concatenate([a, a])),
         ("trials", lambda m: [math.inf, 1]),
         ("trials", lambda m: [1]),
         ("generation", lambda m: math.inf),
+        ("generation", lambda m: 1),
         ("car_steps", lambda m: math.inf),
-        ("populations", lambda m: [[3, m[0][1]]]),
-        ("populations", lambda m: [[m[0][0], 5e-324]]),
+        ("search", lambda m: {"sigma": 0.0}),
+        ("search", lambda m: {"sigma": math.nan}),
+        ("search", lambda m: {"sigma": None}),
+        ("search", lambda m: {}),
+        ("search", lambda m: []),
+        ("target", lambda m: 149.0),
+        ("target", lambda m: 1e9),
+        ("target", lambda m: math.nan),
         ("champion", lambda m: [0.5, 0.5, 100.0, 0]),  # of which there are no genes
         ("solved", lambda m: True),  # without a champion
     ],
@@ -276,8 +418,33 @@ def test_states_that_no_run_has_are_refused(maps, halfway, name, change):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("search_parents", np.zeros((67, GENES), np.float32)),  # 2 elites and 64
+        ("search_parents", np.zeros((2, GENES), np.float32)),  # elites alone
+        ("search_parents", np.zeros((66, GENES), np.float64)),
+        ("search", {"elites": 3}),
+        ("search", {"elites": math.inf}),
+    ],
+)
+def test_states_that_no_run_of_two_parents_has_are_refused(maps, name, value):
+    evolution = begin(maps, TWO)
+    go_on(evolution)
+    arrays, meta = evolution.state()
+    begin(maps, TWO).restore(arrays, meta)
+    (arrays if name in arrays else meta)[name] = value
+    with pytest.raises(CheckpointError, match="does not belong to this run"):
+        begin(maps, TWO).restore(arrays, meta)
+
+
+def test_a_state_of_another_search_is_refused(maps, halfway):
+    with pytest.raises(CheckpointError, match="does not belong to this run"):
+        begin(maps, TWO).restore(*load(halfway))
+
+
 def run_folder(halfway, path, **changed):
-    """A run that was stopped after the first of two generations."""
+    """A run that was stopped after two of three generations."""
     run = RunFolder(path, SETTINGS)
     run.write_config()
     arrays, meta = load(halfway)
@@ -321,7 +488,7 @@ def go_on_in(path, maps, session=Session):
     tracker = make_tracker(run, f"sqlite:///{path}/m.db", "test")
     resumed = session(run, SerialPool(maps.build), maps, tracker, time.perf_counter())
     curriculum = resumed.learning.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4, contenders=2)
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4)
     return resumed
 
 
@@ -330,8 +497,8 @@ def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, 
     with pytest.raises(KeyboardInterrupt):
         resumed.learn()
     assert resumed.interrupted
-    assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 2
-    assert len(read_history(tmp_path / "history.csv")) == 2
+    assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 3
+    assert len(read_history(tmp_path / "history.csv")) == 3
 
 
 def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
@@ -349,12 +516,12 @@ class Losing(SerialPool):
 
     def __init__(self, maps, **rows):
         super().__init__(maps.build)
-        self.rows = rows  # by the call's kind: evolve, race or validate
+        self.rows = rows  # by the call's kind: evolve or validate
         self.genomes = np.zeros((0, GENES), dtype=np.float32)  # of who was lost
 
     def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
         outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
-        kind = "race" if task.rewind else "evolve" if recipes["seed"].any() else "validate"
+        kind = "evolve" if (recipes["kind"] != Kind.COPY).any() else "validate"
         rows = np.arange(len(recipes))[self.rows.get(kind, slice(0, 0))]
         outcome.lost[rows] = True
         outcome.results[rows] = np.zeros((), outcome.results.dtype)
@@ -364,32 +531,43 @@ class Losing(SerialPool):
         return outcome
 
 
-def losing(maps, **rows):
-    evolution = begin(maps)
+def losing(maps, settings=SETTINGS, **rows):
+    evolution = begin(maps, settings)
     evolution.pool = Losing(maps, **rows)
     evolution.score = lambda results, target: -results["distance"].sum(axis=1)  # who drives nowhere is the best
     evolution.warn = lambda text: None
     return evolution
 
 
-def test_who_was_lost_cannot_win_whatever_the_fitness(maps):
-    """Neither in the generation nor in its race: not an elite, not a parent, not tried."""
-    evolution = losing(maps, evolve=slice(3, 24), race=slice(0, 2))
+@pytest.mark.parametrize(("settings", "last"), [(SETTINGS, 24), (TWO, 9)], ids=["all", "two"])
+def test_who_was_lost_cannot_win_whatever_the_fitness(maps, settings, last):
+    """Not an elite, not a parent (where tournaments of lost ones alone are rare), not tried."""
+    evolution = losing(maps, settings, evolve=slice(3, last))
     go_on(evolution)
-    kept = np.concatenate([evolution.genetic.parents, evolution.elites, evolution.trials.first])
-    assert len(evolution.pool.genomes) == 23 == evolution.lost_chunks
+    kept = [*evolution.search.candidates(), *evolution.elites, *evolution.trials.first]
+    kept += list(getattr(evolution.search, "parents", []))
+    assert len(evolution.pool.genomes) == last - 3 == evolution.lost_chunks
     assert not {genome.tobytes() for genome in evolution.pool.genomes} & {genome.tobytes() for genome in kept}
     assert np.isfinite(list(evolution.history[0].values())).all()
     arrays, meta = evolution.state()
-    resumed = begin(maps)
+    resumed = begin(maps, settings)
     resumed.restore(arrays, meta)
-    assert resumed.lost_chunks == 23
+    assert resumed.lost_chunks == last - 3
 
 
-@pytest.mark.parametrize(("kind", "stage"), [("evolve", "evolve"), ("race", "race")])
-def test_where_all_are_lost_the_run_stops(maps, kind, stage):
-    with pytest.raises(PoolError, match=rf"^{stage}: nothing is left, all \d+ that were tried killed their workers"):
-        losing(maps, **{kind: slice(0, None)}).step()
+def test_a_leader_that_was_lost_does_not_end_a_run(maps):
+    evolution = losing(maps)
+    go_on(evolution)
+    evolution.pool.rows = {"evolve": slice(32, 33)}  # the leader, beside the members
+    go_on(evolution)
+    assert evolution.lost_chunks == 1
+    assert evolution.history[1]["leader/success_rate"] == 0.0
+    assert np.isfinite(list(evolution.history[1].values())).all()
+
+
+def test_where_all_are_lost_the_run_stops(maps):
+    with pytest.raises(PoolError, match=r"^evolve: nothing is left, all 32 that were tried killed their workers"):
+        losing(maps, evolve=slice(0, None)).step()
 
 
 def test_who_was_lost_in_validation_is_no_champion(maps):
@@ -398,3 +576,58 @@ def test_who_was_lost_in_validation_is_no_champion(maps):
     with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
         evolution.conclude()
     assert evolution.champion is None
+
+
+# --- A fitness of one's own ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("settings", [SETTINGS, TWO], ids=["all", "two"])
+def test_a_fitness_that_is_no_number_loses(maps, settings, bad):
+    def some(results, target):
+        score = results["distance"].sum(axis=1).astype(float)
+        if len(score) > 1:
+            score[: len(score) // 2] = bad
+        return score
+
+    evolution = begin(maps, settings)
+    evolution.score = some
+    go_on(evolution)
+    bred = breed_first(maps, settings)
+    assert evolution.elites[0].tobytes() in {genome.tobytes() for genome in bred[16:]}
+    assert np.isfinite(list(evolution.history[0].values())).all()
+    go_on(evolution)
+    assert np.isfinite(list(evolution.history[1].values())).all()
+
+
+def breed_first(maps, settings):
+    """The members of a run's first generation."""
+    search = begin(maps, settings).search
+    assert search.ask().recipes.dtype == RECIPE
+    return search.genomes(np.arange(settings.population))
+
+
+def test_a_fitness_that_never_is_a_number_does_not_end_a_run(maps):
+    evolution = begin(maps)
+    evolution.score = lambda results, target: np.full(len(results), np.nan)
+    for _ in range(2):
+        go_on(evolution)
+    assert [row["fitness/mean"] for row in evolution.history] == [-1.0, -1.0]
+    resumed = begin(maps)
+    resumed.restore(*evolution.state())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda results, target: results["distance"],
+        lambda results, target: results["distance"].sum(axis=1)[:-1],
+        lambda results, target: 1.0,
+        lambda results, target: results["distance"].sum(axis=1)[:, None],
+    ],
+)
+def test_a_fitness_of_another_shape_is_refused_in_one_line(maps, wrong):
+    evolution = begin(maps)
+    evolution.score = wrong
+    with pytest.raises(ValueError, match=r"^a fitness returns one number a member, \[32\], not [^\n]*$"):
+        evolution.step()

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from cluster import checkpoint, experiment
 from cluster.cells import Cells, settings_of
 from cluster.experiment import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
-from cluster.finished import LEARNERS, ExperimentError
+from cluster.finished import LEARNERS, ExperimentError, learner_of
 from cluster.run import RunFolder
-from cluster.settings import DqnSettings
+from cluster.settings import DqnSettings, to_dict
 from evolution.policy import PolicySpec
 from gridsim.scenarios import REGISTRY
 
@@ -71,8 +71,8 @@ def test_plan_that_makes_no_sense(change, said):
 
 def test_a_comparison_that_was_stopped_has_something_of_everything(tmp_path):
     cells = Plan(ALL, LEARNERS, 3, Budget(1)).cells(tmp_path)
-    assert len({cell.folder for cell in cells}) == len(cells) == 45
-    assert {(cell.scenario, cell.learner) for cell in cells[:15]} == set(itertools.product(ALL, LEARNERS))
+    assert len({cell.folder for cell in cells}) == len(cells) == 60
+    assert {(cell.scenario, cell.learner) for cell in cells[:20]} == set(itertools.product(ALL, LEARNERS))
     assert cells[0].folder == tmp_path / f"{ALL[0]}-evolution-s0"
 
 
@@ -106,17 +106,20 @@ def test_finished_runs_are_never_trained_again(tmp_path):
 
 
 @pytest.mark.parametrize(("observation", "traffic"), [("rays", 0), ("rays", 4), ("grid", 4)])
-def test_learners_see_the_same_and_settings_are_valid(tmp_path, observation, traffic):
+def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, traffic):
     roads = ("highway", "city") if traffic else PLAN.scenarios
     plan = dataclasses.replace(PLAN, scenarios=roads, observation=observation, traffic=traffic, learners=LEARNERS)
-    specs = []
+    specs: dict[str, set[PolicySpec]] = {}
     for cell in plan.cells(tmp_path):
         settings = settings_of(cell)
         settings.check()
-        specs.append(PolicySpec.parse(settings.policy))
-    assert {spec.observation for spec in specs} == {observation}
+        assert learner_of({"command": settings.command, "settings": to_dict(settings)}) == cell.learner
+        specs.setdefault(cell.learner, set()).add(PolicySpec.parse(settings.policy))
+    assert set(specs) == set(LEARNERS)
+    assert {spec.observation for found in specs.values() for spec in found} == {observation}
+    assert specs["evolution"] == specs["two-parents"] == specs["random"]
     if observation == "rays":
-        assert {spec.inputs for spec in specs} == {63 if traffic else 32}, plan
+        assert {spec.inputs for spec in specs["evolution"]} == {63 if traffic else 32}, plan
 
 
 def stop_after(done, count):

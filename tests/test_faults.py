@@ -20,7 +20,7 @@ import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
 from commands import BIN, all_in_mlflow, finish, ray_workers, rows, start, summary, wait_until
-from test_pool import Answering, make_recipes, make_task, never_built
+from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
 from cluster.coordinator import Evolution
 from cluster.learning import Maps
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.e2e
 LONG_S = 300.0  # what takes seconds where nothing else runs
 KILLS = int(os.environ.get("GRIDSIM_KILLS", "3"))
 ROAD = ["--scenario", "curved", "--traffic", "2"]
-SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5", "--elites", "4"]
+SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5"]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -62,7 +62,7 @@ def same(run: Path, reference: Path) -> bool:
     assert mine["car_steps"] == theirs["car_steps"]
     assert mine["lost_chunks"] == 0
     for row, other in zip(rows(run), rows(reference), strict=True):
-        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "race/success_rate"):
+        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
             assert row[name] == other[name]
     return all_in_mlflow(run)
 
@@ -80,7 +80,7 @@ class Deadly(Worker):
     def __init__(self, key: int, seed: int):
         self._key, self._seed = key, seed
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
         if self._key == task.key and self._seed in recipes["seed"]:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().evaluate(task, maps, recipes)
@@ -102,11 +102,14 @@ class Forgetting(SerialPool):
 
 def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
     """The same one, whatever the number of workers; whoever is left is evolved as if it had never been able to win."""
-    settings = EvolveSettings("curved", 0, population=5, elites=1, parents=4, seed=3, generations=2)
+    settings = EvolveSettings("curved", 0, population=5, seed=3, generations=2)
     maps = Maps(settings.scenario, SimConfig())
     first = Evolution(settings, SerialPool(maps.build), maps)
-    recipes, key = first.genetic.ask(first._mutation())
-    seed = int(recipes["seed"][4])  # the last has a chunk of its own: it costs five workers, and no more
+    asked = first.search.ask()
+    key, seed = (
+        asked.key,
+        int(asked.recipes["seed"][4]),
+    )  # the last has a chunk of its own: it costs five workers, and no more
     found = []
     for workers in (0, 1, 2):
         pool = (
@@ -124,7 +127,7 @@ def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
         found.append((evolution.champion.genome.tobytes(), {k: v.tobytes() for k, v in evolution.state()[0].items()}))
         if workers:
             assert evolution.lost_chunks == 1
-            assert said[0].startswith("generation 0, evolve: member 4 (no parents, seed ")
+            assert said[0].startswith("generation 0, evolve: member 4 (new of rows 0 and 0, seed ")
             assert len(said) == 1
     maps.close()
     assert found[0] == found[1] == found[2]
@@ -139,7 +142,7 @@ class Stopping(Answering):
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
         with contextlib.suppress(FileNotFoundError):
             (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
             os.kill(os.getpid(), signal.SIGSTOP)

@@ -8,7 +8,7 @@ import pytest
 from finished_runs import HELD_OUT, make_run
 
 from cluster.champion import evaluate, load_champion
-from cluster.finished import ERROR_FIGURES, Errors, ExperimentError, errors_of, read_run
+from cluster.finished import ERROR_FIGURES, LEARNERS, Errors, ExperimentError, errors_of, read_run
 
 
 def test_errors_are_measured_once(tmp_path):
@@ -41,6 +41,12 @@ def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path,
     other = dataclasses.replace(made, figures={**made.figures, "distance_m": 10.0 * metres + 10.0})
     with pytest.raises(ExperimentError, match="another version of GridSim made it"):
         errors_of(other, "")
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_every_learner_is_known_by_its_config(tmp_path, learner):
+    make_run(tmp_path / "a", learner)
+    assert read_run(tmp_path / "a").learner == learner
 
 
 def test_run_is_read(tmp_path):

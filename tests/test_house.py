@@ -70,8 +70,8 @@ def test_package_keeps_the_rules(root: Path, package: str) -> None:
     ("file", "source"),
     [
         ("gridsim/vehicle.py", "from evolution.policy import PolicySpec"),
-        ("evolution/genetic.py", "def f():\n    import cluster.pool"),
-        ("evolution/genetic.py", "import importlib\nimportlib.import_module('cluster.pool')"),
+        ("evolution/search.py", "def f():\n    import cluster.pool"),
+        ("evolution/search.py", "import importlib\nimportlib.import_module('cluster.pool')"),
         ("gridsim/env.py", "def f():\n    import torch"),
         ("evolution/rollout.py", "import rich.progress"),
         ("cluster/coordinator.py", "from ray.exceptions import RayActorError"),
@@ -89,7 +89,7 @@ def test_a_breach_is_found(file: str, source: str) -> None:
 @pytest.mark.parametrize(
     ("file", "source"),
     [
-        ("cluster/ray_pool.py", "import ray\nfrom evolution import genetic\nimport gridsim.config"),
+        ("cluster/ray_pool.py", "import ray\nfrom evolution import search\nimport gridsim.config"),
         ("cluster/tracking.py", "def f():\n    import mlflow"),
         ("gridsim/render.py", "import pygame"),
         ("evolution/policy.py", "def f():\n    import torch"),

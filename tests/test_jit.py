@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evolution.breeding import FRESH, RECIPE, Mutation, breed
+from evolution.breeding import RECIPE, Mutation, breed, moments
 from evolution.collecting import collect
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, Limits, evaluate
@@ -177,8 +177,14 @@ def collect_some(scenario, start, genomes):
 
 
 def have_children(parents):
-    recipes = np.array([(0, 0, 0), (0, 1, 1), (1, 1, 2), (FRESH, FRESH, 3), (FRESH, FRESH, 4)], dtype=RECIPE)
-    return {"children": breed(parents, recipes, 2**62 + 5, SPEC, Mutation(rate=0.2, bump_rate=1.0))}
+    """One of each kind, and two of crossover."""
+    recipes = np.array(
+        [(0, 0, 0, 0), (1, 0, 0, 3), (2, 0, 1, 5), (3, 0, 1, 5), (4, 1, 2, 1), (4, 1, 1, 2)], dtype=RECIPE
+    )
+    seeds = np.arange(7)
+    first, second = moments(seeds, seeds - 2.5, seeds / 7.0, 2**62 + 5, SPEC.size)
+    children = breed(parents, recipes, 2**62 + 5, SPEC, Mutation(rate=0.2, sigma=0.5))
+    return {"children": children, "first": first, "second": second}
 
 
 def lay_a_road():
@@ -275,7 +281,9 @@ def test_plain_python_breeds_the_same_children(both):
     children, same = compiled["breed_children"], plain["breed_children"]
     assert same[0].tobytes() == children[0].tobytes()
     assert same == pytest.approx(children, abs=1e-4)
-    assert len(np.unique(children, axis=0)) == 5
+    assert len(np.unique(children, axis=0)) == 6
+    for moment in ("breed_first", "breed_second"):
+        assert plain[moment] == pytest.approx(compiled[moment], rel=1e-4, abs=1e-4)
 
 
 def test_plain_python_lays_the_same_road(both):

@@ -21,17 +21,22 @@ from evolution.policy import (
     gene_scales,
     pack,
     packed_size,
+    scratch_size,
     squash,
 )
 
 F = np.float32
-TEXTS = ["mlp:6,7", "mlp:3", "mlp:16,16", "mlp:9,1,20", "mlp:8", "mlp:17,5,3,11", "mlp:1"]
+WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
+TEXTS = [
+    "mlp:6,7", "mlp:16,16", "mlp:9,1,20", "mlp:17,5,3,11", "mlp:64,80,65", "mlp:128,8",
+    *(f"mlp:{width}" for width in WIDTHS), *(f"mlp:{a},{b}" for a, b in itertools.pairwise(WIDTHS)),
+]  # fmt: skip
 
 
 def kernel_outputs(spec, genome, inputs, junk=0.0):
     packed = np.full(packed_size(spec.layers), junk, dtype=F)
     pack(genome, spec.layers, packed)
-    scratch = np.full(2 * (spec.layers.max() + BLOCK), junk, dtype=F)
+    scratch = np.full(scratch_size(spec.layers), junk, dtype=F)
     scratch[: spec.inputs] = inputs
     at = int(forward(packed, spec.layers, scratch))
     outputs = scratch[at : at + spec.outputs].copy()
@@ -71,7 +76,7 @@ def test_forward_is_numpys(text):
         genome, inputs = rng.normal(size=spec.size).astype(F), rng.uniform(-1, 1, INPUTS).astype(F)
         outputs, action = kernel_outputs(spec, genome, inputs)
         expected = reference(spec, genome, inputs, lambert)
-        assert outputs == pytest.approx(expected, abs=3e-5)
+        assert outputs == pytest.approx(expected, abs=3e-5 * max(1.0, np.sqrt(max(spec.hidden) / 16)))
         assert action == int(outputs.argmax())
         # The rational function stands for tanh: 2e-4 a unit, and what the layers after it make of that.
         worst = max(worst, np.abs(outputs - reference(spec, genome, inputs, np.tanh)).max())
@@ -101,6 +106,20 @@ def test_a_gene_that_is_not_a_number_is_no_action(text):
         if kernel_outputs(spec, spoilt, inputs)[1] != -1:
             let_through.append(gene)
     assert let_through == []
+
+
+@pytest.mark.parametrize("text", ["mlp:6,7", "mlp:64", "mlp:65,17+motion", "mlp:1"])
+def test_packed_are_the_biases_and_then_a_row_of_weights_for_each_input(text):
+    """Rows are whole blocks; what is missing weighs nothing."""
+    spec = PolicySpec.parse(text)
+    genome = np.random.default_rng(4).normal(size=spec.size).astype(F)
+    packed, wanted, at = np.full(packed_size(spec.layers), np.nan, dtype=F), [], 0
+    pack(genome, spec.layers, packed)
+    for n, m in itertools.pairwise(spec.layers.tolist()):
+        weights, biases = genome[at : at + n * m].reshape(n, m), genome[at + n * m : at + (n + 1) * m]
+        wanted.append(np.pad(np.vstack([biases, weights]), ((0, 0), (0, -m % BLOCK))).ravel())
+        at += (n + 1) * m
+    assert packed.tobytes() == np.concatenate(wanted).tobytes()
 
 
 def test_the_first_of_equal_outputs_acts():

@@ -28,28 +28,32 @@ from cluster.pool import (
     new_outcome,
 )
 from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import FRESH, RECIPE, Mutation
+from evolution.breeding import RECIPE, Kind, Mutation
 from evolution.episodes import lane_starts
 from evolution.experience import Experience, to_bytes
-from evolution.packing import pack_recipes
 from evolution.policy import PolicySpec
 from evolution.rollout import EPISODE, RESULT, Limits, no_traffic
 from gridsim.config import SimConfig
 from gridsim.scenarios import Scenario, build
+from gridsim.world import FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
+Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # what `Worker.evaluate` returns
 
 
 class Answering(Worker):
     """A stand-in that answers at once: each result is a function of the recipe and the episode."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
         started = time.perf_counter()
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         results["distance"] = recipes["seed"][:, None] * 16.0 + task.episodes["start"][:, 4]
         results["paced"] = task.parents[recipes["a"], 0][:, None]
         results["steps"] = sum(m.seed for m in maps)
-        return results, time.perf_counter() - started
+        back = task.episodes["start"][task.episodes["rewind"] > 0]
+        rewound = np.repeat(back[None], len(recipes), axis=0)
+        worlds = np.repeat(task.worlds[task.episodes["rewind"] > 0][None], len(recipes), axis=0)
+        return results, rewound, worlds, time.perf_counter() - started
 
     def collect(
         self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
@@ -68,7 +72,7 @@ class Answering(Worker):
 class Failing(Answering):
     """Answers until it meets a member that it cannot bear."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
         if 300 in recipes["seed"]:
             raise ValueError("member 300 is\nnot to be had")
         return super().evaluate(task, maps, recipes)
@@ -121,11 +125,11 @@ def collect_drive_task(n: int) -> tuple[CollectTask, list[Scenario]]:
 def make_recipes(n: int) -> np.ndarray:
     """Two copies first, then children of two parents."""
     recipes = np.zeros(n, dtype=RECIPE)
+    recipes["kind"] = Kind.CROSS
     recipes["seed"] = np.arange(n)
     recipes["a"] = np.arange(n) % 8
     recipes["b"] = np.arange(n) * 3 % 8
-    recipes["seed"][:2] = 0
-    recipes["b"][:2] = recipes["a"][:2]
+    recipes["kind"][:2], recipes["seed"][:2] = Kind.COPY, 0
     return recipes
 
 
@@ -266,8 +270,9 @@ def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
     """A member whose first episode came back and whose second kills; and an episode of a batch."""
     task, recipes = make_task(), make_recipes(3)
     outcome = new_outcome(task, recipes, everything(task, recipes))
-    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), 0.1)
-    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), 0.1)
+    none, nobody = np.zeros((2, 0, 5), dtype=np.float32), np.zeros((2, 0, 0, FIELDS), dtype=np.float32)
+    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), none, nobody, 0.1)
+    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), none[:1], nobody[:1], 0.1)
     assert not outcome.whole()
     outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
     assert outcome.whole()
@@ -285,15 +290,50 @@ def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
     assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
+def rewound_task() -> tuple[Task, list[Scenario]]:
+    """A small real task; of its last two episodes the states before their ends are wanted back."""
+    scenarios = [build(*name) for name in MAPS]
+    episodes, worlds = lane_starts(scenarios, np.array([0, 1, 1, 0]), np.random.default_rng(1), 2)
+    episodes["rewind"][2:] = 5, 9
+    parents = np.random.default_rng(0).standard_normal((8, 311)).astype(np.float32)
+    limits = Limits(150.0, 300)
+    return Task("mlp:6,7", parents, 12345, Mutation(), episodes, worlds, MAPS, limits, SimConfig()), scenarios
+
+
+def test_states_before_the_end_are_those_of_the_one_who_drove_there() -> None:
+    """The last member drives the last two episodes, which ask for them; alone, in parts, and as bytes."""
+    task, scenarios = rewound_task()
+    recipes = make_recipes(6)
+    asked = [Chunk(slice(5, 6), slice(2, 4)), Chunk(slice(0, 5), slice(0, 2))]
+    outcome = SerialPool(lambda *name: scenarios[name[1]]).evaluate(task, recipes, asked=asked)
+    results, rewound, worlds, _ = Worker().evaluate(task, scenarios, recipes[5:])
+    assert outcome.rewound.shape == (4, 5)
+    assert outcome.worlds.shape == task.worlds.shape
+    assert (outcome.rewound[:2] == 0.0).all()
+    assert (outcome.worlds[:2] == 0.0).all()
+    assert outcome.rewound[2:].tobytes() == rewound[0].tobytes()
+    assert outcome.worlds[2:].tobytes() == worlds[0].tobytes()
+    assert outcome.results[5, 2:].tobytes() == results[0, 2:].tobytes()
+    assert (outcome.rewound[2:, :2] != 0.0).all()
+
+    taken = new_outcome(task, recipes, asked)
+    for rows, columns in ((slice(5, 6), slice(3, 4)), (slice(0, 5), slice(0, 2)), (slice(5, 6), slice(2, 3))):
+        raw = answer(Worker(), task, scenarios, recipes[rows].tobytes(), columns.start, columns.stop)
+        taken.take(0, Chunk(rows, columns), raw)
+    assert taken.whole()
+    for name in ("results", "rewound", "worlds"):
+        assert getattr(taken, name).tobytes() == getattr(outcome, name).tobytes()
+    assert taken.bytes_up >= 12 * RESULT.itemsize + rewound.nbytes + worlds.nbytes
+
+
 def test_a_member_is_told_by_its_recipe() -> None:
     recipes = make_recipes(9)
-    recipes["a"][8] = recipes["b"][8] = FRESH
-    told = [
-        identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), pack_recipes(recipes[k : k + 1])) for k in (7, 8)
-    ]
+    recipes["kind"][8] = Kind.MIRRORED
+    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes[k : k + 1].tobytes()) for k in (1, 7, 8)]
     assert told == [
-        "member 7 (parents 7 and 5, seed 7, key 0x3039)",
-        "member 8 (no parents, seed 8, key 0x3039)",
+        "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
+        "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",
+        "member 8 (mirrored of rows 0 and 0, seed 8, key 0x3039)",
     ]
 
 
@@ -325,10 +365,11 @@ def test_chunks_change_nothing_for_the_real_worker() -> None:
     """All at once, in the pool's chunks, and member by member: the same bits."""
     task, scenarios = drive_task()
     recipes = make_recipes(40)
-    recipes["a"][30:] = recipes["b"][30:] = FRESH
+    for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (30, Kind.MIRRORED), (35, Kind.COPY)):
+        recipes["kind"][first : first + 5] = kind
     known = dict(zip(MAPS, scenarios, strict=True))
     outcome = SerialPool(lambda *name: known[name]).evaluate(task, recipes)
-    whole, seconds = Worker().evaluate(task, scenarios, recipes)
+    whole, _, _, seconds = Worker().evaluate(task, scenarios, recipes)
     single = np.concatenate([Worker().evaluate(task, scenarios, recipes[i : i + 1])[0] for i in range(40)])
     assert outcome.results.tobytes() == whole.tobytes() == single.tobytes()
     assert whole["distance"].max() > 0
@@ -340,7 +381,7 @@ def test_every_input_of_the_kernels_is_read_only() -> None:
     seen: list[np.ndarray] = []
 
     class Looking(Answering):
-        def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+        def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
             seen.extend([task.parents, task.episodes, recipes])
             seen.extend(value for value in maps[0].road if isinstance(value, np.ndarray))
             return super().evaluate(task, maps, recipes)

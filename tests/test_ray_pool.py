@@ -22,6 +22,7 @@ from commands import wait_until
 from test_pool import (
     MAPS,
     Answering,
+    Evaluated,
     collect_drive_task,
     drive_task,
     interrupted,
@@ -49,7 +50,7 @@ class Obeying(Answering):
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
         self._obey(recipes["seed"] if len(recipes) else np.array([NOBODY]))
         return super().evaluate(task, maps, recipes)
 
@@ -84,14 +85,14 @@ class Obeying(Answering):
 class Inspecting(Answering):
     """Tells of its process: modules that should not be there, writable inputs, the time that SIGINT is ignored."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
-        results, seconds = super().evaluate(task, maps, recipes)
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+        results, rewound, worlds, seconds = super().evaluate(task, maps, recipes)
         arrays = [task.parents, task.episodes, recipes, *(m.road.field for m in maps)]
         results["distance"] = sum(name in sys.modules for name in BANNED)
         results["paced"] = sum(array.flags.writeable or not array.flags.aligned for array in arrays)
         results["end"] = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         results["steps"] = os.environ.get("OMP_NUM_THREADS") == "1"
-        return results, seconds
+        return results, rewound, worlds, seconds
 
 
 class Unfit(Answering):
@@ -527,10 +528,10 @@ def test_a_cluster_is_told_how_a_run_is_doing(
 class Stepping(Answering):
     """Three steps an episode."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
-        results, seconds = super().evaluate(task, maps, recipes)
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+        results, rewound, worlds, seconds = super().evaluate(task, maps, recipes)
         results["steps"] = 3
-        return results, seconds
+        return results, rewound, worlds, seconds
 
 
 def test_a_cluster_that_wants_a_token(

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from test_pool import Answering, never_built
+from test_pool import Answering, Evaluated, never_built
 from test_ray_pool import gone
 
 from cluster.pool import PoolError
@@ -51,7 +51,7 @@ SCRIPT = """
 
 
 class Slow(Answering):
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> tuple[np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
         time.sleep(0.001 * len(recipes))
         return super().evaluate(task, maps, recipes)
 

@@ -136,7 +136,7 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     recipes = np.zeros(3, dtype=RECIPE)
     names = tuple((scenario.name, scenario.seed) for scenario in maps)
     task = Task("mlp:6,7", genome[None].copy(), 0, Mutation(), episodes.copy(), worlds.copy(), names, AMONG, CONFIG)
-    shared, _ = Worker().evaluate(task, maps, recipes)
+    shared, _, _, _ = Worker().evaluate(task, maps, recipes)
     assert all(row.tobytes() == results[0].tobytes() for row in shared)
 
     wheel = Wheel(spec, genome)
@@ -166,7 +166,9 @@ def test_a_key_stands_for_its_world(among):
 def test_what_is_rewound_goes_on_as_it_did(among):
     """64 steps before the end the ego car and its world are those of then, and with the same actions end the same."""
     spec, genome, maps, episodes, worlds, paths = among
-    _, starts, then = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, 64, worlds)
+    wanted = episodes.copy()
+    wanted["rewind"] = 64
+    _, starts, then = evaluate(spec, genome[None], maps, wanted, AMONG, CONFIG, worlds)
     compared = 0
     for k, (row, states, traffic) in enumerate(paths):
         first, last = max(int(row["steps"]) - 64, 0), int(row["steps"])
@@ -198,6 +200,33 @@ def test_what_is_rewound_goes_on_as_it_did(among):
             assert again.state.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
         assert again.state.ends[0] == End.COLLISION
     assert compared
+
+
+def test_only_episodes_that_ask_for_it_are_rewound_and_no_result_depends_on_it(among):
+    """Each as far back as it says; a longer way than it drove is back to its start."""
+    spec, genome, maps, episodes, worlds, paths = among
+    both = np.stack([genome, np.zeros_like(genome)])
+    plain, starts, then = evaluate(spec, both, maps, episodes, AMONG, CONFIG, worlds)
+    assert starts.shape == (2, 0, 5)
+    assert then.shape == (2, 0, *worlds.shape[1:])
+    some = episodes.copy()
+    some["rewind"][[1, 4, 6]] = 1, 64, 5000
+    results, starts, then = evaluate(spec, both, maps, some, AMONG, CONFIG, worlds)
+    assert results.tobytes() == plain.tobytes()
+    assert starts.shape == (2, 3, 5)
+    assert then.shape == (2, 3, *worlds.shape[1:])
+    for k, (column, back) in enumerate([(1, 1), (4, 64), (6, 5000)]):
+        row, states, traffic = paths[column]
+        first = max(int(row["steps"]) - back, 0)
+        assert then[0, k].tobytes() == traffic[first].tobytes()
+        assert starts[0, k, :2] == pytest.approx(states[first][[X, Y]])
+        alone, start, world = evaluate(
+            spec, both[:1], maps, some[column : column + 1], AMONG, CONFIG, worlds[column : column + 1]
+        )
+        assert start[0, 0].tobytes() == starts[0, k].tobytes()
+        assert world[0, 0].tobytes() == then[0, k].tobytes()
+        assert alone[0, 0] == results[0, column]
+    assert starts[0, 2] == pytest.approx(episodes["start"][6], abs=1e-5)
 
 
 def test_without_room_for_anybody_there_is_no_traffic(among):

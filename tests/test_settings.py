@@ -5,10 +5,12 @@ from dataclasses import replace
 import pytest
 
 from cluster.settings import DqnSettings, EvolveSettings, SettingsError, from_dict, to_dict
+from evolution.search import SearchConfig
+from gridsim.scenarios import REGISTRY
 
 
 def test_the_policy_follows_the_observation():
-    assert EvolveSettings().policy == "mlp:6,7"
+    assert EvolveSettings().policy == "mlp:64"
     assert EvolveSettings(observation="grid").policy == "cnn:8,16,32@1"
     assert EvolveSettings(observation="grid", policy="cnn").policy == "cnn"
     for settings in (EvolveSettings(), EvolveSettings(observation="grid"), EvolveSettings(policy="mlp:3")):
@@ -48,18 +50,22 @@ def test_what_is_not_given_suits_the_observation():
     assert from_dict(DqnSettings, to_dict(grid)) == grid
 
 
-def test_evolution_s_default_budget_is_of_generations_and_of_car_steps():
-    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (400, 135_000_000)
-    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 175_000_000
-    assert EvolveSettings("highway", traffic=0).car_steps == 135_000_000
+def test_evolution_s_default_budget_is_of_car_steps():
+    assert (EvolveSettings().generations, EvolveSettings().car_steps) == (0, 30_000_000)
+    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 80_000_000
+    assert EvolveSettings("highway", traffic=0).car_steps == 30_000_000
     assert EvolveSettings(generations=2_000).car_steps == 0  # whoever says how long means it
-    assert EvolveSettings(car_steps=7).generations == 400
+    assert EvolveSettings(car_steps=7).generations == 0
     assert EvolveSettings(car_steps=7).car_steps == 7
+    both = EvolveSettings(generations=9, car_steps=7)
+    assert (both.generations, both.car_steps) == (9, 7)
     settings = from_dict(EvolveSettings, to_dict(EvolveSettings()))
     assert settings == EvolveSettings()
-    for generation, car_steps in ((400, 1), (1, 135_000_000)):
-        assert settings.ended({"solved": False, "generation": generation, "car_steps": car_steps})
-    assert not settings.ended({"solved": False, "generation": 399, "car_steps": 134_999_999})
+    assert settings.ended({"solved": False, "generation": 1, "car_steps": 30_000_000})
+    assert not settings.ended({"solved": False, "generation": 10**9, "car_steps": 29_999_999})
+    assert EvolveSettings(generations=4).ended({"solved": False, "generation": 4, "car_steps": 0})
+    assert not EvolveSettings(generations=4).ended({"solved": False, "generation": 3, "car_steps": 10**12})
+    assert settings.ended({"solved": True, "generation": 0, "car_steps": 0})
 
 
 def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it():
@@ -72,18 +78,72 @@ def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it
     assert DqnSettings().extending(DqnSettings()) == DqnSettings()
 
 
-def test_evolution_sees_motion_in_traffic_on_all_roads_but_one():
-    for scenario in ("highway", "seamless", "roundabout", "city"):
-        assert EvolveSettings(scenario, traffic=2).policy == "mlp:16,16+motion"
-        assert EvolveSettings(scenario, traffic=0).policy == "mlp:6,7"
-    assert EvolveSettings("city").policy == "mlp:16,16+motion"
-    assert EvolveSettings("curved", traffic=2).policy == "mlp:6,7"
+def test_evolution_sees_motion_in_traffic():
+    for scenario in REGISTRY:
+        assert EvolveSettings(scenario, traffic=2).policy == "mlp:64+motion"
+        assert EvolveSettings(scenario, traffic=0).policy == "mlp:64"
+    assert EvolveSettings("city").policy == "mlp:64+motion"
     assert EvolveSettings("city", observation="grid").policy == EvolveSettings(observation="grid").policy
     assert EvolveSettings("city", policy="mlp:5").policy == "mlp:5"
-    assert EvolveSettings("city").mutation_rate == 0.012
-    for settings in (EvolveSettings("city", traffic=0), EvolveSettings("city", policy="mlp:5")):
-        assert settings.mutation_rate == 0.03
-    for rate in (0.0, 0.5):
-        assert EvolveSettings("city", mutation_rate=rate).mutation_rate == rate
-    with pytest.raises(SettingsError, match="--mutation-rate"):
-        EvolveSettings("city", mutation_rate=-0.5).check()
+
+
+# --- The search ------------------------------------------------------------------------------------------------------
+
+
+def test_the_search_s_parameters_are_the_settings():
+    settings = EvolveSettings(recombination="two", population=64, tournament=3, sigma=0.7, elites=2, mutation_rate=0.1)
+    settings.check()
+    assert settings.search_config() == SearchConfig(64, 4, 3, 0.7, 2, 0.1)
+    EvolveSettings().check()
+    assert EvolveSettings().search_config() == SearchConfig(256, 4, 8, 1.0, 8, 0.03)
+
+
+def test_mutation_s_size_suits_the_recombination():
+    assert EvolveSettings().sigma == 1.0
+    assert EvolveSettings(recombination="two").sigma == 0.5
+    for recombination in ("all", "two"):
+        assert EvolveSettings(recombination=recombination, sigma=0.25).sigma == 0.25
+    settings = EvolveSettings(recombination="two")
+    assert from_dict(EvolveSettings, to_dict(settings)) == settings
+
+
+def test_there_are_no_more_groups_than_members_for_them():
+    """Of a group's members the best are to be good."""
+    for population, groups in ((4, 1), (31, 1), (32, 2), (63, 3), (64, 4), (1000, 4)):
+        settings = EvolveSettings(population=population)
+        settings.check()
+        assert settings.curriculum().groups == settings.search_config().groups == groups
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"elites": 4}, "--elites is for --recombination two"),
+        ({"mutation_rate": 0.1}, "--mutation-rate is for --recombination two"),
+        ({"recombination": "two", "population": 8}, "--elites must be"),
+        ({"recombination": "two", "elites": -1}, "--elites must be"),
+        ({"recombination": "two", "elites": 10_001, "population": 20_000}, "--elites must be"),
+        ({"recombination": "two", "mutation_rate": -0.5}, "--mutation-rate must be 0 to 1"),
+        ({"recombination": "two", "mutation_rate": 1.5}, "--mutation-rate must be 0 to 1"),
+        ({"population": 3}, "population must be 4 or more"),
+        ({"population": 1_000_001}, "--population must be 1,000,000 or less"),
+        ({"tournament": 0}, "tournament"),
+        ({"sigma": -1.0}, "sigma must be above 0"),
+        ({"sigma": float("nan")}, "sigma must be above 0"),
+        ({"generations": -1}, "--generations"),
+    ],
+)
+def test_searches_that_make_no_sense_are_refused_in_one_line(wrong, told):
+    with pytest.raises(SettingsError, match=rf"^[^\n]*{told}[^\n]*$"):
+        EvolveSettings(**wrong).check()
+
+
+@pytest.mark.parametrize("name", ["parents", "crossover", "islands", "ranking", "bump_rate"])
+def test_settings_that_went_are_unknown(name):
+    with pytest.raises(SettingsError, match=f"^unknown setting '{name}'$"):
+        from_dict(EvolveSettings, to_dict(EvolveSettings()) | {name: 1})
+
+
+def test_another_recombination_is_refused():
+    with pytest.raises(SettingsError, match="'recombination' must be all or two"):
+        from_dict(EvolveSettings, to_dict(EvolveSettings()) | {"recombination": "some"})

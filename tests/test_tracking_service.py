@@ -24,7 +24,7 @@ pytestmark = pytest.mark.e2e
 
 GENERATIONS = 12
 ROAD = ["--scenario", "curved", "--traffic", "2"]
-SMALL = [*ROAD, "--population", "48", "--generations", str(GENERATIONS), "--seed", "5", "--elites", "4", "--until", "2"]
+SMALL = [*ROAD, "--population", "48", "--generations", str(GENERATIONS), "--seed", "5", "--until", "2"]
 COMMAND = "gridsim-evolve"
 
 
@@ -85,7 +85,7 @@ def check_complete(served, name):
 
     history = rows(folder)
     assert len(history) == GENERATIONS
-    for column in set(history[0]) - {"generation", "target_m", "island"}:
+    for column in set(history[0]) - {"generation", "target_m"}:
         wanted = {int(row["generation"]): float(row[column]) for row in history}
         logged = client(served.uri).get_metric_history(run_id, column)
         assert {metric.step: metric.value for metric in logged} == pytest.approx(wanted)
@@ -112,7 +112,7 @@ def test_a_run_outlives_an_outage_and_loses_nothing(served):
     assert (served.codes["during"], err) == (0, "")
     run = check_complete(served, "during")
     assert run.info.run_name == "during: curved-evolution-s5 2 cars"
-    assert run.data.tags["group"] == "curved evolution mlp:6,7 2 cars, until 2.0, population 48, elites 4"
+    assert run.data.tags["group"] == "curved evolution mlp:64+motion 2 cars, until 2.0, population 48"
 
 
 def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):

@@ -29,7 +29,7 @@ from gridsim.scenarios import build, sample_starts
 from gridsim.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
-SMALL = ["--workers", "0", "--population", "48", "--generations", "4", "--seed", "5", "--elites", "4"]
+SMALL = ["--workers", "0", "--population", "48", "--generations", "4", "--seed", "5"]
 
 
 def run(command, *arguments, cwd, timeout=240, **environment):

@@ -1,0 +1,107 @@
+"""How the task grows with its leader, and what is remembered of the leader's crashes."""
+
+import numpy as np
+import pytest
+
+from evolution.curriculum import Curriculum, CurriculumConfig
+from evolution.rollout import RESULT
+from gridsim.ego import End
+from gridsim.scenarios import build
+from gridsim.world import FIELDS, LANE
+
+CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
+CARS = 4
+
+
+def new(config=CONFIG, traffic=2):
+    return Curriculum(config, 7, lambda seed: build("seamless", seed), 2000.0, 400.0, 0.1, traffic)
+
+
+@pytest.fixture(scope="module")
+def curriculum():
+    return new()
+
+
+def led(curriculum, generation, ends, distance=0.0, steps=50):
+    """Results of the leader's episodes with these ends; told to the curriculum."""
+    episodes = curriculum.leader_episodes(generation)
+    results = np.zeros(len(episodes.rows), dtype=RESULT)
+    results["end"], results["distance"], results["steps"] = ends, distance, steps
+    rewound = np.repeat(np.arange(len(results), dtype=np.float32)[:, None], 5, axis=1) + 100.0 * generation
+    curriculum.followed(episodes, results, rewound, episodes.worlds)
+    return episodes, rewound
+
+
+def test_a_leader_s_episodes_are_longer_and_rewound(curriculum):
+    episodes = curriculum.leader_episodes(0)
+    assert len(episodes.rows) == 8
+    assert (episodes.rows["rewind"] == CONFIG.rewind).all()
+    assert (episodes.rows["target"] == 2.5 * 150.0).all()
+    assert (episodes.rows["steps"] == curriculum.leader_limits().steps).all()
+    assert curriculum.leader_limits().steps > curriculum.limits().steps
+    assert (curriculum.episodes(0).rows["rewind"] == 0).all()
+
+
+def test_only_who_crashed_or_stood_still_on_the_way_is_remembered():
+    curriculum = new()
+    ends = np.array([End.COLLISION, End.SUCCESS, End.TIME, End.IDLE, End.COLLISION, End.IDLE, End.SUCCESS, End.TIME])
+    steps = np.array([50, 50, 50, 50, 10, 11, 50, 50])  # the fifth crashed at its start
+    episodes, rewound = led(curriculum, 0, ends, steps=steps)
+    kept = [0, 3, 5]
+    assert curriculum.crashes["start"].tobytes() == rewound[kept].tobytes()
+    assert curriculum.crash_worlds.tobytes() == episodes.worlds[kept].tobytes()
+    seeds = [curriculum.map_seeds[m] for m in curriculum.crashes["map"]]
+    assert seeds == [episodes.maps[m] for m in episodes.rows["map"][kept]]
+    assert (curriculum.crashes["rewind"] == 0).all()
+    led(curriculum, 1, End.COLLISION)
+    assert len(curriculum.crashes) == CONFIG.crash_memory  # the latest
+    assert curriculum.crashes["start"][-1, 0] == 107.0
+    assert curriculum.crashes["start"][0, 0] == 3.0
+
+
+def test_the_task_doubles_as_the_leader_succeeds():
+    curriculum = new()
+    distance = np.array([150.0] * 4 + [149.0] * 4)
+    led(curriculum, 0, End.TIME, distance)
+    assert curriculum.target == 150.0  # 4 of 8 are less than 0.6
+    distance[4] = 150.0
+    led(curriculum, 1, End.TIME, distance)
+    assert curriculum.target == 300.0
+    for generation in (2, 3):
+        led(curriculum, generation, End.TIME, 1e4)
+        assert curriculum.target == CONFIG.last_target
+
+
+def test_each_group_has_as_many_new_starts_and_crashes():
+    curriculum = new()
+    fresh = curriculum.episodes(0)
+    assert len(fresh.rows) == 3 * 2
+    led(curriculum, 0, End.COLLISION)
+    remembered = {crash["start"].tobytes() for crash in curriculum.crashes}
+    curriculum._check = lambda maps, worlds: None  # they are made up
+    episodes = curriculum.episodes(1)
+    assert len(episodes.rows) == len(episodes.worlds) == 3 * 4
+    of_crash = [row["start"].tobytes() in remembered for row in episodes.rows]
+    assert of_crash == [False, False, True, True] * 3
+    assert (episodes.rows["target"][of_crash] == CONFIG.crash_target).all()
+    assert (episodes.rows["steps"][of_crash] > 0).all()
+    assert episodes.maps == sorted(set(episodes.maps))
+    for row, world in zip(episodes.rows[of_crash], episodes.worlds[of_crash], strict=True):
+        k = next(k for k, crash in enumerate(curriculum.crashes) if crash["start"].tobytes() == row["start"].tobytes())
+        assert episodes.maps[row["map"]] == curriculum.map_seeds[curriculum.crashes["map"][k]]
+        assert world.tobytes() == curriculum.crash_worlds[k].tobytes()
+    again = curriculum.episodes(1)
+    assert again.rows.tobytes() == episodes.rows.tobytes()
+    assert curriculum.episodes(2).rows.tobytes() != episodes.rows.tobytes()
+
+
+def test_maps_come_in_one_by_one(curriculum):
+    assert [curriculum.maps_in_use(generation) for generation in range(4)] == [2, 3, 3, 3]
+    assert set(curriculum.episodes(0).maps) <= set(curriculum.map_seeds[:2])
+    assert len(set(curriculum.map_seeds)) == 3
+
+
+def test_training_has_twice_the_cars(curriculum):
+    assert curriculum.episodes(0).worlds.shape[1:] == (CARS, FIELDS)
+    assert curriculum.leader_episodes(0).worlds.shape[1:] == (CARS, FIELDS)
+    assert (curriculum.leader_episodes(0).worlds[..., LANE] >= 0).mean() > 0.9

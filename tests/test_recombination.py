@@ -1,0 +1,337 @@
+"""The default search: the centre, mirrored pairs, elites, and how fast it is beside separable CMA-ES."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evolution.breeding import Kind, Mutation, breed
+from evolution.policy import PolicySpec, gene_scales
+from evolution.recombination import Recombination
+from evolution.search import SearchConfig, ranks, tournament_weights
+
+F = np.float32
+SPEC = PolicySpec.parse("mlp:1")
+GENES = SPEC.size  # 49
+CNN = PolicySpec.parse("cnn:8,8,8@1")
+
+
+def begun(config, seed=1, spec=SPEC, genome=None):
+    """A search about a genome, by default a random one."""
+    search = Recombination(spec, config, seed)
+    search.begin_with(np.random.default_rng(seed).normal(size=spec.size).astype(F) if genome is None else genome)
+    return search
+
+
+def told(search, score):
+    """One generation: asked for, and told `score(genomes)`; returns the genomes."""
+    search.ask()
+    genomes = search.genomes(np.arange(search.config.population))
+    search.tell(score(genomes))
+    return genomes
+
+
+def leader(search):
+    """Who leads: somebody does."""
+    found = search.leader()
+    assert found is not None
+    return found
+
+
+def first_gene(genomes):
+    return genomes[:, 0].astype(float)
+
+
+def snapshot(search):
+    arrays, numbers = search.state()
+    return {name: array.tobytes() for name, array in arrays.items()}, numbers
+
+
+# --- A generation ----------------------------------------------------------------------------------------------------
+
+
+def test_the_first_centre_is_the_best_of_a_random_generation():
+    search = Recombination(SPEC, SearchConfig(population=40, groups=4), seed=1)
+    members = told(search, first_gene)
+    best = members[first_gene(members).argmax()]
+    assert leader(search).tobytes() == search.candidates()[0].tobytes() == best.tobytes()
+    assert search.sigma == 1.0
+    assert search.candidates().shape == (1, GENES)
+
+
+@pytest.mark.parametrize("spec", [SPEC, CNN], ids=str)
+def test_the_centre_is_the_first_member_bit_for_bit(spec):
+    search = begun(SearchConfig(population=9, groups=1, tournament=3), spec=spec)
+    for _ in range(4):
+        before = leader(search)
+        members = told(search, first_gene)
+        assert members[0].tobytes() == before.tobytes()
+        assert leader(search).tobytes() != before.tobytes()
+
+
+def test_the_champion_is_the_second_member_bit_for_bit():
+    search = begun(SearchConfig(population=16, groups=2))
+    champion = np.random.default_rng(3).normal(size=GENES).astype(F)
+    champion[:2] = -0.0, 1e-42
+    search.champion = champion
+    asked = search.ask()
+    members = search.genomes(np.arange(16))
+    assert members[0].tobytes() == leader(search).tobytes()
+    assert members[1].tobytes() == champion.tobytes()
+    assert asked.recipes["kind"].tolist() == [Kind.COPY] * 2 + [Kind.STEP, Kind.MIRRORED] * 7
+    search.tell(np.arange(16) == 1.0)  # who alone wins is the next centre, but for those it ties with by chance
+    moved, way = search.centre - members[0], champion - members[0]
+    assert moved @ way / np.linalg.norm(moved) / np.linalg.norm(way) > 0.95
+
+
+@settings(max_examples=60, derandomize=True)
+@given(data=st.data())
+def test_mirrored_pairs_meet_the_same_episodes(data):
+    population = data.draw(st.integers(4, 300))
+    groups = data.draw(st.integers(1, min(population // 2, 12)))
+    search = begun(SearchConfig(population=population, groups=groups))
+    elites = 1 + data.draw(st.booleans())
+    if elites == 2:
+        search.champion = np.zeros(GENES, dtype=F)
+    asked = search.ask()
+    kinds, seeds = asked.recipes["kind"], asked.recipes["seed"]
+    assert (kinds[:elites] == Kind.COPY).all()
+    children = np.arange(elites, population)
+    assert (kinds[children[::2]] == Kind.STEP).all()
+    assert (kinds[children[1::2]] == Kind.MIRRORED).all()
+    of = np.concatenate([np.full(part.stop - part.start, g) for g, part in enumerate(asked.groups)])
+    pairs = children[: len(children) // 2 * 2].reshape(-1, 2)
+    assert (of[pairs[:, 0]] == of[pairs[:, 1]]).all()
+    assert (seeds[pairs[:, 0]] == seeds[pairs[:, 1]]).all()
+    assert len(set(seeds[children[::2]].tolist())) == len(children[::2])
+
+
+@pytest.mark.parametrize("spec", [SPEC, CNN], ids=str)
+def test_members_lie_about_the_centre_as_far_as_its_steps_say(spec):
+    config = SearchConfig(population=401, groups=1, sigma=0.3)
+    search = begun(config, spec=spec)
+    search.variances = 10.0 ** np.random.default_rng(1).uniform(-2, 2, spec.size)
+    wanted = 0.3 * gene_scales(spec) * np.sqrt(search.variances)
+    np.testing.assert_allclose(search.steps(), wanted)
+    search.ask()
+    noise = (search.genomes(np.arange(1, 401)) - search.centre) / wanted
+    assert np.abs(noise.std(axis=0) - 1.0).max() < 6.0 / np.sqrt(400)
+    assert np.abs(noise[::2] + noise[1::2]).max() < 1e-2
+
+
+# --- What the scores do ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("best", [[3], [2, 5, 11], [1, 2], [4, 7, 9, 12]])
+@pytest.mark.parametrize("spec", [SPEC, CNN], ids=str)
+def test_the_next_centre_is_the_mean_of_who_wins(spec, best):
+    """Where tournaments are so large that only the best win, and all of them are equal."""
+    search = begun(SearchConfig(population=17, groups=1, tournament=10_000), spec=spec)
+    search.ask()
+    members = search.genomes(np.arange(17)).astype(float)
+    search.tell(np.isin(np.arange(17), best).astype(float))
+    np.testing.assert_allclose(search.centre, members[best].mean(axis=0), rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("champion", [False, True])
+def test_the_next_centre_is_the_weighted_mean_of_its_members(champion):
+    search = begun(SearchConfig(population=40, groups=4, tournament=3))
+    if champion:
+        search.champion = np.random.default_rng(4).normal(size=GENES).astype(F)
+    asked = search.ask()
+    members, scores = search.genomes(np.arange(40)).astype(float), np.random.default_rng(5).random(40)
+    search.tell(scores)
+    weights = tournament_weights(ranks(scores, asked.groups), 3)
+    np.testing.assert_allclose(search.centre, weights @ members, rtol=2e-5, atol=5e-6)
+
+
+def test_the_variances_follow_the_textbook():
+    """Separable CMA-ES without its path: 1 - rate of the old, rate of the winners' mean squared steps."""
+    search = begun(SearchConfig(population=41, groups=1, tournament=4))
+    search.variances = np.random.default_rng(1).uniform(0.1, 3.0, GENES)
+    before, steps, centre = search.variances.copy(), search.steps(), search.centre.copy()
+    search.ask()
+    z = (search.genomes(np.arange(1, 41)) - centre) / steps
+    scores = np.random.default_rng(2).random(41)
+    search.tell(scores)
+    weights = tournament_weights(scores, 4)
+    wanted = weights[1:] @ z**2 / weights[1:].sum()
+    rates = (search.variances / before - 1.0) / (wanted - 1.0)
+    far = np.abs(wanted - 1.0) > 0.1
+    effective = 1.0 / (weights**2).sum()
+    rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((GENES + 2.0) ** 2 + effective) * (GENES + 2.0) / 3.0
+    assert rates[far] == pytest.approx(rate, rel=1e-3)
+
+
+@pytest.mark.parametrize("population", [17, 41])
+def test_equal_scores_move_nothing(population):
+    search = begun(SearchConfig(population=population, groups=2))
+    before = snapshot(search)
+    for score in (0.0, -np.inf, np.nan):
+        told(search, lambda genomes: np.full(len(genomes), score))  # noqa: B023
+        after = snapshot(search)
+        assert all(after[0][name] == before[0][name] for name in ("centre", "path"))
+        assert after[1] == before[1]
+    assert (search.variances > 0.0).all()
+
+
+def test_a_shift_of_a_groups_scores_changes_nothing():
+    states = []
+    for easier in (0.0, 1e3):
+        search = begun(SearchConfig(population=20, groups=2))
+        for k in range(3):
+            scores = np.random.default_rng(k).random(20)
+            search.ask()
+            scores[search.asked.groups[1]] += easier
+            search.tell(scores)
+        states.append(snapshot(search))
+    assert states[0] == states[1]
+
+
+@pytest.mark.parametrize(("population", "groups", "tournament"), [(17, 1, 8), (65, 2, 8), (64, 4, 2)])
+def test_where_chance_decides_sigma_does_not_drift(population, groups, tournament):
+    """The path is N(0, 1) in each gene; the step size does as a random walk does."""
+    squares, ends = [], []
+    for seed in range(6):
+        search = begun(SearchConfig(population=population, groups=groups, tournament=tournament), seed)
+        rng = np.random.default_rng(seed)
+        for _ in range(150):
+            told(search, lambda genomes: rng.random(len(genomes)))  # noqa: B023
+            squares.append((search.path**2).mean())
+            assert 0.1 < search.sigma < 10.0
+        ends.append(np.log(search.sigma))
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.08)
+    assert abs(np.mean(ends)) < 0.6
+
+
+@pytest.mark.parametrize("axis", [True, False])
+def test_on_a_slope_sigma_grows(axis):
+    way = np.eye(GENES)[0] if axis else np.random.default_rng(2).normal(size=GENES)
+    search = begun(SearchConfig(population=33, groups=1))
+    for _ in range(120):
+        told(search, lambda genomes: genomes @ way)
+    sizes = search.steps() * np.abs(way) / np.linalg.norm(way)
+    assert np.linalg.norm(sizes) > 100.0
+    assert search.centre @ way / np.linalg.norm(way) > 1000.0
+
+
+def test_about_a_point_sigma_shrinks():
+    search = begun(SearchConfig(population=33, groups=1), genome=np.full(GENES, 1e-3, dtype=F))
+    for _ in range(120):
+        told(search, lambda genomes: -(genomes.astype(float) ** 2).sum(axis=1))
+    assert search.steps().max() < 0.1
+
+
+# Medians of 7 runs of pycma 4.5.0, CMAEvolutionStrategy(x0, 1.0, {"CMA_diagonal": True, "popsize": 33}), which is
+# separable CMA-ES (Ros and Hansen 2008): evaluations of 49 genes from N(0, 1) to 1e-9 of what the start is worth.
+# The functions are sums over i of c ** (i / 48) * x_i ** 2, c their condition.
+REFERENCE = {1.0: 7_821, 1e4: 8_877, 1e6: 10_065}
+
+
+@pytest.mark.parametrize("tournament", [4, 8])
+@pytest.mark.parametrize("condition", REFERENCE)
+def test_it_is_about_as_fast_as_separable_cma_es(condition, tournament):
+    weights, needed = condition ** (np.arange(GENES) / (GENES - 1)), []
+
+    def value(genomes):
+        return (genomes.astype(float) ** 2) @ weights
+
+    for seed in range(1, 6):
+        search = begun(SearchConfig(population=33, groups=1, tournament=tournament), seed)
+        goal = 1e-9 * value(leader(search)[None])[0]
+        while value(leader(search)[None])[0] > goal and search.generation < 1000:
+            told(search, lambda genomes: -value(genomes))
+        needed.append(33 * search.generation)
+    assert np.median(needed) < 2.0 * REFERENCE[condition]
+
+
+# --- Beginning and resuming ------------------------------------------------------------------------------------------
+
+
+def test_a_run_may_begin_with_a_genome():
+    genome = np.random.default_rng(1).normal(size=GENES).astype(F)
+    search = Recombination(SPEC, SearchConfig(population=20, groups=1, sigma=0.25), seed=12)
+    search.begin_with(genome)
+    genome[0] += 1.0  # it is a copy
+    assert leader(search)[1:].tobytes() == genome[1:].tobytes()
+    assert leader(search)[0] != genome[0]
+    assert leader(search).dtype == F
+    asked = search.ask()
+    members = search.genomes(np.arange(20))
+    assert len({m.tobytes() for m in members}) == 20
+    assert np.std(members[1:] - members[0]) == pytest.approx(0.25, rel=0.1)
+    assert breed(asked.parents, asked.recipes, asked.key, SPEC, Mutation()).tobytes() == members.tobytes()
+
+
+def test_the_same_seed_is_the_same_run_and_another_is_not():
+    runs = []
+    for seed in (1, 1, 2):
+        search = Recombination(SPEC, SearchConfig(population=20, groups=2), seed=seed)
+        runs.append(b"".join(told(search, first_gene).tobytes() for _ in range(4)))
+    assert runs[0] == runs[1] != runs[2]
+
+
+@pytest.mark.parametrize("generations", [0, 1, 4])
+def test_a_restored_search_goes_on_bit_for_bit(generations):
+    search, again = (Recombination(SPEC, SearchConfig(population=20, groups=2), seed=10) for _ in range(2))
+    for _ in range(generations):
+        told(search, first_gene)
+    arrays, numbers = search.state()
+    again.restore({name: array.copy() for name, array in arrays.items()}, dict(numbers))
+    again.generation = search.generation
+    for _ in range(3):
+        assert told(search, first_gene).tobytes() == told(again, first_gene).tobytes()
+        assert snapshot(search) == snapshot(again)
+
+
+def test_the_state_is_not_changed_by_what_comes_after():
+    """It is saved while the workers are at the next generation."""
+    search = begun(SearchConfig(population=20, groups=2))
+    told(search, first_gene)
+    arrays, _ = search.state()
+    before = {name: array.copy() for name, array in arrays.items()}
+    search.ask()
+    assert all(np.array_equal(arrays[name], before[name]) for name in before)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("centre", np.zeros(GENES - 1)),
+        ("centre", np.zeros(GENES, F)),
+        ("centre", np.full(GENES, np.nan)),
+        ("centre", np.zeros((0, 2))),
+        ("path", np.zeros(GENES + 1)),
+        ("path", np.zeros((GENES, 1))),
+        ("path", np.full(GENES, np.inf)),
+        ("variances", np.zeros(GENES)),
+        ("variances", -np.ones(GENES)),
+        ("variances", np.full(GENES, np.nan)),
+        ("variances", np.ones(GENES, F)),
+        ("sigma", 0.0),
+        ("sigma", -1.0),
+        ("sigma", np.nan),
+        ("sigma", np.inf),
+        ("sigma", None),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(name, value):
+    search = begun(SearchConfig(population=20, groups=2))
+    told(search, first_gene)
+    before = snapshot(search)
+    arrays, numbers = search.state()
+    part = arrays if name in arrays else numbers
+    part[name] = value
+    with pytest.raises((TypeError, ValueError)):
+        search.restore(arrays, numbers)
+    assert snapshot(search) == before
+
+
+def test_a_state_without_all_its_parts_is_refused():
+    search = begun(SearchConfig(population=20, groups=2))
+    arrays, numbers = search.state()
+    for name in arrays:
+        with pytest.raises(KeyError):
+            search.restore({other: array for other, array in arrays.items() if other != name}, numbers)
+    with pytest.raises(KeyError):
+        search.restore(arrays, {})

@@ -1,0 +1,228 @@
+"""What searches share: ranks within groups, tournaments in closed form, groups of pairs, the order of ask and tell."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from evolution.policy import PolicySpec
+from evolution.recombination import Recombination
+from evolution.search import SearchConfig, checked, ranks, recipes, split, tournament_weights, tournaments
+from evolution.two_parents import TwoParents
+
+SPEC = PolicySpec.parse("mlp:1")
+SEARCHES = [Recombination, TwoParents]
+few = st.integers(0, 4)  # scores that are often equal
+
+
+# --- Ranks -----------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, derandomize=True)
+@given(scores=st.lists(few | st.just(-np.inf), min_size=2, max_size=40).map(np.array), data=st.data())
+def test_a_rank_is_the_share_of_its_group_with_lower_scores_equals_by_half(scores, data):
+    cuts = sorted(data.draw(st.sets(st.integers(1, len(scores) - 1), max_size=4)))
+    groups = [slice(a, b) for a, b in itertools.pairwise([0, *cuts, len(scores)])]
+    standing = ranks(scores, groups)
+    for group in groups:
+        for own, score in zip(standing[group], scores[group], strict=True):
+            lower, equal = (scores[group] < score).sum(), (scores[group] == score).sum()
+            assert own == pytest.approx((lower + equal / 2) / len(scores[group]))
+    assert ((standing > 0.0) & (standing < 1.0)).all()
+
+
+def test_who_met_easier_episodes_does_not_stand_better():
+    rng = np.random.default_rng(5)
+    scores = np.concatenate([rng.random(32), 10.0 + rng.random(32)])
+    standing = ranks(scores, [slice(0, 32), slice(32, 64)])
+    assert np.array_equal(np.sort(standing[:32]), np.sort(standing[32:]))
+    assert np.array_equal(np.argsort(standing[:32]), np.argsort(scores[:32]))
+
+
+# --- Tournaments -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "size"), [(20, 1), (20, 2), (20, 3), (12, 8), (2, 2), (7, 1000)])
+def test_weights_are_their_closed_form(n, size):
+    """Of n members, k drawn with replacement: rank i (1 is best) wins ((n - i + 1)^k - (n - i)^k) / n^k of them."""
+    scores = np.random.default_rng(n).permutation(n).astype(float)
+    place = n - scores  # 1 to n
+    expected = [((n - int(i) + 1) ** size - (n - int(i)) ** size) / n**size for i in place]
+    np.testing.assert_allclose(tournament_weights(scores, size), expected, rtol=1e-9, atol=1e-300)
+
+
+@given(scores=st.lists(few, min_size=1, max_size=5), size=st.integers(1, 4))
+def test_weights_are_what_all_tournaments_come_to(scores, size):
+    """Every tournament that can be, its equal winners sharing it."""
+    scores, wins = np.array(scores), np.zeros(len(scores))
+    for drawn in itertools.product(range(len(scores)), repeat=size):
+        best = [k for k in drawn if scores[k] == scores[list(drawn)].max()]
+        for k in best:
+            wins[k] += 1.0 / len(best)
+    np.testing.assert_allclose(tournament_weights(scores, size), wins / len(scores) ** size, atol=1e-12)
+
+
+@given(scores=st.lists(few, min_size=1, max_size=60).map(np.array), size=st.integers(1, 100))
+def test_weights_are_shares_and_equals_have_the_same(scores, size):
+    weights = tournament_weights(scores, size)
+    assert weights.sum() == pytest.approx(1.0)
+    assert (weights >= 0.0).all()
+    for score in np.unique(scores):
+        assert len(set(weights[scores == score])) == 1
+    assert (np.diff(weights[np.argsort(scores, kind="stable")]) >= -1e-15).all()
+
+
+def test_tournaments_of_one_are_a_draw():
+    assert tournament_weights(np.arange(10.0), 1) == pytest.approx(np.full(10, 0.1))
+
+
+@pytest.mark.parametrize(("n", "size"), [(20, 1), (20, 2), (20, 3), (12, 8), (2, 2)])
+def test_tournaments_are_won_at_their_weights(n, size):
+    rng = np.random.default_rng(100 * n + size)
+    scores, count = rng.permutation(n).astype(float), 60_000
+    winners = tournaments(scores, size, count, rng)
+    assert winners.shape == (count,)
+    seen, expected = np.bincount(winners, minlength=n), count * tournament_weights(scores, size)
+    likely = expected >= 5
+    seen = np.append(seen[likely], seen[~likely].sum())
+    expected = np.append(expected[likely], expected[~likely].sum())
+    assert stats.chisquare(seen[expected > 0], expected[expected > 0]).pvalue > 1e-3
+
+
+def test_equal_scores_win_equally():
+    rng = np.random.default_rng(1)
+    scores = np.array([0.0, 3.0, 3.0, 1.0, 3.0, 1.0, 0.0, 0.0])
+    seen = np.bincount(tournaments(scores, 2, 50_000, rng), minlength=8)
+    assert stats.chisquare(seen, 50_000 * tournament_weights(scores, 2)).pvalue > 1e-3
+
+
+# --- Groups ----------------------------------------------------------------------------------------------------------
+
+
+@given(data=st.data())
+def test_pairs_stay_together_in_groups_of_about_as_many(data):
+    members = data.draw(st.integers(4, 300))
+    groups = data.draw(st.integers(1, members // 2))
+    first = data.draw(st.integers(0, 2))
+    parts = split(members, groups, first)
+    assert len(parts) == groups
+    assert [k for part in parts for k in range(part.start, part.stop)] == list(range(members))
+    for part in parts[1:]:
+        assert (part.start - first) % 2 == 0  # no pair is cut
+    sizes = np.array([part.stop - part.start for part in parts])
+    sizes[0] -= first
+    assert np.ptp((sizes + 1) // 2) <= 1
+
+
+# --- Order of ask and tell -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_out_of_order_raises(kind):
+    search = kind(SPEC, SearchConfig(population=40, groups=2), seed=9)
+    with pytest.raises(RuntimeError, match="without ask"):
+        search.tell(np.zeros(40))
+    with pytest.raises(RuntimeError, match="asked for"):
+        search.genomes(np.arange(40))
+    search.ask()
+    with pytest.raises(RuntimeError, match="twice"):
+        search.ask()
+    for wrong in (np.zeros(39), np.zeros((40, 1)), np.zeros(0)):
+        with pytest.raises(ValueError, match="40 members"):
+            search.tell(wrong)
+    search.tell(np.zeros(40))  # what was refused has changed nothing
+    assert search.generation == 1
+    with pytest.raises(RuntimeError, match="without ask"):
+        search.tell(np.zeros(40))
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_the_first_generation_is_new_and_its_groups_cover_it(kind):
+    search = kind(SPEC, SearchConfig(population=41, groups=3), seed=4)
+    assert search.leader() is None
+    asked = search.ask()
+    assert asked.parents.shape == (0, SPEC.size)
+    assert len({genome.tobytes() for genome in search.genomes(np.arange(41))}) == 41
+    assert 0 <= asked.key < 2**63
+    assert asked.groups == split(41, 3)
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_each_generation_has_a_key_of_its_own(kind):
+    search, keys = kind(SPEC, SearchConfig(population=8, groups=1), seed=4), []
+    for _ in range(50):
+        keys.append(search.ask().key)
+        search.tell(np.arange(8.0))
+    assert len(set(keys)) == 50
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
+def test_a_score_that_is_not_a_number_loses(kind, bad):
+    """The search goes as if it were lower than all others'."""
+    states = []
+    for spoilt in (bad, -1e300):
+        search = kind(SPEC, SearchConfig(population=16, groups=2, tournament=4), seed=6)
+        for generation in range(4):
+            search.ask()
+            scores = np.random.default_rng(generation).normal(size=16)
+            scores[[2, 3, 11]] = spoilt
+            search.tell(scores)
+        arrays, numbers = search.state()
+        states.append(({name: array.tobytes() for name, array in arrays.items()}, numbers))
+    assert states[0] == states[1]
+
+
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_a_generation_of_nothing_but_not_a_number_goes_on(kind):
+    search = kind(SPEC, SearchConfig(population=16, groups=2), seed=8)
+    for scores in (np.full(16, np.nan), np.full(16, np.nan), np.arange(16.0)):
+        search.ask()
+        search.tell(scores)
+    assert search.generation == 3
+    search.ask()
+    assert np.isfinite(search.genomes(np.arange(16))).all()
+
+
+# --- Parameters ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ({"population": 3}, "population must be 4 or more"),
+        ({"population": -1}, "population must be 4 or more"),
+        ({"population": 10, "groups": 6}, "no 6 groups"),
+        ({"groups": 0}, "no 0 groups"),
+        ({"tournament": 0}, "tournament"),
+        ({"sigma": 0.0}, "sigma"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"sigma": np.inf}, "sigma"),
+        ({"sigma": np.nan}, "sigma"),
+        ({"mutation_rate": -0.1}, "mutation rate"),
+        ({"mutation_rate": 1.1}, "mutation rate"),
+        ({"mutation_rate": np.nan}, "mutation rate"),
+    ],
+)
+@pytest.mark.parametrize("kind", SEARCHES)
+def test_parameters_that_do_not_fit_are_refused_in_one_line(kind, wrong, told):
+    with pytest.raises(ValueError, match=rf"^[^\n]*{told}[^\n]*$"):
+        kind(SPEC, SearchConfig(**wrong), seed=1)
+
+
+def test_recipes_differ_by_their_seeds_alone():
+    made = recipes(5)
+    assert made["seed"].tolist() == [0, 1, 2, 3, 4]
+    assert all((made[name] == 0).all() for name in ("kind", "a", "b"))
+
+
+@pytest.mark.parametrize(
+    "array", [np.zeros(3), np.zeros((2, 1)), np.zeros(2, np.float32), np.array([1.0, np.nan]), np.array([np.inf, 0.0])]
+)
+def test_an_array_that_does_not_fit_is_refused(array):
+    assert checked(np.zeros(2), (2,), np.float64).tolist() == [0.0, 0.0]
+    with pytest.raises(ValueError, match=r"^it holds [^\n]*in place of float64\[2\]$"):
+        checked(array, (2,), np.float64)
