@@ -117,7 +117,7 @@ class Evolution(Learning):
                 self.search.carry(self.champion.genome)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         row = {
-            "fitness/best": led_score,
+            "fitness/best": led_score if np.isfinite(led_score) else -1.0,
             "fitness/mean": float(finite.mean()) if finite.size else -1.0,
             "fitness/std": float(finite.std()) if finite.size else 0.0,
             "distance_m/best": float(led["distance"].mean()),
@@ -199,6 +199,8 @@ class Evolution(Learning):
         check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
         searched = {name.removeprefix("search_"): array for name, array in arrays.items() if name.startswith("search_")}
         self.search.restore(searched, meta["search"])
+        if generation and self.search.leader() is None:
+            raise ValueError("it has no genomes to go on with")
         self.search.generation = generation
         if self.champion is not None:
             self.search.carry(self.champion.genome)

@@ -112,7 +112,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
             raise RunError(f"{path}: too large for a run's {CONFIG}")
         config = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(config, dict) and config.get("format") in OLD_FORMATS:
-            raise RunError(f"{path} is of a run of GridSim 0.1, whose search is no more; start a new run")
+            raise RunError(f"{path} is of a run of GridSim 0.1, which this version cannot go on with; start a new run")
         if not isinstance(config, dict) or config.get("format") != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim")
         settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))

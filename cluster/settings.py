@@ -210,9 +210,14 @@ class EvolveSettings(RunSettings):
             raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
         _check_share(self, "mutation_rate")
         for name in ("elites", "mutation_rate"):
-            if self.recombination == "all" and getattr(self, name) != getattr(EvolveSettings, name):
+            if (
+                self.recombination == "all"
+                and self.search != "random"
+                and getattr(self, name) != getattr(EvolveSettings, name)
+            ):
                 raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two")
-        if not 0 <= self.elites <= MAX_ELITES or (self.recombination == "two" and self.elites >= self.population):
+        classic = self.recombination == "two" or self.search == "random"
+        if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
             raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
         try:
             self.search_config().check()

@@ -40,8 +40,14 @@ def what(settings: RunSettings) -> str:
 def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
     """Settings that are not what they are by default, but for those that decide when a run ends."""
     kind = type(settings)
-    usual = to_dict(kind(scenario=settings.scenario, observation=settings.observation, traffic=settings.traffic))
-    usual["traffic"] = kind(scenario=settings.scenario).traffic
+    alike = {
+        name: getattr(settings, name)
+        for name in ("scenario", "observation", "traffic", "recombination")
+        if hasattr(settings, name)
+    }
+    usual = to_dict(kind(**alike)) | {"traffic": kind(scenario=settings.scenario).traffic}
+    if "recombination" in usual:
+        usual["recombination"] = "all"
     left_out = {"seed", *settings.unbound, *without}
     return {name: value for name, value in to_dict(settings).items() if name not in left_out and value != usual[name]}
 

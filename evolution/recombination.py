@@ -2,7 +2,8 @@
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
 adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Children come
-in mirrored pairs (Brockhoff et al. 2010) that meet the same episodes. The centre and the champion are the elites.
+in mirrored pairs (Brockhoff et al. 2010) that meet the same episodes. The centre and the champion (before there is one,
+the average of centres) are the elites: they are driven unmodified, and may win like all others.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from evolution.breeding import Kind, Mutation, moments
 from evolution.policy import PolicySpec, gene_scales
 from evolution.search import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournament_weights
 
-_CENTRE, _STEPS, _CHAMPION = 0, 1, 2  # rows of the parents that are broadcast
+_CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
+_ELITES = 2  # the centre, and the champion: before there is one, the average
 _KEPT = 0.9  # of the average of centres, in each generation
 
 
@@ -64,33 +66,27 @@ class Recombination(Search):
             made["kind"] = Kind.NEW
             none = np.zeros((0, self.spec.size), dtype=np.float32)
             return Asked(none, made, key, Mutation(), split(n, self.config.groups))
-        rows = [self.centre, self.steps()]
-        if self.champion is not None:
-            rows.append(self.champion)
-        elites = len(rows) - 1
-        made["kind"], made["a"], made["seed"] = Kind.COPY, _CENTRE, 0
-        made["a"][1:elites] = _CHAMPION
-        child = np.arange(n - elites)
-        made["kind"][elites:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
-        made["b"][elites:] = _STEPS
-        made["seed"][elites:] = child // 2
-        return Asked(np.stack(rows).astype(np.float32), made, key, Mutation(), split(n, self.config.groups, elites))
+        other = self.average if self.champion is None else self.champion
+        rows = np.stack([self.centre, self.steps(), other]).astype(np.float32)
+        made["kind"], made["seed"] = Kind.COPY, 0
+        made["a"][:_ELITES] = _CENTRE, _OTHER
+        child = np.arange(n - _ELITES)
+        made["kind"][_ELITES:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
+        made["a"][_ELITES:], made["b"][_ELITES:] = _CENTRE, _STEPS
+        made["seed"][_ELITES:] = child // 2
+        return Asked(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
 
     def _tell(self, asked: Asked, scores: np.ndarray) -> None:
-        if not len(self.centre):
+        if not len(self.centre):  # whose score is the best, though groups met different episodes
             self.begin_with(self.genomes(np.array([scores.argmax()]))[0])
             return
         weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
         effective = 1.0 / float((weights**2).sum())  # mu_eff
-        elites = len(asked.parents) - 1
-        children = np.append(weights[elites:], np.zeros((len(weights) - elites) % 2))
-        plus, minus = children[::2], children[1::2]
+        pairs = (len(weights) - _ELITES) // 2  # of an odd population the last member has no mirror image and no say
+        plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
         genes, shift = self.spec.size, plus - minus
-        first, second = moments(np.arange(len(shift)), shift, plus + minus, asked.key, genes)
-        toward = self.steps() * first
-        if elites == 2:
-            toward += weights[1] * (asked.parents[_CHAMPION] - self.centre)
-        self.centre = self.centre + toward
+        first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, genes)
+        self.centre = self.centre + self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
         # Under random selection, first / norm is N(0, 1) in each gene, whatever the weights of a pair are.
         norm = math.sqrt(float((shift**2).sum()))
@@ -100,10 +96,11 @@ class Recombination(Search):
             expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
             self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
-        if children.sum() > 0.0:
+        share = float((plus + minus).sum())
+        if share > 0.0:
             rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
             rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
-            self.variances *= 1.0 - rate + rate * second / children.sum()
+            self.variances = self.variances * (1.0 - rate + rate * second / share)
 
     def state(self) -> tuple[Arrays, dict[str, float]]:
         names = ("centre", "average", "path", "variances")
