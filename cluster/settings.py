@@ -28,7 +28,7 @@ LEAST_GROUP = 16  # members of a group, of whom the best are to be good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default.
-CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 80_000_000
+CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -88,7 +88,8 @@ class RunSettings:
         if self.pace:
             return CurriculumConfig(pace=self.pace + 1.15, champion_pace=self.pace)
         if self.traffic:
-            return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3)
+            # What befalls a car in traffic is chance: it takes more episodes to tell who drives well.
+            return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3, starts=3, crash_starts=3)
         return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
 
     def extending(self, base: RunSettings) -> Self:
@@ -136,27 +137,27 @@ class EvolveSettings(RunSettings):
     """What an evolution run depends on."""
 
     command: ClassVar[str] = "gridsim-evolve"
-    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:32+steering", "grid": "cnn:8,16,32@1"}
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64+steering", "grid": "cnn:8,16,32@1"}
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
-    closer, +steering if it sees how its own wheels stand; by default mlp:32+steering, in traffic
-    mlp:32+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of
+    closer, +steering if it sees how its own wheels stand; by default mlp:64+steering, in traffic
+    mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of
     a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 256
     """Members of a generation."""
     generations: int = 0
     """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
-    otherwise no more than 30 million car-steps, in traffic 80."""
+    otherwise no more than 30 million car-steps, in traffic 60."""
     recombination: Literal["all", "two"] = "all"
     """Whose genes a child has: all winners of the tournaments, averaged into one centre (an evolution strategy), or
     two parents' (the classic genetic algorithm)."""
     tournament: int = 8
     """Members of a tournament."""
-    sigma: float = 0.0
-    """Standard deviation of mutation, of all winners' centre at the beginning; 0: 1, of two parents' children 0.5."""
+    sigma: float = 0.5
+    """Standard deviation of mutation; that of all winners' centre adapts from there."""
     elites: int = 8
     """With --recombination two: members that go on unmodified."""
     mutation_rate: float = 0.03
@@ -166,8 +167,6 @@ class EvolveSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.sigma:
-            object.__setattr__(self, "sigma", 0.5 if self.recombination == "two" else 1.0)
         if not self.generations and not self.car_steps:
             object.__setattr__(self, "car_steps", self.default_car_steps())
 

@@ -41,11 +41,11 @@ class CurriculumConfig:
     maps: int = 16  # training maps
     first_maps: int = 4  # of these, how many the first generation meets ...
     map_generations: int = 4  # ... and after how many there is one more, so that none needs to be waited for
-    groups: int = 4  # of members, each with episodes of its own
+    groups: int = 8  # of members, each with episodes of its own
     starts: int = 1  # new episodes of a group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, their length
-    crash_memory: int = 16  # crashes that are remembered: the latest, as the leader no longer has older ones
+    crash_memory: int = 64  # crashes that are remembered
     crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
     rewind: int = 64  # control steps before the crash
     leader_episodes: int = 16  # that the leader drives in each generation

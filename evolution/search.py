@@ -22,9 +22,9 @@ class SearchConfig:
     """Parameters of a search; `elites` and `mutation_rate` are those of two parents alone."""
 
     population: int = 256  # members of a generation
-    groups: int = 4  # of members, each of which meets episodes of its own
+    groups: int = 8  # of members, each of which meets episodes of its own
     tournament: int = 8  # members of a tournament
-    sigma: float = 1.0  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
+    sigma: float = 0.5  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
     elites: int = 8  # members that go on unmodified
     mutation_rate: float = 0.03  # share of genes that mutate
 

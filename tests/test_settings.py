@@ -10,7 +10,7 @@ from gridsim.scenarios import REGISTRY
 
 
 def test_the_policy_follows_the_observation():
-    assert EvolveSettings().policy == "mlp:32+steering"
+    assert EvolveSettings().policy == "mlp:64+steering"
     assert EvolveSettings(observation="grid").policy == "cnn:8,16,32@1"
     assert EvolveSettings(observation="grid", policy="cnn").policy == "cnn"
     for settings in (EvolveSettings(), EvolveSettings(observation="grid"), EvolveSettings(policy="mlp:3")):
@@ -80,9 +80,9 @@ def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it
 
 def test_evolution_sees_motion_in_traffic():
     for scenario in REGISTRY:
-        assert EvolveSettings(scenario, traffic=2).policy == "mlp:32+motion+steering"
-        assert EvolveSettings(scenario, traffic=0).policy == "mlp:32+steering"
-    assert EvolveSettings("city").policy == "mlp:32+motion+steering"
+        assert EvolveSettings(scenario, traffic=2).policy == "mlp:64+motion+steering"
+        assert EvolveSettings(scenario, traffic=0).policy == "mlp:64+steering"
+    assert EvolveSettings("city").policy == "mlp:64+motion+steering"
     assert EvolveSettings("city", observation="grid").policy == EvolveSettings(observation="grid").policy
     assert EvolveSettings("city", policy="mlp:5").policy == "mlp:5"
 

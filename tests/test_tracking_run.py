@@ -50,23 +50,23 @@ def test_seeds_are_one_group_and_nothing_else_is():
     def of(kind=EvolveSettings, **settings):
         return group(kind("curved", **settings))
 
-    assert of() == of(seed=1) == of(generations=5) == "curved evolution mlp:32+steering"
+    assert of() == of(seed=1) == of(generations=5) == "curved evolution mlp:64+steering"
     others = [
         of(population=64), of(policy="mlp:8"), of(traffic=3), of(search="random"), of(observation="grid"),
         of(sigma=0.1), of(recombination="two"), of(DqnSettings), of(DqnSettings, double=False),
         of(DqnSettings, observation="grid"),
     ]  # fmt: skip
     assert len({of(), *others}) == 1 + len(others)
-    assert of(population=64, sigma=0.1) == "curved evolution mlp:32+steering, population 64, sigma 0.1"
+    assert of(population=64, sigma=0.1) == "curved evolution mlp:64+steering, population 64, sigma 0.1"
     assert of(DqnSettings, observation="grid") == "curved dqn cnn:16,32,256@4"
-    assert of(search="random", traffic=3) == "curved random mlp:32+motion+steering 3 cars"
+    assert of(search="random", traffic=3) == "curved random mlp:64+motion+steering 3 cars"
 
 
 def test_tags_and_params_name_everything():
     found = tags(EvolveSettings("highway", seed=4, search="random"))
     assert found.items() >= {
-        "algorithm": "evolution", "search": "random", "scenario": "highway", "seed": "4", "policy": "mlp:32+motion+steering",
-        "observation": "rays", "traffic": "8", "group": "highway random mlp:32+motion+steering 8 cars",
+        "algorithm": "evolution", "search": "random", "scenario": "highway", "seed": "4", "policy": "mlp:64+motion+steering",
+        "observation": "rays", "traffic": "8", "group": "highway random mlp:64+motion+steering 8 cars",
     }.items()  # fmt: skip
     assert tags(DqnSettings())["algorithm"] == "dqn"
     assert params(EvolveSettings()).items() >= {"population": "256", "vehicle/wheelbase": "2.5"}.items()
@@ -94,7 +94,7 @@ def test_the_description_says_what_came_of_it_and_how_to_watch_it(tmp_path):
     run = new_run(tmp_path, "mine", EvolveSettings("curved", seed=3, traffic=2))
     begun, done = describe(run), describe(run, SUMMARY)
     assert begun.splitlines()[0] == done.splitlines()[0]
-    assert begun.startswith("Evolution of a `mlp:32+motion+steering` driver on **curved**, among 2 cars, seed 3.")
+    assert begun.startswith("Evolution of a `mlp:64+motion+steering` driver on **curved**, among 2 cars, seed 3.")
     for words in ("48 generations, 96.3 million car-steps and 57 s", "**98.4%**", "7.61 m/s", "collides in 1.6%",
                   f"gridsim-watch {tmp_path}/mine", "champion.mp4", "float32 [n, 64]", "gridsim-curved-evolution",
                   'load_model("runs:/{run_id}/model")'):  # fmt: skip

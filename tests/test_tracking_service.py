@@ -112,7 +112,7 @@ def test_a_run_outlives_an_outage_and_loses_nothing(served):
     assert (served.codes["during"], err) == (0, "")
     run = check_complete(served, "during")
     assert run.info.run_name == "during: curved-evolution-s5 2 cars"
-    assert run.data.tags["group"] == "curved evolution mlp:32+motion+steering 2 cars, until 2.0, population 48"
+    assert run.data.tags["group"] == "curved evolution mlp:64+motion+steering 2 cars, until 2.0, population 48"
 
 
 def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
