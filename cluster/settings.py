@@ -85,12 +85,12 @@ class RunSettings:
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
         low, _ = speed_interval(self.scenario)
+        pace, champion_pace = (low + 0.8, low + 0.3) if self.traffic else (low + 2.0, low + 0.85)
         if self.pace:
-            return CurriculumConfig(pace=self.pace + 1.15, champion_pace=self.pace)
-        if self.traffic:
-            # What befalls a car in traffic is chance: it takes more episodes to tell who drives well.
-            return CurriculumConfig(pace=low + 0.8, champion_pace=low + 0.3, starts=3, crash_starts=3)
-        return CurriculumConfig(pace=low + 2.0, champion_pace=low + 0.85)
+            pace, champion_pace = self.pace + 1.15, self.pace
+        # What befalls a car in traffic is chance: it takes more episodes to tell who drives well.
+        episodes = 3 if self.traffic else 1
+        return CurriculumConfig(pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes)
 
     def extending(self, base: RunSettings) -> Self:
         """These, asked for where a run of `base` goes on: its bounds may be greater."""
