@@ -144,8 +144,8 @@ class EvolveSettings(RunSettings):
     policy: str = ""
     """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
     closer, +steering if it sees how its own wheels stand; by default mlp:64+steering, in traffic
-    mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units of
-    a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
+    of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 256
     """Members of a generation."""
     generations: int = 0

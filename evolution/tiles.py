@@ -1,8 +1,8 @@
 """Vector code for layers, their sums held in registers.
 
 `dense` is for some units of a perceptron's layer, `tile` for some positions times some units of a convolution's. A
-position's inputs lie in `planes` x `rows` runs of `run` numbers. The `vector_` ones emit LLVM vectors, the `plain_` ones
-are the same arithmetic in plain Python, for `NUMBA_DISABLE_JIT=1` and for the tests.
+position's inputs lie in `planes` x `rows` runs of `run` numbers. The `vector_` ones emit LLVM vectors; the `plain_`
+ones are the same arithmetic in plain Python, for `NUMBA_DISABLE_JIT=1` and for the tests.
 """
 
 from __future__ import annotations

@@ -65,7 +65,8 @@ def test_seeds_are_one_group_and_nothing_else_is():
 def test_tags_and_params_name_everything():
     found = tags(EvolveSettings("highway", seed=4, search="random"))
     assert found.items() >= {
-        "algorithm": "evolution", "search": "random", "scenario": "highway", "seed": "4", "policy": "mlp:64+motion+steering",
+        "algorithm": "evolution", "search": "random", "scenario": "highway", "seed": "4",
+        "policy": "mlp:64+motion+steering",
         "observation": "rays", "traffic": "8", "group": "highway random mlp:64+motion+steering 8 cars",
     }.items()  # fmt: skip
     assert tags(DqnSettings())["algorithm"] == "dqn"
