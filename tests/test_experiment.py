@@ -119,7 +119,7 @@ def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, tra
     assert {spec.observation for found in specs.values() for spec in found} == {observation}
     assert specs["evolution"] == specs["two-parents"] == specs["random"]
     if observation == "rays":
-        assert {spec.inputs for spec in specs["evolution"]} == {63 if traffic else 32}, plan
+        assert {spec.inputs for spec in specs["evolution"]} == {64 if traffic else 33}, plan
 
 
 def stop_after(done, count):
