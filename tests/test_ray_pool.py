@@ -35,6 +35,7 @@ from test_pool import (
 from cluster.pool import PoolError, SerialPool
 from cluster.ray_pool import RayPool, check_address
 from cluster.worker import CollectTask, Task
+from evolution.breeding import RECIPE
 from evolution.experience import Experience, to_bytes
 from gridsim.scenarios import Scenario
 
@@ -157,8 +158,8 @@ def test_results_progress_and_what_is_sent(pool: RayPool) -> None:
     assert told == sorted(told)
     assert told[-1] == (512, 512)
     assert outcome.retries == 0
-    assert 2 * 512 <= outcome.bytes_down <= 3 * 512 + 3 * len(told), "8 parents and 512 seeds"
-    assert outcome.bytes_up == outcome.results.nbytes + 9 * len(told), "these numbers are no distances: not packed"
+    assert outcome.bytes_down == 512 * RECIPE.itemsize
+    assert outcome.bytes_up == outcome.results.nbytes + 8 * len(told)
     assert 8 * 311 * 4 < outcome.broadcast_bytes < 8 * 311 * 4 + 2000
     assert set(outcome.busy_s) <= {0, 1}
     assert len(set(pool.pids())) == pool.workers() <= 2
@@ -238,8 +239,8 @@ def test_a_member_that_always_kills_is_lost_alone(pool: RayPool, folder: Path) -
     assert told[-1] == (512, 512)
     (warning,) = outcome.warnings
     assert warning.startswith(
-        "member 300 (parents 4 and 4, seed 300, key 0x3039) killed its worker 3 times and is lost; the last time its "
-        "process was killed, crashed, or ran out of memory (logs: "
+        "member 300 (cross of rows 4 and 4, seed 300, key 0x3039) killed its worker 3 times and is lost; the last time "
+        "its process was killed, crashed, or ran out of memory (logs: "
     )
     assert 3 <= 100 - int((folder / "kill-300").read_text()) <= 12, "workers that it cost"
     (folder / "kill-300").unlink()
