@@ -35,16 +35,15 @@ T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 
-_TWO = "of --recombination two it is fixed, and of all winners there is none"
 REMOVED = {
     "islands": "a run has one population; use --recombination all, the default, which needs no others",
     "island-car-steps": "a run has one population; use --car-steps for its budget",
-    "parents": f"the size of the mating pool: {_TWO}; use --tournament for the pressure of selection",
+    "parents": "the mating pool of --recombination two has a fixed size; use --tournament for selection pressure",
     "crossover": "all children of --recombination two have two parents; use --recombination",
     "bump-rate": "mutation is Gaussian; use --sigma for its size",
     "ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
 }
-"""Flags of gridsim-evolve that went with version 0.1, and what takes their place."""
+"""Flags of gridsim-evolve that version 0.1 had, and what takes their place."""
 
 
 class UsageError(Exception):
@@ -84,7 +83,7 @@ class RunFlags:
 
 @dataclass(frozen=True)
 class EvolveFlags(RunFlags, EvolveSettings):
-    """Evolve a driver: a genetic algorithm over neural networks, its population evaluated in parallel.
+    """Evolve a driver: a population of neural networks is evaluated in parallel and recombined.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
     curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
@@ -246,7 +245,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         for argument in arguments:
             flag = argument.partition("=")[0].removeprefix("--").replace("_", "-")
             if argument.startswith("--") and flag in REMOVED:
-                raise UsageError(f"--{flag} is no more: {REMOVED[flag]}")
+                raise UsageError(f"--{flag} was removed: {REMOVED[flag]}")
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
     if {"-h", "--help"} & set(arguments) or not (resume or config):
         flags = parse(kind, prog, arguments)

@@ -404,7 +404,7 @@ def champion_of(genome: np.ndarray, figures: list[float], genes: int) -> Champio
 
 
 class Bred(NamedTuple):
-    """Members to be driven: what their recipes refer to, and they."""
+    """Members to be driven: their recipes and the genomes that these refer to."""
 
     parents: np.ndarray  # float32 [p, genes]
     recipes: np.ndarray  # RECIPE [n]

@@ -29,7 +29,6 @@ class Kind(IntEnum):
 
 
 RECIPE = np.dtype([("kind", "u1"), ("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
-MAX_PARENTS = 65_500  # rows that a recipe can name
 
 _COPY, _NEW, _STEP, _MIRRORED = int(Kind.COPY), int(Kind.NEW), int(Kind.STEP), int(Kind.MIRRORED)
 _F, _U = np.float32, np.uint64

@@ -26,11 +26,11 @@ class Recombination(Search):
 
     Attributes:
         centre: float64 [genes], or [0] before the first generation.
-        path: float64 [genes], the evolution path: N(0, 1) in each gene where selection has no say, as at the beginning.
+        path: float64 [genes], the evolution path: N(0, 1) in each gene under random selection, as at the beginning.
         variances: float64 [genes], diagonal of the covariance, 1 at the beginning.
         sigma: step size over all genes.
         average: float64 [genes], of the latest centres, each of which weighs 0.9 times the next one.
-        champion: float32 [genes], carried beside the centre once there is one.
+        champion: float32 [genes], of the run; None before there is one.
     """
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
@@ -77,12 +77,12 @@ class Recombination(Search):
         return Asked(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
 
     def _tell(self, asked: Asked, scores: np.ndarray) -> None:
-        if not len(self.centre):  # whose score is the best, though groups met different episodes
+        if not len(self.centre):  # begin with the best score, although groups met different episodes
             self.begin_with(self.genomes(np.array([scores.argmax()]))[0])
             return
         weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
         effective = 1.0 / float((weights**2).sum())  # mu_eff
-        pairs = (len(weights) - _ELITES) // 2  # of an odd population the last member has no mirror image and no say
+        pairs = (len(weights) - _ELITES) // 2  # an odd last member has no mirror image and is left out
         plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
         genes, shift = self.spec.size, plus - minus
         first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, genes)

@@ -243,8 +243,8 @@ def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(flag, for
     monkeypatch.chdir(tmp_path)
     for spelling in (flag, flag.replace("-", "_")):
         (line,) = said_by(monkeypatch, capsys, *form.format(spelling).split())
-        assert line.startswith(f"gridsim-evolve: error: --{flag} is no more: ")
-        assert INSTEAD[flag] in line.split("no more: ")[1]
+        assert line.startswith(f"gridsim-evolve: error: --{flag} was removed: ")
+        assert INSTEAD[flag] in line.split("was removed: ")[1]
     assert list(tmp_path.iterdir()) == []
 
 

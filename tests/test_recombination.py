@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from searching import first_gene, leader, told
 
 from evolution.breeding import Kind, Mutation, breed
 from evolution.policy import PolicySpec, gene_scales
@@ -21,25 +22,6 @@ def begun(config, seed=1, spec=SPEC, genome=None):
     search = Recombination(spec, config, seed)
     search.begin_with(np.random.default_rng(seed).normal(size=spec.size).astype(F) if genome is None else genome)
     return search
-
-
-def told(search, score):
-    """One generation: asked for, and told `score(genomes)`; returns the genomes."""
-    search.ask()
-    genomes = search.genomes(np.arange(search.config.population))
-    search.tell(score(genomes))
-    return genomes
-
-
-def leader(search):
-    """Who leads: somebody does."""
-    found = search.leader()
-    assert found is not None
-    return found
-
-
-def first_gene(genomes):
-    return genomes[:, 0].astype(float)
 
 
 def snapshot(search):

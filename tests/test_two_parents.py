@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from searching import first_gene, leader, told
 
 from evolution.breeding import Kind, Mutation, breed
 from evolution.policy import PolicySpec
@@ -12,25 +13,6 @@ F = np.float32
 SPEC = PolicySpec.parse("mlp:3")
 CONFIG = SearchConfig(population=40, groups=1, tournament=3, sigma=0.5, elites=4)
 EVERYONE = np.arange(CONFIG.population)
-
-
-def told(search, score):
-    """One generation: asked for, and told `score(genomes)`; returns the genomes."""
-    search.ask()
-    genomes = search.genomes(np.arange(search.config.population))
-    search.tell(score(genomes))
-    return genomes
-
-
-def leader(search):
-    """Who leads: somebody does."""
-    found = search.leader()
-    assert found is not None
-    return found
-
-
-def first_gene(genomes):
-    return genomes[:, 0].astype(float)
 
 
 # --- Elites ----------------------------------------------------------------------------------------------------------
