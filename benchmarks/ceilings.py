@@ -209,7 +209,7 @@ def gene_costs() -> tuple[float, float]:
         times = [time.perf_counter()]
         breed(rows(2), recipes, 1, spec, Mutation())
         times.append(time.perf_counter())
-        moments(np.arange(pairs), weights, weights**2, 1, spec.size)
+        moments(np.arange(pairs), weights, weights**2, 1, spec)
         times.append(time.perf_counter())
         bred.append(times[1] - times[0])
         recombined.append(times[2] - times[1])

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from evolution.policy import PolicySpec, gene_scales
+from evolution.symmetry import symmetry
 from gridsim.counter import GOLDEN, mix
 from gridsim.jit import njit
 from gridsim.roads import freeze
@@ -22,7 +23,7 @@ class Kind(IntEnum):
     """How a child is made from the rows of `parents` that its recipe names."""
 
     COPY = 0  # parents[a], unmodified
-    NEW = 1  # a random genome
+    NEW = 1  # a random genome, symmetric as all noise but that of CROSS is (`symmetry`)
     STEP = 2  # parents[a] + parents[b] * N(0, 1): a centre, and a standard deviation for each gene
     MIRRORED = 3  # parents[a] - parents[b] * N(0, 1): with the same seed the mirror image of a STEP
     CROSS = 4  # uniform crossover of parents[a] and parents[b], then Gaussian mutation
@@ -60,8 +61,8 @@ def _stream(key, seed):
 
 
 @njit
-def _normals(quantiles, stream, scale, out):
-    """out[i] = scale[i] * N(0, 1); four numbers from each 64 random bits."""
+def _normals(quantiles, stream, scale, symmetry, out):
+    """out[i] = scale[i] * N(0, 1), and symmetric; four numbers from each 64 random bits."""
     n = out.shape[0]
     for block in range(n // 4):
         bits = mix(stream + _U(block + 1) * GOLDEN)
@@ -73,6 +74,8 @@ def _normals(quantiles, stream, scale, out):
     bits = mix(stream + _U(n // 4 + 1) * GOLDEN)
     for i in range(4 * (n // 4), n):
         out[i] = scale[i] * quantiles[(bits >> _U(16 * (i & 3))) & _U(0xFFF)]
+    for k in range(symmetry.bound.shape[0]):
+        out[symmetry.bound[k]] = symmetry.factor[k] * out[symmetry.source[k]]
 
 
 @njit
@@ -86,7 +89,7 @@ def _cross(a, b, stream, threshold, child, marked):
 
 
 @njit(nogil=True)
-def _breed(parents, recipes, key, scales, quantiles, rate, sigma, children):
+def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, children):
     """Children of recipes; scales [genes] are `policy.gene_scales`."""
     genes = children.shape[1]
     threshold = _U(rate * _F(1 << 24))
@@ -100,9 +103,9 @@ def _breed(parents, recipes, key, scales, quantiles, rate, sigma, children):
             for i in range(genes):
                 child[i] = a[i]
         elif kind == _NEW:
-            _normals(quantiles, stream, scales, child)
+            _normals(quantiles, stream, scales, symmetry, child)
         elif kind in (_STEP, _MIRRORED):
-            _normals(quantiles, stream, b, child)
+            _normals(quantiles, stream, b, symmetry, child)
             sign = _F(1.0) if kind == _STEP else _F(-1.0)
             for i in range(genes):
                 child[i] = a[i] + sign * child[i]
@@ -129,21 +132,21 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, 
         parents = np.zeros((1, spec.size), dtype=np.float32)
     children = np.empty((len(recipes), spec.size), dtype=np.float32)
     _breed(
-        freeze(parents), freeze(recipes), _U(key), gene_scales(spec), QUANTILES,
+        freeze(parents), freeze(recipes), _U(key), gene_scales(spec), symmetry(spec), QUANTILES,
         _F(mutation.rate), _F(mutation.sigma), children,
     )  # fmt: skip
     return children
 
 
 @njit
-def _moments(seeds, weights, squares, key, quantiles, first, second):
+def _moments(seeds, weights, squares, key, quantiles, symmetry, first, second):
     """Add weights[k] * z_k to first [genes] and squares[k] * z_k ** 2 to second, z_k the noise of seeds[k]."""
     genes = first.shape[0]
     ones, z = np.ones(genes, dtype=np.float32), np.empty(genes, dtype=np.float32)
     for k in range(seeds.shape[0]):
         if weights[k] == 0.0 and squares[k] == 0.0:
             continue
-        _normals(quantiles, _stream(key, seeds[k]), ones, z)
+        _normals(quantiles, _stream(key, seeds[k]), ones, symmetry, z)
         w, s = _F(weights[k]), _F(squares[k])
         for i in range(genes):
             first[i] += w * z[i]
@@ -151,9 +154,9 @@ def _moments(seeds, weights, squares, key, quantiles, first, second):
 
 
 def moments(
-    seeds: np.ndarray, weights: np.ndarray, squares: np.ndarray, key: int, genes: int
+    seeds: np.ndarray, weights: np.ndarray, squares: np.ndarray, key: int, spec: PolicySpec
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weighted sums over the noise z [genes] of seeds [n]: of z by weights [n], and of z squared by squares [n]."""
-    first, second = np.zeros(genes, dtype=np.float32), np.zeros(genes, dtype=np.float32)
-    _moments(seeds.astype(np.uint32), weights, squares, _U(key), QUANTILES, first, second)
+    first, second = np.zeros(spec.size, dtype=np.float32), np.zeros(spec.size, dtype=np.float32)
+    _moments(seeds.astype(np.uint32), weights, squares, _U(key), QUANTILES, symmetry(spec), first, second)
     return first, second

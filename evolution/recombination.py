@@ -1,9 +1,10 @@
 """The default search: the tournaments' winners are recombined into one centre, around which the next members lie.
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
-adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Children come
-in mirrored pairs (Brockhoff et al. 2010) that meet the same episodes. The centre and the champion (before there is one,
-the average of centres) are the elites: they are driven unmodified, and may win like all others.
+adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Noise is
+left-right symmetric (`symmetry`). Children come in mirrored pairs (Brockhoff et al. 2010), the centre plus and minus
+the same noise, that meet the same episodes. The centre and the champion (before there is one, the average of centres)
+are the elites: they are driven unmodified, and may win like all others.
 """
 
 from __future__ import annotations
@@ -15,10 +16,13 @@ import numpy as np
 from evolution.breeding import Kind, Mutation, moments
 from evolution.policy import PolicySpec, gene_scales
 from evolution.search import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournament_weights
+from evolution.symmetry import symmetry
 
 _CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
 _ELITES = 2  # the centre, and the champion: before there is one, the average
 _KEPT = 0.9  # of the average of centres, in each generation
+_MOST = 2.0  # of the step size, over that of the beginning: which output is the greatest does not depend on how great
+# weights are, so that they and the step size could grow for ever
 
 
 class Recombination(Search):
@@ -26,7 +30,7 @@ class Recombination(Search):
 
     Attributes:
         centre: float64 [genes], or [0] before the first generation.
-        path: float64 [genes], the evolution path: N(0, 1) in each gene under random selection, as at the beginning.
+        path: float64 [free genes], the evolution path: N(0, 1) in each under random selection, as at the beginning.
         variances: float64 [genes], diagonal of the covariance, 1 at the beginning.
         sigma: step size over all genes.
         average: float64 [genes], of the latest centres, each of which weighs 0.9 times the next one.
@@ -36,8 +40,9 @@ class Recombination(Search):
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         super().__init__(spec, config, seed)
         self.centre = np.zeros(0)
+        self._free = symmetry(spec).free
         # Not 0: the step size would shrink until the path has grown to its expected length.
-        self.path = self._rng(1).standard_normal(spec.size)
+        self.path = self._rng(1).standard_normal(len(self._free))
         self.variances = np.ones(spec.size)
         self.average = np.zeros(0)
         self.sigma = config.sigma
@@ -84,8 +89,8 @@ class Recombination(Search):
         effective = 1.0 / float((weights**2).sum())  # mu_eff
         pairs = (len(weights) - _ELITES) // 2  # an odd last member has no mirror image and is left out
         plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
-        genes, shift = self.spec.size, plus - minus
-        first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, genes)
+        genes, shift = len(self._free), plus - minus
+        first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, self.spec)
         self.centre = self.centre + self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
         # Under random selection, first / norm is N(0, 1) in each gene, whatever the weights of a pair are.
@@ -94,8 +99,9 @@ class Recombination(Search):
             rate = (effective + 2.0) / (genes + effective + 5.0)
             damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
             expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
-            self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first
+            self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first[self._free]
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
+            self.sigma = min(self.sigma, _MOST * self.config.sigma)
         share = float((plus + minus).sum())
         if share > 0.0:
             rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
@@ -109,7 +115,8 @@ class Recombination(Search):
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
         genes, sigma = (self.spec.size,), float(numbers["sigma"])
         centre = arrays["centre"]
-        path, variances = (checked(arrays[name], genes, np.float64) for name in ("path", "variances"))
+        path = checked(arrays["path"], self.path.shape, np.float64)
+        variances = checked(arrays["variances"], genes, np.float64)
         if not 0.0 < sigma < math.inf or (variances <= 0.0).any():
             raise ValueError("its step sizes are not above 0")
         shape = genes if centre.size else (0,)

@@ -29,6 +29,7 @@ THIN_WALL = 3.0  # m: a plain ray may pass what is thinner
 MEMORY_LIMIT_CELLS = 1 << 24  # nodes of a field; above this a map is refused
 
 _F, _I, _U = np.float32, np.int32, np.uint32
+_LANES = 16  # cones of the ray start table that are marched side by side
 
 
 class Road(NamedTuple):
@@ -249,29 +250,38 @@ def _ray_starts(nodes, columns, rows, ray_range):
     radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
     spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
     margin = _F(0.2)  # m: not worth another step
-    mask_x, mask_y = _U(columns - 1), _U(rows - 1)
+    mask_x, mask_y, flat = _I(columns - 1), _I(rows - 1), nodes.reshape(-1)
     # Positions are kept above 0, where truncation is rounding down, by whole turns of the torus.
     turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
     turn_y = _F(rows * math.ceil(ray_range * CELLS_PER_M / rows) + 0.5)
-    for b in range(HEADING_BINS):
+    # Cones go side by side, so that the inner loop becomes vector code: those that have ended stand still.
+    cones = (HEADING_BINS + _LANES - 1) // _LANES * _LANES
+    c, s = np.empty(cones, dtype=np.float32), np.empty(cones, dtype=np.float32)
+    for b in range(cones):
         angle = (b + 0.5) * 2.0 * math.pi / HEADING_BINS
-        c, s = _F(math.cos(angle) * CELLS_PER_M), _F(math.sin(angle) * CELLS_PER_M)
-        for j in range(cells_y):
-            for i in range(cells_x):
-                row = row_of[j * cells_x + i]
-                if row < 0:
-                    continue
-                x, y = _F((i + 0.5) * k) + turn_x, _F((j + 0.5) * k) + turn_y
-                t = _F(0.0)
-                while t < ray_range:
-                    # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
-                    column = _U(_I(x + t * c)) & mask_x
-                    line = _U(_I(y + t * s)) & mask_y
-                    free = nodes[line, column] - radius - spread * t
-                    if free <= margin:
-                        break
-                    t += free
-                ranges[row * stride + b] = np.uint8(min(t, ray_range) * _F(START_UNITS))
+        c[b], s[b] = _F(math.cos(angle) * CELLS_PER_M), _F(math.sin(angle) * CELLS_PER_M)
+    t = np.empty(cones, dtype=np.float32)
+    for j in range(cells_y):
+        for i in range(cells_x):
+            row = row_of[j * cells_x + i]
+            if row < 0:
+                continue
+            x, y = _F((i + 0.5) * k) + turn_x, _F((j + 0.5) * k) + turn_y
+            t[:] = _F(0.0)
+            for first in range(0, cones, _LANES):
+                longest = _F(1.0)
+                while longest > _F(0.0):
+                    longest = _F(0.0)
+                    for b in range(first, first + _LANES):
+                        # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
+                        column = _I(x + t[b] * c[b]) & mask_x
+                        line = _I(y + t[b] * s[b]) & mask_y
+                        free = flat[line * _I(columns) + column] - radius - spread * t[b]
+                        step = free if free > margin and t[b] < ray_range else _F(0.0)
+                        t[b] += step
+                        longest = max(longest, step)
+            for b in range(HEADING_BINS):
+                ranges[row * stride + b] = np.uint8(min(t[b], ray_range) * _F(START_UNITS))
     for row in range(count):
         for b in range(HEADING_WRAP):
             ranges[row * stride + HEADING_BINS + b] = ranges[row * stride + b]

@@ -8,9 +8,11 @@ from scipy import stats
 
 from evolution.breeding import QUANTILES, RECIPE, Kind, Mutation, breed, moments
 from evolution.policy import PolicySpec, gene_scales
+from evolution.symmetry import symmetry
 
 F = np.float32
 SPEC, CNN = PolicySpec.parse("mlp:6,7"), PolicySpec.parse("cnn:8,8,16@1")
+FREE = symmetry(SPEC).free  # genes with noise of their own
 STILL = Mutation(rate=0.0, sigma=0.0)
 NOBODY = np.zeros((0, SPEC.size), dtype=F)
 KEYS = [0, 1, 2**31, 2**32, 2**53, 2**53 + 1, 2**63 - 1]
@@ -94,8 +96,8 @@ def test_quantiles_are_of_a_standard_normal():
 
 
 def test_neighbouring_genes_seeds_and_keys_have_noise_of_their_own():
-    noise = breed(NOBODY, many(Kind.NEW, 0, 0, 2000), 3, SPEC, Mutation()).astype(float)
-    other = breed(NOBODY, many(Kind.NEW, 0, 0, 2000), 4, SPEC, Mutation()).astype(float)
+    noise = breed(NOBODY, many(Kind.NEW, 0, 0, 2000), 3, SPEC, Mutation()).astype(float)[:, FREE]
+    other = breed(NOBODY, many(Kind.NEW, 0, 0, 2000), 4, SPEC, Mutation()).astype(float)[:, FREE]
     for gap in range(1, 9):  # four numbers are drawn at a time
         assert abs((noise[:, gap:] * noise[:, :-gap]).mean()) < 5.0 / np.sqrt(noise.size)
     assert abs((noise[1:] * noise[:-1]).mean()) < 5.0 / np.sqrt(noise.size)
@@ -125,10 +127,10 @@ def test_a_step_and_its_mirror_image_lie_about_the_centre(spec):
 def test_steps_are_normal_and_as_large_as_the_row_of_steps():
     parents = around(np.random.default_rng(2))
     children = breed(parents, many(Kind.STEP, 0, 1, 3000), 4, SPEC, STILL).astype(float)
-    noise = (children - parents[0].astype(float)) / parents[1].astype(float)
+    noise = ((children - parents[0].astype(float)) / parents[1].astype(float))[:, FREE]
     assert np.abs(noise.mean(axis=0)).max() < 5.0 / np.sqrt(3000)
     assert np.abs(noise.std(axis=0) - 1.0).max() < 5.0 / np.sqrt(2 * 3000)
-    wide = np.flatnonzero(parents[1] > 1e-2)  # the others' noise is rounded beside the centre
+    wide = np.flatnonzero(parents[1, FREE] > 1e-2)  # the others' noise is rounded beside the centre
     assert is_normal(noise[:, wide][:, ::5])
 
 
@@ -144,22 +146,22 @@ def test_a_step_does_not_know_mutation():
     assert children[0] == children[1]
 
 
-@pytest.mark.parametrize("genes", [SPEC.size, 49, 8, 6, 3])  # whole blocks of four numbers, and not
-def test_moments_are_sums_over_the_noise_of_steps(genes):
+@pytest.mark.parametrize("spec", [SPEC, PolicySpec.parse("mlp:4"), CNN], ids=str)  # blocks of four numbers, and not
+def test_moments_are_sums_over_the_noise_of_steps(spec):
     """The noise is that of a child of a zero centre with unit steps."""
-    unit = np.stack([np.zeros(SPEC.size), np.ones(SPEC.size)]).astype(F)
+    unit = np.stack([np.zeros(spec.size), np.ones(spec.size)]).astype(F)
     rng = np.random.default_rng(4)
     weights, squares, made = rng.normal(size=30), rng.random(30), many(Kind.STEP, 0, 1, 30)
     weights[[3, 5]], squares[[3, 7]] = 0.0, 0.0
     made["seed"] = rng.integers(1 << 32, size=30)
-    z = breed(unit, made, 99, SPEC, STILL).astype(float)[:, :genes]
-    first, second = moments(made["seed"], weights, squares, 99, genes)
+    z = breed(unit, made, 99, spec, STILL).astype(float)
+    first, second = moments(made["seed"], weights, squares, 99, spec)
     np.testing.assert_allclose(first, weights @ z, atol=3e-5)
     np.testing.assert_allclose(second, squares @ z**2, rtol=1e-5)
 
 
 def test_moments_of_nobody_are_0():
-    first, second = moments(np.zeros(0, dtype=int), np.zeros(0), np.zeros(0), 1, 9)
+    first, second = moments(np.zeros(0, dtype=int), np.zeros(0), np.zeros(0), 1, SPEC)
     assert (first == 0.0).all()
     assert (second == 0.0).all()
 
@@ -258,7 +260,7 @@ def test_key_and_seed_make_the_child(parents, kind):
 def test_keys_of_63_bits_are_told_apart(parents, kind):
     children = [breed(parents, many(kind, 0, 1, 1), key, SPEC, Mutation(rate=1.0)).tobytes() for key in KEYS]
     assert len(set(children)) == len(KEYS)
-    assert len({moments(np.zeros(1), np.ones(1), np.ones(1), key, 40)[0].tobytes() for key in KEYS}) == len(KEYS)
+    assert len({moments(np.zeros(1), np.ones(1), np.ones(1), key, SPEC)[0].tobytes() for key in KEYS}) == len(KEYS)
 
 
 def test_seeds_of_32_bits_are_told_apart(parents):

@@ -182,7 +182,7 @@ def have_children(parents):
         [(0, 0, 0, 0), (1, 0, 0, 3), (2, 0, 1, 5), (3, 0, 1, 5), (4, 1, 2, 1), (4, 1, 1, 2)], dtype=RECIPE
     )
     seeds = np.arange(7)
-    first, second = moments(seeds, seeds - 2.5, seeds / 7.0, 2**62 + 5, SPEC.size)
+    first, second = moments(seeds, seeds - 2.5, seeds / 7.0, 2**62 + 5, SPEC)
     children = breed(parents, recipes, 2**62 + 5, SPEC, Mutation(rate=0.2, sigma=0.5))
     return {"children": children, "first": first, "second": second}
 

@@ -1,0 +1,117 @@
+"""Left-right symmetry: what a network of symmetric noise does in a mirrored world."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from evolution.breeding import RECIPE, Kind, Mutation, breed, moments
+from evolution.convnet import forward, push, scratch
+from evolution.policy import INPUTS, CnnSpec, MlpSpec, PolicySpec, act_on
+from evolution.symmetry import MIRRORED_ACTIONS, symmetry
+from gridsim.grid import CELLS
+from gridsim.vehicle import Action
+
+F = np.float32
+RAYS = INPUTS - 1
+SPECS = st.builds(
+    MlpSpec,
+    st.lists(st.integers(4, 12), min_size=1, max_size=3).map(tuple),
+    motion=st.booleans(),
+    steering=st.booleans(),
+)
+
+
+def drawn(spec, seed=0, n=1):
+    recipes = np.zeros(n, dtype=RECIPE)
+    recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
+    return breed(np.zeros((0, spec.size), dtype=F), recipes, seed, spec, Mutation())
+
+
+def in_a_mirror(spec, observations):
+    """What the same car would observe if left and right were exchanged."""
+    seen = observations.copy()
+    seen[:, :RAYS] = observations[:, RAYS - 1 :: -1]
+    if spec.motion:
+        seen[:, RAYS : 2 * RAYS] = observations[:, 2 * RAYS - 1 : RAYS - 1 : -1]
+    if spec.steering:
+        seen[:, -1] = -observations[:, -1]
+    return seen
+
+
+def test_left_and_right_are_exchanged_and_nothing_else():
+    names = [Action(a).name for a in MIRRORED_ACTIONS]
+    assert names == [
+        "ACCELERATE", "RIGHT", "LEFT", "BRAKE", "NONE", "ACCELERATE_RIGHT", "ACCELERATE_LEFT", "REVERSE",
+    ]  # fmt: skip
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(spec=SPECS, seed=st.integers(0, 1 << 40))
+def test_in_a_mirrored_world_it_does_the_mirrored_thing(spec, seed):
+    rng = np.random.default_rng(seed)
+    observations = rng.random((60, spec.inputs)).astype(F)
+    observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
+    genome = drawn(spec, seed)[0]
+    mirrored = in_a_mirror(spec, observations)
+    one, other = (act_on(spec, genome, seen, 50.0, 20.0, 0.5) for seen in (observations, mirrored))
+    # But for near ties, where the order of sums decides.
+    assert (MIRRORED_ACTIONS[one] == other).mean() > 0.9
+
+
+@pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:64+steering", "mlp:3+motion+steering", "cnn:8,16,24@2"])
+def test_every_gene_is_drawn_or_follows_from_one_that_is(policy):
+    spec = PolicySpec.parse(policy)
+    free, bound, source, factor = symmetry(spec)
+    assert sorted([*free, *bound]) == list(range(spec.size))
+    assert np.isin(source[factor != 0.0], free).all()
+    assert len(free) < 0.53 * spec.size
+    genomes = drawn(spec, n=5)
+    assert (genomes[:, bound] == factor * genomes[:, source]).all()
+    assert len(np.unique(genomes[0, free])) > 0.4 * min(len(free), 4096)
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_kernels_of_a_cnn_come_in_mirrored_pairs(frames):
+    spec = CnnSpec((8, 16, 24), frames=frames)
+    genome, at, layers = drawn(spec)[0], 0, []
+    for n, m in spec.shapes():
+        layers.append((genome[at : at + n * m].reshape(n, m), genome[at + n * m : at + (n + 1) * m]))
+        at += (n + 1) * m
+    first, second, dense, output = (weights for weights, _ in layers)
+    first = first.reshape(frames * 8, 8, 8)
+    assert (first == first[:, ::-1, ::-1]).all()
+    second = second.reshape(4, 4, 8, 16)
+    assert (second == second[:, ::-1, ::-1, ::-1]).all()
+    seen = dense[:-1].reshape(8, 8, 16, 24)
+    assert (seen == seen[:, ::-1, ::-1, ::-1]).all()
+    assert (dense[-1] == dense[-1, ::-1]).all()  # of the speed
+    assert (output == output[::-1][:, MIRRORED_ACTIONS]).all()
+    for biases in (layer[1] for layer in layers[:3]):
+        assert (biases == biases[::-1]).all()
+
+
+def test_a_cnn_sees_a_mirrored_picture_in_its_mirrored_channels():
+    spec = CnnSpec((8, 16, 24), frames=1)
+    genome, picture = drawn(spec)[0], np.random.default_rng(1).integers(0, 256, (CELLS, CELLS)).astype(np.uint8)
+    seen = []
+    for grid in (picture, np.ascontiguousarray(picture[:, ::-1])):
+        room = scratch(spec)
+        push(grid.ravel(), True, room)
+        forward(genome, spec.layers, F(5.0), room)
+        seen.append(room.first.reshape(19, 19, 8).copy())
+    np.testing.assert_allclose(seen[1], seen[0][:, ::-1, ::-1], rtol=1e-4, atol=1e-5)
+
+
+def test_a_step_is_symmetric_whatever_its_centre_is():
+    spec = PolicySpec.parse("mlp:5+steering")
+    centre = np.random.default_rng(2).normal(size=spec.size).astype(F)
+    _, bound, source, factor = symmetry(spec)
+    recipes = np.zeros(20, dtype=RECIPE)
+    recipes["kind"], recipes["b"], recipes["seed"] = Kind.STEP, 1, np.arange(20)
+    noise = breed(np.stack([centre, np.ones(spec.size, F)]), recipes, 7, spec, Mutation()) - centre
+    np.testing.assert_allclose(noise[:, bound], factor * noise[:, source], atol=2e-6)
+    rng = np.random.default_rng(3)
+    first, second = moments(np.arange(20), rng.normal(size=20), rng.random(20), 7, spec)
+    assert (first[bound] == factor * first[source]).all()
+    assert (second[bound] == factor**2 * second[source]).all()
