@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import io
 import math
 import os
@@ -214,7 +215,9 @@ def _learn_main(kind: type[Flags]) -> None:
     started = time.perf_counter() - process_age_s()
     try:
         with stoppable():
-            sys.exit(_learn(kind, sys.argv[1:], started))
+            code = _learn(kind, sys.argv[1:], started)
+        gc.freeze()  # or the interpreter's last look for garbage walks through all of PyTorch, for two seconds
+        sys.exit(code)
     except KeyboardInterrupt:  # before there was anything to save
         print(f"{kind.command}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
