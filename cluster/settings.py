@@ -28,7 +28,7 @@ LEAST_GROUP = 16  # members of a group, of whom the best are to be good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default.
-CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
+CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 90_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -150,7 +150,7 @@ class EvolveSettings(RunSettings):
     """Members of a generation."""
     generations: int = 0
     """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
-    otherwise no more than 30 million car-steps, in traffic 60."""
+    otherwise no more than 30 million car-steps, in traffic 90."""
     recombination: Literal["all", "two"] = "all"
     """Whose genes a child has: all winners of the tournaments, averaged into one centre (an evolution strategy), or
     two parents' (the classic genetic algorithm)."""

@@ -52,7 +52,7 @@ def test_what_is_not_given_suits_the_observation():
 
 def test_evolution_s_default_budget_is_of_car_steps():
     assert (EvolveSettings().generations, EvolveSettings().car_steps) == (0, 30_000_000)
-    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 60_000_000
+    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 90_000_000
     assert EvolveSettings("highway", traffic=0).car_steps == 30_000_000
     assert EvolveSettings(generations=2_000).car_steps == 0  # whoever says how long means it
     assert EvolveSettings(car_steps=7).generations == 0
