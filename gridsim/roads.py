@@ -225,7 +225,7 @@ def _pack(nodes):
     return packed
 
 
-@njit(nogil=True)
+@njit(nogil=True, fastmath=False)
 def _ray_starts(nodes, columns, rows, ray_range):
     """Start ranges: for each 1 m cell where a car can be and each bin of 4 degrees, how far every ray surely gets.
 
@@ -269,17 +269,17 @@ def _ray_starts(nodes, columns, rows, ray_range):
             x, y = _F((i + 0.5) * k) + turn_x, _F((j + 0.5) * k) + turn_y
             t[:] = _F(0.0)
             for first in range(0, cones, _LANES):
-                longest = _F(1.0)
-                while longest > _F(0.0):
-                    longest = _F(0.0)
+                going = _I(1)
+                while going:
+                    going = _I(0)
                     for b in range(first, first + _LANES):
                         # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
                         column = _I(x + t[b] * c[b]) & mask_x
                         line = _I(y + t[b] * s[b]) & mask_y
                         free = flat[line * _I(columns) + column] - radius - spread * t[b]
-                        step = free if free > margin and t[b] < ray_range else _F(0.0)
-                        t[b] += step
-                        longest = max(longest, step)
+                        goes = free > margin and t[b] < ray_range
+                        t[b] += free if goes else _F(0.0)
+                        going |= _I(goes)
             for b in range(HEADING_BINS):
                 ranges[row * stride + b] = np.uint8(min(t[b], ray_range) * _F(START_UNITS))
     for row in range(count):

@@ -254,8 +254,8 @@ def test_the_registry_is_the_designs_table():
 # --- Each of them ----------------------------------------------------------------------------------------------------
 
 # Of field, start table and strips. Since the shipped champion was trained, a T junction has one strip more, and the
-# field more clearance in its middle; all else is as it was.
-SEAMLESS = {0: "9bc8e1c58bef6df3", 7: "ba49f541134b2b18", 2_000_000: "b9f9bdf836156477"}
+# field more clearance in its middle; a few values of the start table are rounded otherwise; all else is as it was.
+SEAMLESS = {0: "7f53b8d18cd1b90a", 7: "ba49f541134b2b18", 2_000_000: "4850a032321ef4e9"}
 
 
 @pytest.mark.parametrize("seed", SEAMLESS)
