@@ -21,8 +21,8 @@ from evolution.symmetry import symmetry
 _CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
 _ELITES = 2  # the centre, and the champion: before there is one, the average
 _KEPT = 0.9  # of the average of centres, in each generation
-_MOST = 2.0  # of the step size, over that of the beginning: which output is the greatest does not depend on how great
-# weights are, so that they and the step size could grow for ever
+_MOST = 2.0  # of the step size, over that of the beginning: once units saturate, what a network does hardly depends on
+# how great its weights are, so that they and the step size could grow for ever
 
 
 class Recombination(Search):
@@ -106,7 +106,8 @@ class Recombination(Search):
         if share > 0.0:
             rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
             rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
-            self.variances = self.variances * (1.0 - rate + rate * second / share)
+            # Where there is no noise (a gene that is its own opposite), there is nothing to adapt to.
+            self.variances = self.variances * np.where(second > 0.0, 1.0 - rate + rate * second / share, 1.0)
 
     def state(self) -> tuple[Arrays, dict[str, float]]:
         names = ("centre", "average", "path", "variances")

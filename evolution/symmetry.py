@@ -46,8 +46,9 @@ class Symmetry(NamedTuple):
 def symmetry(spec: PolicySpec) -> Symmetry:
     """Of a network whose hidden units mirror each other from first to last.
 
-    The middle one of an odd number mirrors itself. A `cnn` is symmetric but for one column of its second convolution,
-    which does not see the last of 19 columns.
+    The middle one of an odd number mirrors itself; with a layer of that one alone a network could not tell left from
+    right, so that all of its genes are free. A `cnn` is symmetric only about: its second convolution does not see the
+    last of 19 columns.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()
@@ -61,6 +62,8 @@ def symmetry(spec: PolicySpec) -> Symmetry:
         at += (n + 1) * m
     image, factor = np.concatenate(images), np.concatenate(signs)
     gene = np.arange(spec.size)
+    if 1 in spec.hidden:
+        image, factor = gene, np.ones(spec.size)
     opposite = (image == gene) & (factor < 0)
     is_free = (gene <= image) & ~opposite
     bound = np.flatnonzero(~is_free)

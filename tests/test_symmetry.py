@@ -71,6 +71,15 @@ def test_every_gene_is_drawn_or_follows_from_one_that_is(policy):
     assert len(np.unique(genomes[0, free])) > 0.4 * min(len(free), 4096)
 
 
+@pytest.mark.parametrize("policy", ["mlp:1", "mlp:1,1+motion", "mlp:3,1,4+steering"])
+def test_a_layer_of_one_unit_can_tell_left_from_right(policy):
+    spec = PolicySpec.parse(policy)
+    assert len(symmetry(spec).free) == spec.size
+    observations = np.random.default_rng(1).random((300, spec.inputs)).astype(F)
+    done = np.array([act_on(spec, genome, observations, 50.0, 20.0, 0.5) for genome in drawn(spec, n=40)])
+    assert {*np.unique(done)} >= {Action.LEFT, Action.RIGHT, Action.ACCELERATE_LEFT, Action.ACCELERATE_RIGHT}
+
+
 @pytest.mark.parametrize("frames", [1, 3])
 def test_kernels_of_a_cnn_come_in_mirrored_pairs(frames):
     spec = CnnSpec((8, 16, 24), frames=frames)
