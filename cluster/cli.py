@@ -216,7 +216,7 @@ def _learn_main(kind: type[Flags]) -> None:
     try:
         with stoppable():
             code = _learn(kind, sys.argv[1:], started)
-        gc.freeze()  # or the interpreter's last look for garbage walks through all of PyTorch, for two seconds
+        gc.freeze()  # otherwise the final garbage collection traverses all PyTorch objects, which takes two seconds
         sys.exit(code)
     except KeyboardInterrupt:  # before there was anything to save
         print(f"{kind.command}: stopped", file=sys.stderr)

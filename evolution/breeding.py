@@ -23,7 +23,7 @@ class Kind(IntEnum):
     """How a child is made from the rows of `parents` that its recipe names."""
 
     COPY = 0  # parents[a], unmodified
-    NEW = 1  # a random genome, symmetric as all noise but that of CROSS is (`symmetry`)
+    NEW = 1  # a random genome, left-right symmetric (`symmetry`), as the noise of STEP and MIRRORED is
     STEP = 2  # parents[a] + parents[b] * N(0, 1): a centre, and a standard deviation for each gene
     MIRRORED = 3  # parents[a] - parents[b] * N(0, 1): with the same seed the mirror image of a STEP
     CROSS = 4  # uniform crossover of parents[a] and parents[b], then Gaussian mutation
@@ -62,7 +62,7 @@ def _stream(key, seed):
 
 @njit
 def _normals(quantiles, stream, scale, symmetry, out):
-    """out[i] = scale[i] * N(0, 1), and symmetric; four numbers from each 64 random bits."""
+    """out[i] = scale[i] * N(0, 1), left-right symmetric; four numbers from each 64 random bits."""
     n = out.shape[0]
     for block in range(n // 4):
         bits = mix(stream + _U(block + 1) * GOLDEN)

@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evolution.policy import (
-    INPUTS,
     KERNEL_1,
     KERNEL_2,
     RAY_HALF,
+    RAYS,
     SPEED_SCALE,
     STEERING_SCALE,
     STRIDE_1,
@@ -36,7 +36,6 @@ from gridsim.grid import CELLS, FREE, OCCUPIED, UNKNOWN, centres
 if TYPE_CHECKING:
     import torch
 
-_RAYS = INPUTS - 1
 _ROAD = 8.0  # m, width of the straight road of `example`
 
 
@@ -73,12 +72,12 @@ def to_torch(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> torch.n
             self.layers = torch.nn.ModuleList(dense(*part) for part in parts)
 
         def forward(self, observation: torch.Tensor) -> torch.Tensor:
-            ranges = observation[:, :_RAYS] * config.sensors.range
+            ranges = observation[:, :RAYS] * config.sensors.range
             inputs = [2.0 * ranges / (ranges + float(RAY_HALF)) - 1.0]
-            at = _RAYS
+            at = RAYS
             if self.motion:
-                inputs.append(observation[:, at : at + _RAYS] * config.vehicle.speed_limit / float(SPEED_SCALE))
-                at += _RAYS
+                inputs.append(observation[:, at : at + RAYS] * config.vehicle.speed_limit / float(SPEED_SCALE))
+                at += RAYS
             speed = observation[:, at : at + 1] * config.vehicle.speed_limit
             inputs.append(speed / float(SPEED_SCALE) - 1.0)
             if self.steering:
@@ -137,10 +136,10 @@ def example(spec: PolicySpec, config: SimConfig) -> np.ndarray:
         return np.stack([np.append(cells, speed) for speed in speeds])
     assert isinstance(spec, MlpSpec)
     half = math.radians(config.sensors.field_of_view / 2)
-    across = np.abs(np.sin(np.linspace(-half, half, _RAYS)))
+    across = np.abs(np.sin(np.linspace(-half, half, RAYS)))
     reach = config.sensors.range
     ranges = np.minimum(_ROAD / 2 / np.maximum(across, 1e-6), reach) / reach
-    still = np.zeros(_RAYS if spec.motion else 0)
+    still = np.zeros(RAYS if spec.motion else 0)
     wheels = np.zeros(1 if spec.steering else 0)
     rows = [np.concatenate([ranges, still, [speed / config.vehicle.speed_limit], wheels]) for speed in speeds]
     return np.array(rows, dtype=np.float32)

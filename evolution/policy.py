@@ -20,7 +20,8 @@ from gridsim.grid import CELLS
 from gridsim.jit import leaf, njit
 from gridsim.roads import freeze
 
-INPUTS = 32  # 31 rays and the speed
+RAYS = 31
+INPUTS = RAYS + 1  # and the speed
 ACTIONS = 8
 MAX_GENES = 1_000_000
 _F, _U = np.float32, np.uint64
@@ -114,7 +115,7 @@ class MlpSpec(PolicySpec):
     @property
     def inputs(self) -> int:
         """The rays, what they meet's motion if it is seen, the speed, and the steering angle if it is seen."""
-        return INPUTS + (INPUTS - 1 if self.motion else 0) + self.steering
+        return INPUTS + (RAYS if self.motion else 0) + self.steering
 
     @property
     def layers(self) -> np.ndarray:

@@ -21,8 +21,9 @@ from evolution.symmetry import symmetry
 _CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
 _ELITES = 2  # the centre, and the champion: before there is one, the average
 _KEPT = 0.9  # of the average of centres, in each generation
-_MOST = 2.0  # of the step size, over that of the beginning: once units saturate, what a network does hardly depends on
-# how great its weights are, so that they and the step size could grow for ever
+# The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so that without a
+# bound weights and step size grow for ever.
+_MAX_GROWTH = 2.0
 
 
 class Recombination(Search):
@@ -101,12 +102,12 @@ class Recombination(Search):
             expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
             self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first[self._free]
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
-            self.sigma = min(self.sigma, _MOST * self.config.sigma)
+            self.sigma = min(self.sigma, _MAX_GROWTH * self.config.sigma)
         share = float((plus + minus).sum())
         if share > 0.0:
             rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
             rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
-            # Where there is no noise (a gene that is its own opposite), there is nothing to adapt to.
+            # A gene without noise (factor 0 in `symmetry`) keeps its variance, which would shrink to 0.
             self.variances = self.variances * np.where(second > 0.0, 1.0 - rate + rate * second / share, 1.0)
 
     def state(self) -> tuple[Arrays, dict[str, float]]:
@@ -118,8 +119,8 @@ class Recombination(Search):
         centre = arrays["centre"]
         path = checked(arrays["path"], self.path.shape, np.float64)
         variances = checked(arrays["variances"], genes, np.float64)
-        if not 0.0 < sigma < math.inf or (variances <= 0.0).any():
-            raise ValueError("its step sizes are not above 0")
+        if not 0.0 < sigma <= _MAX_GROWTH * self.config.sigma or (variances <= 0.0).any():
+            raise ValueError("its step sizes are out of range")
         shape = genes if centre.size else (0,)
         self.centre, self.average = checked(centre, shape, np.float64), checked(arrays["average"], shape, np.float64)
         self.path, self.variances, self.sigma = path, variances, sigma

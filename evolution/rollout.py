@@ -15,7 +15,7 @@ import numpy as np
 
 from evolution import convnet
 from evolution.policy import (
-    INPUTS,
+    RAYS,
     CnnSpec,
     MlpSpec,
     PolicySpec,
@@ -84,8 +84,8 @@ def eye_of(spec: PolicySpec, config: SimConfig) -> Eye | None:
     """None for a policy on rays. Raises: ValueError if it sees another number of them."""
     if isinstance(spec, CnnSpec):
         return Eye(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
-    if config.sensors.rays != INPUTS - 1:
-        raise ValueError(f"{spec} sees {INPUTS - 1} rays, the sensor has {config.sensors.rays}")
+    if config.sensors.rays != RAYS:
+        raise ValueError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
     return None
 
 

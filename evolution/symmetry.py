@@ -1,9 +1,9 @@
-"""Left-right symmetry: which genes are drawn, and which follow from them.
+"""Left-right symmetry: which genes are free, and which are bound to them.
 
-Cars and roads look the same in a mirror, so a network should do in a mirrored world what it does in ours, with left and
-right exchanged. Random numbers of a genome are therefore drawn for half of its genes; the others get the same ones in
-their mirrored place. A symmetric genome stays so, there is half as much to search for, and what is learned in a bend to
-the left serves in one to the right.
+Cars and roads look the same in a mirror. In a mirrored world a network should therefore take the mirrored action. It
+does so if each gene equals the gene of its mirror image, so random numbers are drawn for the free half of a genome, and
+the bound half copies them. The search then has half as many dimensions, and what is learned in a bend to the left also
+serves in a bend to the right.
 """
 
 from __future__ import annotations
@@ -13,42 +13,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.policy import INPUTS, KERNEL_1, KERNEL_2, SIDE_2, CnnSpec, MlpSpec, PolicySpec
+from evolution.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec
 from gridsim.roads import freeze
 from gridsim.vehicle import Action
 
-RAYS = INPUTS - 1
-
-#: Of each action its mirror image.
+#: The mirror image of each action.
 MIRRORED_ACTIONS = np.array(
     [
-        {
-            Action.LEFT: Action.RIGHT,
-            Action.RIGHT: Action.LEFT,
-            Action.ACCELERATE_LEFT: Action.ACCELERATE_RIGHT,
-            Action.ACCELERATE_RIGHT: Action.ACCELERATE_LEFT,
-        }.get(action, action)
-        for action in Action
+        Action.ACCELERATE, Action.RIGHT, Action.LEFT, Action.BRAKE, Action.NONE, Action.ACCELERATE_RIGHT,
+        Action.ACCELERATE_LEFT, Action.REVERSE,
     ]
-)
+)  # fmt: skip
 
 
 class Symmetry(NamedTuple):
     """How the genes of a symmetric network depend on each other: gene[bound] = factor * gene[source]."""
 
-    free: np.ndarray  # int32 [f], genes that are drawn
-    bound: np.ndarray  # int32 [genes - f], all others
-    source: np.ndarray  # int32 [genes - f], free genes, but where the factor is 0
-    factor: np.ndarray  # float32 [genes - f]: 1; -1 of the steering angle's weights, 0 of its weight at a middle unit
+    free: np.ndarray  # int32 [f], genes with random numbers of their own
+    bound: np.ndarray  # int32 [genes - f], all other genes
+    source: np.ndarray  # int32 [genes - f], the mirror image of each bound gene: a free gene, unless the factor is 0
+    factor: np.ndarray  # float32 [genes - f]: 1; -1 for weights of the steering angle, 0 for that of a middle unit
 
 
 @cache
 def symmetry(spec: PolicySpec) -> Symmetry:
-    """Of a network whose hidden units mirror each other from first to last.
+    """The symmetry of a network in which hidden unit k of a layer mirrors unit k from its end.
 
-    The middle one of an odd number mirrors itself; with a layer of that one alone a network could not tell left from
-    right, so that all of its genes are free. A `cnn` is symmetric only about: its second convolution does not see the
-    last of 19 columns.
+    The middle unit of an odd number mirrors itself. If a layer had no other unit, left and right would be
+    indistinguishable, so all genes of such a network are free. A `cnn` is only approximately symmetric, because its
+    second convolution leaves out the last of 19 columns.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()
@@ -62,10 +55,8 @@ def symmetry(spec: PolicySpec) -> Symmetry:
         at += (n + 1) * m
     image, factor = np.concatenate(images), np.concatenate(signs)
     gene = np.arange(spec.size)
-    if 1 in spec.hidden:
-        image, factor = gene, np.ones(spec.size)
     opposite = (image == gene) & (factor < 0)
-    is_free = (gene <= image) & ~opposite
+    is_free = (gene <= image) & ~opposite | (1 in spec.hidden)
     bound = np.flatnonzero(~is_free)
     return Symmetry(
         freeze(np.flatnonzero(is_free).astype(np.int32)),
@@ -76,7 +67,7 @@ def symmetry(spec: PolicySpec) -> Symmetry:
 
 
 def _inputs(spec: PolicySpec) -> list[np.ndarray]:
-    """Of each layer the mirror images of its units' inputs, by their places."""
+    """For each layer, the index of the mirror image of each input."""
     if isinstance(spec, CnnSpec):
         first, second, dense = spec.hidden
         return [
@@ -93,6 +84,6 @@ def _inputs(spec: PolicySpec) -> list[np.ndarray]:
 
 
 def _columns_reversed(rows: int, columns: int, channels: int) -> np.ndarray:
-    """Places of the mirror image's values (row, column, channel) among those of an image."""
-    places = np.arange(rows * columns * channels).reshape(rows, columns, channels)
-    return places[:, ::-1, ::-1].ravel()
+    """Indices [rows * columns * channels] of an image's values in the order of its mirror image."""
+    index = np.arange(rows * columns * channels).reshape(rows, columns, channels)
+    return index[:, ::-1, ::-1].ravel()

@@ -230,7 +230,8 @@ def _ray_starts(nodes, columns, rows, ray_range):
     """Start ranges: for each 1 m cell where a car can be and each bin of 4 degrees, how far every ray surely gets.
 
     A cone that holds every ray of the cell and bin is marched through the field; where it first may touch an edge
-    is the start. Returns (row of each cell or -1, ranges as bytes [rows, bins + wrap]).
+    is the start. Without fast math, so that every machine has the same table.
+    Returns (row of each cell or -1, ranges as bytes [rows, bins + wrap]).
     """
     k = CELLS_PER_M // START_CELLS_PER_M
     cells_x, cells_y = columns // k, rows // k
@@ -254,7 +255,7 @@ def _ray_starts(nodes, columns, rows, ray_range):
     # Positions are kept above 0, where truncation is rounding down, by whole turns of the torus.
     turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
     turn_y = _F(rows * math.ceil(ray_range * CELLS_PER_M / rows) + 0.5)
-    # Cones go side by side, so that the inner loop becomes vector code: those that have ended stand still.
+    # Cones are marched side by side, so that the inner loop becomes vector code; finished ones do not move.
     cones = (HEADING_BINS + _LANES - 1) // _LANES * _LANES
     c, s = np.empty(cones, dtype=np.float32), np.empty(cones, dtype=np.float32)
     for b in range(cones):

@@ -199,6 +199,7 @@ def test_on_a_slope_sigma_grows_to_twice_its_size(axis):
         sizes.append(search.sigma)
     assert max(sizes) == 2.0 * search.config.sigma
     assert np.mean(sizes[-20:]) > 1.5 * search.config.sigma
+    assert search.centre @ way / np.linalg.norm(way) > 50.0
 
 
 def test_about_a_point_sigma_shrinks():
@@ -257,8 +258,8 @@ def test_the_same_seed_is_the_same_run_and_another_is_not():
     assert runs[0] == runs[1] != runs[2]
 
 
-def test_what_is_left_of_symmetry_can_be_restored():
-    """A middle unit's weight of the steering angle is always 0, and its step size does not vanish."""
+def test_a_gene_without_noise_keeps_a_variance_that_can_be_restored():
+    """The weight of the steering angle at a middle unit is always 0."""
     config = SearchConfig(population=512, groups=2)
     search, again = (Recombination(SYMMETRIC, config, seed=3) for _ in range(2))
     rng = np.random.default_rng(4)
@@ -311,6 +312,7 @@ def test_the_state_is_not_changed_by_what_comes_after():
         ("sigma", -1.0),
         ("sigma", np.nan),
         ("sigma", np.inf),
+        ("sigma", 1.01),  # above twice the initial one
         ("sigma", None),
     ],
 )

@@ -1,4 +1,4 @@
-"""Left-right symmetry: what a network of symmetric noise does in a mirrored world."""
+"""Left-right symmetry: a symmetric network takes the mirrored action in a mirrored world."""
 
 import numpy as np
 import pytest
@@ -7,13 +7,12 @@ from hypothesis import strategies as st
 
 from evolution.breeding import RECIPE, Kind, Mutation, breed, moments
 from evolution.convnet import forward, push, scratch
-from evolution.policy import INPUTS, CnnSpec, MlpSpec, PolicySpec, act_on
+from evolution.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on
 from evolution.symmetry import MIRRORED_ACTIONS, symmetry
 from gridsim.grid import CELLS
 from gridsim.vehicle import Action
 
 F = np.float32
-RAYS = INPUTS - 1
 SPECS = st.builds(
     MlpSpec,
     st.lists(st.integers(4, 12), min_size=1, max_size=3).map(tuple),
@@ -48,7 +47,7 @@ def test_left_and_right_are_exchanged_and_nothing_else():
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(spec=SPECS, seed=st.integers(0, 1 << 40))
-def test_in_a_mirrored_world_it_does_the_mirrored_thing(spec, seed):
+def test_in_a_mirrored_world_it_takes_the_mirrored_action(spec, seed):
     rng = np.random.default_rng(seed)
     observations = rng.random((60, spec.inputs)).astype(F)
     observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
@@ -60,7 +59,7 @@ def test_in_a_mirrored_world_it_does_the_mirrored_thing(spec, seed):
 
 
 @pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:64+steering", "mlp:3+motion+steering", "cnn:8,16,24@2"])
-def test_every_gene_is_drawn_or_follows_from_one_that_is(policy):
+def test_every_gene_is_free_or_bound_to_a_free_one(policy):
     spec = PolicySpec.parse(policy)
     free, bound, source, factor = symmetry(spec)
     assert sorted([*free, *bound]) == list(range(spec.size))
