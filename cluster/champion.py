@@ -1,6 +1,6 @@
 """Champions: what is written of them, and what a person does with one: load it, drive it, evaluate it.
 
->>> champion = load_champion("runs/NAME/champion.npz")  # doctest: +SKIP
+>>> champion = load_champion("runs/NAME")  # doctest: +SKIP
 >>> env = champion.make_env()  # doctest: +SKIP
 >>> evaluate(champion, "seamless", episodes=64)  # doctest: +SKIP
 """
@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import json
 import math
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cluster import checkpoint
-from cluster.checkpoint import CheckpointError
+from cluster.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
 from cluster.learning import Maps, summarise
-from cluster.settings import MAX_TRAFFIC
+from cluster.settings import MAX_TRAFFIC, SETTINGS, EvolveSettings
 from evolution import convnet
 from evolution.curriculum import HELD_OUT_SEEDS, spread_starts
 from evolution.episodes import Episodes
@@ -47,6 +49,9 @@ class Champion:
     scenario: str
     sim: SimConfig
     traffic: int = 0
+
+    def __repr__(self) -> str:
+        return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
 
     @property
     def sha256(self) -> str:
@@ -105,11 +110,20 @@ class Champion:
         checkpoint.save(path, {"genome": self.genome}, meta)
 
 
-def load_champion(path: str | os.PathLike[str]) -> Champion:
-    """Read champion.npz.
+class UnfinishedError(CheckpointError):
+    """A run that has no champion yet; the message is one line for the user."""
 
-    Raises: CheckpointError with one line for a file that is missing, damaged, hostile or no champion.
+
+def load_champion(path: str | os.PathLike[str]) -> Champion:
+    """Read a champion.npz, given the file or its run's folder.
+
+    Raises: UnfinishedError for a run that has no champion yet, CheckpointError with one line for what is missing,
+    damaged, hostile or no champion.
     """
+    path = Path(path)
+    if path.is_dir():
+        _check_finished(path)
+        path /= CHAMPION
     arrays, meta = checkpoint.load(path)
     try:
         genome, sim = arrays["genome"], meta["sim"]
@@ -125,6 +139,24 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: no champion: {error}") from error
+
+
+def _check_finished(run: Path) -> None:
+    """Raises: CheckpointError with one line where a folder has no champion.npz."""
+    if (run / CHAMPION).exists():
+        return
+    if not (run / CONFIG).is_file():
+        raise CheckpointError(f"{run} is no run's folder: it has neither {CHAMPION} nor {CONFIG}")
+    try:
+        command = json.loads((run / CONFIG).read_text(encoding="utf-8"))["command"]
+        SETTINGS[command]
+    except (OSError, ValueError, KeyError, TypeError):
+        command = EvolveSettings.command
+    resumable = (run / CHECKPOINT).is_file()
+    again = f"continue it with: {command} --resume {run}"
+    if not resumable:
+        again = f"start it anew with: {command} --config {run / CONFIG}"
+    raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
 
 
 def evaluate(

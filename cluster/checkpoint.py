@@ -19,6 +19,9 @@ from typing import Any
 
 import numpy as np
 
+CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
+"""Files of a run's folder."""
+
 VERSION = 1
 MAX_BYTES = 1 << 32
 """The largest file, in bytes, that is written or read."""

@@ -71,7 +71,7 @@ class RunFlags:
     config: str = ""
     """A run's config.json: repeat that run; flags beside it change it."""
     init: str = ""
-    """A champion.npz to start from, in place of random networks."""
+    """A champion.npz, or a run's folder, to start from in place of random networks."""
     address: str = ""
     """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
     patience: float = 0.0
@@ -499,9 +499,8 @@ def evaluate_main() -> None:
         from cluster.checkpoint import CheckpointError
         from cluster.errors import errors
 
-        path = Path(flags.champion)
         try:
-            champion = load_champion(path / "champion.npz" if path.is_dir() else path)
+            champion = load_champion(flags.champion)
             traffic = None if flags.traffic == -1 else flags.traffic
             chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
             missed = None

@@ -27,7 +27,7 @@ import numpy as np
 
 from cluster import checkpoint, tracking_run
 from cluster.champion import Champion
-from cluster.checkpoint import CheckpointError
+from cluster.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
 from cluster.coordinator import Evolution
 from cluster.learning import Learning, Maps, held_out_episodes, now
 from cluster.pool import WorkerPool
@@ -40,7 +40,6 @@ from gridsim.config import SimConfig
 from gridsim.maps import map_digest
 from gridsim.scenarios import is_map_file, label
 
-CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
 CONFIG_FORMAT = 2
 OLD_FORMATS = (1,)  # GridSim 0.1: other searches, other parameters

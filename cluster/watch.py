@@ -17,10 +17,10 @@ import tyro
 from rich.console import Console
 
 from cluster import checkpoint
-from cluster.champion import Champion, load_champion
+from cluster.champion import Champion, UnfinishedError, load_champion
 from cluster.checkpoint import CheckpointError
 from cluster.cli import INTERRUPTED, UsageError, fail, parse
-from cluster.run import CHAMPION, CHECKPOINT, CONFIG, ELITES, RunError, read_config
+from cluster.run import CHECKPOINT, CONFIG, ELITES, RunError, read_config
 from cluster.settings import MAX_TRAFFIC
 from cluster.video import SUFFIXES, Recording, VideoError, frames, others, picture, record, write_video
 from evolution.policy import PolicySpec
@@ -181,12 +181,7 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     if not source.exists():
         raise UsageError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
     if flags.generation is None and not flags.follow:
-        path = source / CHAMPION if source.is_dir() else source
-        if source.is_dir() and not path.is_file():
-            if not (source / CONFIG).is_file():
-                raise UsageError(f"{source} is no run's folder: it has neither {CHAMPION} nor {CONFIG}")
-            raise UsageError(f"{source} has no {CHAMPION} yet; watch it with --follow or --generation 0")
-        champion = load_champion(path)
+        champion = load_champion(source)
         return lambda: (champion, "champion")
     elites = Elites(source)
     if flags.follow and not elites.changed():
@@ -309,6 +304,8 @@ def watch_main() -> None:
                 _show(flags)
         except NoDisplayError as error:
             fail(prog, str(error), "to write a film in place of a window: --output film.mp4")
+        except UnfinishedError as error:
+            fail(prog, str(error), "to watch it as it stands: --follow, or --generation N")
         except (UsageError, RunError, CheckpointError, DriveError) as error:
             fail(prog, str(error))
         except VideoError as error:

@@ -7,7 +7,8 @@ import pytest
 
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
 from cluster.checkpoint import CheckpointError, save
-from cluster.settings import SettingsError
+from cluster.run import RunFolder
+from cluster.settings import DqnSettings, SettingsError
 from evolution.policy import PolicySpec
 from evolution.rollout import Limits, trajectory
 from gridsim.ego import STEERING
@@ -26,6 +27,7 @@ def test_load_drive_evaluate(champion, tmp_path):
     loaded = load_champion(tmp_path / "champion.npz")
     assert loaded.genome.tobytes() == champion.genome.tobytes()
     assert loaded.sim == champion.sim
+    assert load_champion(tmp_path).sha256 == load_champion(str(tmp_path)).sha256 == champion.sha256  # a run's folder
     env = loaded.make_env()
     observation, _ = env.reset(seed=1)
     for _ in range(20):
@@ -132,9 +134,26 @@ def test_bad_champions_are_refused(champion, tmp_path):
         evolve(EvolveSettings(population=4, elites=8, recombination="two"))
 
 
+@pytest.mark.parametrize("settings", [SMALL, DqnSettings("curved")])
+def test_an_unfinished_run_says_how_to_go_on(settings, tmp_path):
+    with pytest.raises(CheckpointError, match="no run's folder"):
+        load_champion(tmp_path)
+    RunFolder(tmp_path, settings).write_config()
+    with pytest.raises(CheckpointError, match=rf"no champion.npz yet.* {settings.command} --config \S+/config.json$"):
+        load_champion(tmp_path)
+    save(tmp_path / "checkpoint.npz", {}, {})
+    with pytest.raises(CheckpointError, match=rf"no champion.npz yet.* {settings.command} --resume {tmp_path}$"):
+        load_champion(tmp_path)
+    (tmp_path / "config.json").write_text("[")
+    with pytest.raises(CheckpointError, match=r"no champion.npz yet.* gridsim-evolve --resume"):
+        load_champion(tmp_path)
+
+
 def test_champion_class_is_what_is_returned(champion):
     assert isinstance(champion, Champion)
     assert len(champion.sha256) == 64
+    text = f"<Champion mlp:64+steering of curved: 2,696 genes, sha256 {champion.sha256[:8]}>"
+    assert repr(champion) == str(champion) == text
 
 
 # --- On the occupancy grid -------------------------------------------------------------------------------------------

@@ -17,9 +17,10 @@ import pytest
 from commands import BIN, descendants, finish, rows, start, summary, wait_until
 
 from cluster.checkpoint import save
-from cluster.cli import REMOVED, EvolveFlags, evolve_main
+from cluster.cli import REMOVED, EvolveFlags, evaluate_main, evolve_main
 from cluster.run import RunFolder
 from cluster.settings import EvolveSettings
+from cluster.watch import watch_main
 
 # Of all maps these are built fastest.
 ROAD = ["--scenario", "curved", "--traffic", "2"]
@@ -154,7 +155,7 @@ def test_config_repeats_and_init_continues(reference, tmp_path):
     done = evolve("--workers", "0", "--config", str(config), "--name", "again", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert summary(tmp_path / "runs/again")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
-    champion = reference / "runs/ref/champion.npz"
+    champion = reference / "runs/ref"
     arguments = ["--workers", "0", *ROAD, "--population", "24", "--generations", "1"]
     arguments += ["--recombination", "two", "--mutation-rate", "0"]
     done = evolve(*arguments, "--init", str(champion), "--name", "warm", cwd=tmp_path)
@@ -220,6 +221,29 @@ def said_by(monkeypatch, capsys, *arguments):
     assert out == ""
     assert err.startswith("gridsim-evolve: error: ")
     return err.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("main", "line"),
+    [
+        (evaluate_main, "gridsim-evaluate r"),
+        (watch_main, "gridsim-watch r --output a.mp4"),
+        (evolve_main, "gridsim-evolve --workers 0 --init r"),
+    ],
+)
+def test_an_unfinished_runs_missing_champion_is_told_with_how_to_go_on(main, line, monkeypatch, capsys, tmp_path):
+    (tmp_path / "r").mkdir()
+    RunFolder(tmp_path / "r", EvolveSettings("curved")).write_config()
+    save(tmp_path / "r/checkpoint.npz", {}, {})
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", line.split())
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    first, *hint = capsys.readouterr().err.splitlines()
+    assert first.endswith("if it was stopped, continue it with: gridsim-evolve --resume r")
+    assert len(hint) == (main is watch_main)
+    assert os.listdir(tmp_path) == ["r"]
 
 
 INSTEAD = {
