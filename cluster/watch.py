@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import itertools
 import math
 import re
 import sys
@@ -58,7 +58,7 @@ class WatchFlags:
     seed: int = HELD_OUT_SEED
     """Seed of the first map and of the starts; those of held-out maps begin at 2,000,000."""
     seconds: float = 0.0
-    """Seconds of driving to show; by default 60 in a film, and until it is closed in a window."""
+    """Seconds of driving to show; by default all of a recorded drive, else 60 in a film and no limit in a window."""
     fps: int = 0
     """Pictures a second; by default 30 in a window, 20 in an .mp4, 10 in a .gif."""
     size: str = ""
@@ -194,9 +194,13 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     return lambda: elites.get(None)
 
 
+def _is_recording(flags: WatchFlags) -> bool:
+    return flags.source.lower().endswith(".csv")
+
+
 def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
     """Drives to show, without an end but for a recorded one, and what they are. Raises as `_driver`, DriveError."""
-    if flags.source.lower().endswith(".csv"):
+    if _is_recording(flags):
         yield from _recorded(flags)
         return
     driver = _driver(flags)
@@ -218,11 +222,14 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     config = SimConfig()
     scenario, _ = _map(kept.scenario, kept.map_seed, config)
     _, cars, ranges, worlds = replay(kept, scenario, config)
-    boxes = others(worlds)
-    for episode in range(int(kept.episodes[-1]) + 1):
+    title = f"{Path(flags.source).name}    {label(scenario.name)}, map {scenario.seed:,}"
+    episodes = int(kept.episodes[-1]) + 1
+    for episode in range(episodes):
         own = kept.episodes == episode
-        drive = Recording(scenario, cars[own], ranges[own], boxes[own], End.RUNNING, config.episode.control_period)
-        yield drive, f"{Path(flags.source).name}    {label(scenario.name)}, map {scenario.seed:,}"
+        drive = Recording(
+            scenario, cars[own], ranges[own], others(worlds[own]), End.RUNNING, config.episode.control_period
+        )
+        yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
 
 
 def _film(flags: WatchFlags, console: Console) -> str:
@@ -237,23 +244,24 @@ def _film(flags: WatchFlags, console: Console) -> str:
     if gif and 100 % fps:
         raise UsageError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
     size = _size(flags.size or "640x360")
-    seconds = _seconds(flags.seconds) or FILM_S
-    drive, title = next(_drives(flags, seconds))
-    if drive.seconds > seconds:
-        kept = slice(0, 1 + round(seconds / drive.period))
-        drive = dataclasses.replace(drive, cars=drive.cars[kept], ranges=drive.ranges[kept], boxes=drive.boxes[kept])
-    total = max(1, round(drive.seconds * fps))
-    renderer = Renderer(drive.scenario, size)
-    with console.status(f"filming {drive.seconds:.0f} s of driving") as status:
+    recorded = _is_recording(flags)
+    limit = _seconds(flags.seconds) or (math.inf if recorded else FILM_S)
+    drives = list(_recorded(flags)) if recorded else [next(_drives(flags, limit))]
+    seconds = min(limit, sum(drive.seconds for drive, _ in drives))
+    total = max(1, round(seconds * fps))
+    renderer = Renderer(drives[0][0].scenario, size)
+    pictures = itertools.chain.from_iterable(frames(renderer, drive, fps, title) for drive, title in drives)
+    with console.status(f"filming {seconds:.0f} s of driving") as status:
 
         def counted() -> Iterator[np.ndarray]:
-            for k, image in enumerate(frames(renderer, drive, fps, title)):
-                status.update(f"filming {drive.seconds:.0f} s of driving: picture {k} of {total}")
+            for k, image in enumerate(itertools.islice(pictures, total)):
+                status.update(f"filming {seconds:.0f} s of driving: picture {k} of {total}")
                 yield image
 
         count = write_video(output, counted(), size, fps)
-    how = "" if drive.end == End.RUNNING else f", to its end: {drive.end.name.lower()}"
-    return f"{output}: {drive.seconds:.1f} s{how}, {count} pictures, {output.stat().st_size / 1e6:.1f} MB"
+    end = drives[0][0].end
+    how = "" if end == End.RUNNING else f", to its end: {end.name.lower()}"
+    return f"{output}: {seconds:.1f} s{how}, {count} pictures, {output.stat().st_size / 1e6:.1f} MB"
 
 
 def _show(flags: WatchFlags) -> None:

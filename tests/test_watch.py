@@ -266,18 +266,22 @@ def test_watch_shows_a_recorded_drive(tmp_path):
     scenario = build("seamless", 3)
     simulator = Simulator([scenario], 1, unhurried())
     start = sample_starts(scenario, 1, np.random.default_rng(1))[0]
-    simulator.reset(start[None])
     with Recorder(tmp_path / "drive.csv", scenario, 0.1) as recorder:
-        for k in range(16):
-            recorder.write(k, start if k == 0 else pose(simulator.state.cars[0]), 0, 0)
-            simulator.step(np.array([0]))
-    done = run("watch", "drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert probe(tmp_path / "d.mp4")[5] == 15
+        for episode, steps in enumerate((16, 11)):
+            simulator.reset(start[None])
+            for k in range(steps):
+                recorder.write(k, start if k == 0 else pose(simulator.state.cars[0]), 0, episode)
+                simulator.step(np.array([0]))
+    for arguments, pictures in (([], 25), (["--seconds", 2], 20)):
+        film = ["--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]
+        done = run("watch", "drive.csv", *film, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert probe(tmp_path / "d.mp4")[5] == pictures
+        assert f"{pictures / 10:.1f} s, {pictures} pictures" in done.stdout
     (tmp_path / "cut.csv").write_text((tmp_path / "drive.csv").read_text()[:-30])
     done = run("watch", "cut.csv", "--output", "e.mp4", cwd=tmp_path)
     assert done.returncode == 2
-    assert "cut.csv, line 17" in done.stderr
+    assert "cut.csv, line 28" in done.stderr
 
 
 @pytest.mark.e2e
