@@ -1,11 +1,12 @@
 # GridSim. `make help` (or plain `make`) lists what there is.
 #
 # Each target sets up its own needs: .venv is created if there is none, and installed into
-# again only when pyproject.toml has changed.
+# again only when pyproject.toml has changed. Tests and checks need more than a user does.
 
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+DEV    := $(VENV)/.installed-dev
 # What .venv is made with: PYTHON if given, else the first of these that is 3.11 or newer and can make one.
 PYTHON ?=
 PYTHONS := python3 python3.11 python3.12 python3.13 /usr/bin/python3
@@ -14,7 +15,8 @@ ARGS   ?=
 PORT   ?= 5000
 
 .DEFAULT_GOAL := help
-.PHONY: help install evolve dqn compare test ui bench pictures lint format
+.NOTPARALLEL:
+.PHONY: help install develop evolve dqn compare test ui bench pictures lint format
 
 help: ## This list
 	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
@@ -22,6 +24,8 @@ help: ## This list
 	@echo; echo "  PYTHON=/path/to/python  makes .venv with that one (3.11 or newer);  PORT=5000  is make ui's"
 
 install: $(STAMP) ## Create .venv and install into it (the others do so by themselves)
+
+develop: $(DEV) ## The same with what tests, style and type checks need
 
 evolve: $(STAMP) ## Evolve a driver; ARGS="--workers 2 --seed 3" are passed on, ARGS=--help lists them
 	@$(BIN)/gridsim-evolve $(ARGS)
@@ -32,7 +36,7 @@ dqn: $(STAMP) ## Train a driver by deep Q-learning instead; ARGS as above
 compare: $(STAMP) ## Compare the learners on all roads, up to an hour; ARGS=--quick takes minutes
 	@$(BIN)/gridsim-compare $(ARGS)
 
-test: $(STAMP) ## Run all tests; ARGS='-m "not e2e"' leaves out those with real Ray workers
+test: $(DEV) ## Run all tests; ARGS='-m "not e2e"' leaves out those with real Ray workers
 	$(BIN)/python -m pytest $(ARGS)
 
 ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
@@ -48,17 +52,19 @@ bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
 pictures: $(STAMP) ## Draw docs/'s pictures of the five scenarios again
 	$(BIN)/python docs/pictures.py
 
-lint: $(STAMP) ## Check style, format and types
+lint: $(DEV) ## Check style, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(STAMP) ## Rewrite the code in the project's format
+format: $(DEV) ## Rewrite the code in the project's format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 # The stamp comes last, so that an install cut short is done again.
-$(STAMP): pyproject.toml
+$(STAMP): EXTRA :=
+$(DEV): EXTRA := [dev]
+$(STAMP) $(DEV): pyproject.toml
 	@if ! $(BIN)/python -m pip --version >/dev/null 2>&1; then \
 	  for python in $(or $(PYTHON),$(PYTHONS)); do \
 	    if "$$python" -c 'import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
@@ -72,5 +78,5 @@ $(STAMP): pyproject.toml
 	    echo "make: name one that is not found by itself with make PYTHON=/path/to/python" >&2; exit 1; \
 	  fi; \
 	fi
-	$(BIN)/python -m pip install --disable-pip-version-check --editable ".[dev]"
-	@touch $@
+	$(BIN)/python -m pip install --disable-pip-version-check --editable ".$(EXTRA)"
+	@touch $(STAMP) $@

@@ -51,6 +51,26 @@ def test_cluster_files_are_packaged(root: Path) -> None:
     assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml"}
 
 
+def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path) -> None:
+
+    def said(target: str) -> str:
+        command = ["make", "--dry-run", target, f"VENV={tmp_path}"]
+        return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout
+
+    def installs(target: str) -> list[str]:
+        return re.findall(r'--editable "(.*)"', said(target))
+
+    for target in ("install", "evolve", "dqn", "compare", "ui", "bench", "pictures"):
+        assert installs(target) == ["."]
+    for target in ("develop", "test", "lint", "format"):
+        assert installs(target) == [".[dev]"]
+    assert f"touch {tmp_path}/.installed {tmp_path}/.installed-dev" in said("test")  # it has what a user needs, too
+    (tmp_path / ".installed").touch()
+    assert (installs("evolve"), installs("test")) == ([], [".[dev]"])
+    (tmp_path / ".installed-dev").touch()
+    assert (installs("evolve"), installs("test")) == ([], [])
+
+
 def test_make_help_names_every_target(root: Path) -> None:
     done = subprocess.run(["make", "help"], cwd=root, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
