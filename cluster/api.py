@@ -37,7 +37,8 @@ def evolve(
         workers: Ray workers on this machine; 0 evaluates in this process.
         on_generation: told the number of generations done and the last one's figures.
 
-    Returns: the champion, and the history, a row of figures for each generation.
+    Returns: the champion, and the history, a row of figures for each generation, by the names of a run's history.csv:
+    `.../mean` is of all members on training's episodes, `.../best` of the best genome so far on episodes of its own.
     Raises: SettingsError, PoolError with one line.
     """
     settings = settings or EvolveSettings()
