@@ -1,5 +1,6 @@
 """What tests of whole commands share: the installed scripts, run as a user runs them, and their workers."""
 
+import contextlib
 import csv
 import json
 import os
@@ -8,6 +9,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+import psutil  # type: ignore[import-untyped]
 
 BIN = Path(sys.executable).parent
 
@@ -93,3 +96,22 @@ def wait_until(condition, timeout=120.0, pause=0.02):
             return value
         time.sleep(pause)
     raise AssertionError("it did not happen in time")
+
+
+def answers(address: str) -> bool:
+    """Whether a Ray cluster is there, if only to say that it wants its token."""
+    from cluster.ray_pool import PoolError, check_address
+
+    try:
+        return bool(check_address(address))
+    except PoolError as error:
+        return "wants its token" in str(error)
+
+
+def end(node: subprocess.Popen) -> None:
+    """Kill a host: all of its processes, at once."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                process.kill()
+    node.wait()

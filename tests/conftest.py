@@ -5,21 +5,28 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sysconfig
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from commands import BIN, answers, end, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
     from gridsim.scenarios import Scenario
 
-# Nothing may reach a cluster or a tracking server that the shell happens to name.
-for _name in ("MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME", "MLFLOW_RUN_ID", "RAY_ADDRESS"):
-    os.environ.pop(_name, None)
+# Tests take nothing from the machine's home (a cluster's token) or shell (a cluster's or tracking server's address).
+# Caches stay where they are, as compiling all kernels takes minutes.
+for _name in [name for name in os.environ if name.startswith(("MLFLOW_", "RAY_"))]:
+    del os.environ[_name]
+os.environ.setdefault("XDG_CACHE_HOME", str(Path.home() / ".cache"))
+_home = tempfile.TemporaryDirectory(prefix="gridsim-home-", ignore_cleanup_errors=True)
+os.environ["HOME"] = _home.name
 
 # A shell ignores Ctrl-C for what it starts in the background, and so would the commands that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -112,3 +119,39 @@ def command(tmp_path: Path) -> Command:
         )
 
     return run
+
+
+@pytest.fixture
+def cluster() -> Iterator[Callable[..., tuple[str, subprocess.Popen]]]:
+    """Start a Ray node as its users do: a head, or with the head's address another one. All on this machine.
+
+    Keywords but `address` are set in its environment.
+    """
+    nodes: list[subprocess.Popen] = []
+    folders = []  # in a user's own, `ray start` would name another head as the current one; paths of sockets are short
+
+    def node(cpus: int, address: str = "", **environment: str) -> tuple[str, subprocess.Popen]:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        where = [f"--address={address}"]
+        if not address:
+            folders.append(tempfile.mkdtemp(prefix="gridsim-", dir="/tmp"))
+            where = ["--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={folders[-1]}"]
+        nodes.append(
+            subprocess.Popen(
+                [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}", "--object-store-memory=100000000", *where],
+                env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | environment,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+        )
+        if not address:
+            wait_until(lambda: answers(f"127.0.0.1:{port}"), 60)
+        return address or f"127.0.0.1:{port}", nodes[-1]
+
+    yield node
+    for process in nodes:
+        end(process)
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -8,13 +8,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import BIN, descendants, finish, rows, start, summary, wait_until
+from commands import BIN, answers, descendants, finish, rows, start, summary, wait_until
 
 from cluster.checkpoint import save
 from cluster.cli import REMOVED, EvolveFlags, evaluate_main, evolve_main
@@ -79,36 +78,25 @@ def test_ctrl_c_saves_and_leaves_nothing_behind(reference, empty_database, tmp_p
 
 
 @pytest.mark.e2e
-def test_existing_cluster(reference, tmp_path):
+def test_existing_cluster(reference, cluster, tmp_path):
     """As the README says: ray start, then --address."""
-    port = 6399
-    short = tempfile.mkdtemp(prefix="gridsim-")  # Ray's sockets lie in it, and their paths must be short
-    env = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0"}
-    ray = [str(BIN / "ray")]
-    head = [
-        "start",
-        "--head",
-        "--num-cpus",
-        "2",
-        f"--port={port}",
-        "--include-dashboard=false",
-        "--disable-usage-stats",
-    ]
-    subprocess.run(
-        [*ray, *head, "--object-store-memory=200000000", f"--temp-dir={short}"], check=True, capture_output=True,
-        env=env,
-    )  # fmt: skip
-    try:
-        done = evolve("--workers", "2", "--address", f"127.0.0.1:{port}", "--name", "a", *SMALL, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        assert summary(tmp_path / "runs/a")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
-        alive = subprocess.run(
-            [*ray, "status", f"--address=127.0.0.1:{port}"], capture_output=True, env=env, check=False
-        )
-        assert alive.returncode == 0  # the run left, the cluster stays
-    finally:
-        subprocess.run([*ray, "stop", "--force"], capture_output=True, env=env, check=False)
-        shutil.rmtree(short, ignore_errors=True)
+    address, _ = cluster(2)
+    done = evolve("--workers", "2", "--address", address, "--name", "a", *SMALL, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert summary(tmp_path / "runs/a")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    assert answers(address)  # the run left, the cluster stays
+
+
+def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path):
+    code = "import conftest, os, pathlib, gridsim.jit as jit; print(pathlib.Path.home(), jit.CACHE_FOLDER, *os.environ)"
+    shell = {"HOME": str(tmp_path), "RAY_ADDRESS": "x", "RAY_AUTH_MODE": "token", "MLFLOW_TRACKING_URI": "x"}
+    env = {name: value for name, value in os.environ.items() if name not in ("XDG_CACHE_HOME", "GRIDSIM_CACHE_DIR")}
+    home, cache, *names = subprocess.run(
+        [sys.executable, "-c", code], cwd=root / "tests", env=env | shell, check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert not Path(home).is_relative_to(tmp_path)
+    assert Path(cache).is_relative_to(tmp_path / ".cache"), "kernels are compiled once for all sessions"
+    assert not set(shell) - {"HOME"} & set(names)
 
 
 @pytest.mark.e2e

@@ -10,7 +10,6 @@ import os
 import random
 import shutil
 import signal
-import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,13 +18,13 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import BIN, all_in_mlflow, finish, ray_workers, rows, start, summary, wait_until
+from commands import all_in_mlflow, end, finish, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
 from cluster.coordinator import Evolution
 from cluster.learning import Maps
-from cluster.pool import PoolError, SerialPool
-from cluster.ray_pool import RayPool, check_address
+from cluster.pool import SerialPool
+from cluster.ray_pool import RayPool
 from cluster.settings import EvolveSettings
 from cluster.worker import Task, Worker
 from gridsim.config import SimConfig
@@ -210,51 +209,9 @@ def test_ten_workers_killed_at_random_moments_change_nothing(reference: Path, tm
 # ------------------------------------------------------------------------------------------------------------ hosts
 
 
-@pytest.fixture
-def cluster() -> Iterator[Callable[..., tuple[str, subprocess.Popen]]]:
-    """Start a Ray node as its users do: a head, or with the head's address another one. All on this machine."""
-    nodes: list[subprocess.Popen] = []
-
-    def node(cpus: int, address: str = "") -> tuple[str, subprocess.Popen]:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        where = [f"--address={address}"] if address else ["--head", f"--port={port}", "--include-dashboard=false"]
-        nodes.append(
-            subprocess.Popen(
-                [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}", "--object-store-memory=100000000", *where],
-                env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"},
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-        )
-        if not address:
-            wait_until(lambda: answers(f"127.0.0.1:{port}"), 60)
-        return address or f"127.0.0.1:{port}", nodes[-1]
-
-    yield node
-    for process in nodes:
-        end(process)
-
-
-def answers(address: str) -> bool:
-    with contextlib.suppress(PoolError):
-        return bool(check_address(address))
-    return False
-
-
 def below(node: subprocess.Popen, name: str) -> list[psutil.Process]:
     """Processes of a host whose names begin so."""
     return [p for p in psutil.Process(node.pid).children(recursive=True) if p.name().startswith(name)]
-
-
-def end(node: subprocess.Popen) -> None:
-    """Kill a host: all of its processes, at once."""
-    with contextlib.suppress(psutil.NoSuchProcess):
-        for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
-    node.wait()
 
 
 def test_hosts_come_and_go_and_in_the_end_patience_does(

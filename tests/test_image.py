@@ -12,6 +12,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from hosts import HOME
 from test_docker import ROOT, ignored, instructions
 
 MIRROR = "http://deb.debian.org/debian"
@@ -78,7 +79,8 @@ def pip_settings() -> dict[str, str]:
 
 def pip_folders() -> list[str]:
     """Folders of packages that pip is told of, where this machine has any."""
-    said = subprocess.run(["pip", "config", "list"], capture_output=True, text=True, check=True).stdout
+    env = os.environ | {"HOME": str(HOME)}
+    said = subprocess.run(["pip", "config", "list"], env=env, capture_output=True, text=True, check=True).stdout
     named = re.findall(r"(?<![\w.:/])(?:file://)?(/[\w./-]+)", said)
     return sorted({path.removesuffix("/simple") for path in named if Path(path).is_dir()})  # files lie beside an index
 
@@ -91,7 +93,7 @@ def fresh(folder: Path) -> Path:
     for path in ("/etc/resolv.conf", "/etc/hosts", "/etc/pip.conf", "/etc/ssl/certs/ca-certificates.crt"):
         if Path(path).is_file():
             shutil.copy(path, folder / path[1:])
-    own = Path.home() / ".config/pip/pip.conf"
+    own = HOME / ".config/pip/pip.conf"
     if own.is_file():
         (folder / "root/.config/pip").mkdir(parents=True)
         shutil.copy(own, folder / "root/.config/pip/pip.conf")

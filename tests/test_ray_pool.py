@@ -4,10 +4,8 @@ import contextlib
 import functools
 import os
 import signal
-import socket
 import subprocess
 import sys
-import sysconfig
 import threading
 import time
 import urllib.request
@@ -420,60 +418,11 @@ def test_workers_that_cannot_start_are_given_up() -> None:
         pool.evaluate(make_task(), make_recipes(20))
 
 
-RAY = str(Path(sysconfig.get_path("scripts"), "ray"))
-START = [
-    RAY,
-    "start",
-    "--head",
-    "--block",
-    "--num-cpus=2",
-    "--include-dashboard=false",
-    "--object-store-memory=100000000",
-]
-
-
-@pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Callable[..., str]]:
-    """Start Ray as its users do, with two CPUs and nobody's token at hand; returns its address."""
-    heads: list[subprocess.Popen[bytes]] = []
-
-    def start(**environment: str) -> str:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        heads.append(
-            subprocess.Popen(
-                [*START, f"--port={port}"],
-                env=os.environ | {"HOME": str(tmp_path), "RAY_USAGE_STATS_ENABLED": "0"} | environment,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-        )
-        for _ in range(600):
-            time.sleep(0.1)
-            try:
-                check_address(f"127.0.0.1:{port}")
-            except PoolError as error:
-                if "wants its token" not in str(error):
-                    continue
-            break
-        return f"127.0.0.1:{port}"
-
-    yield start
-    for head in heads:
-        processes = [psutil.Process(head.pid), *psutil.Process(head.pid).children(recursive=True)]
-        head.terminate()
-        for process in gone(processes, 20):
-            process.kill()
-        head.wait()
-
-
 @pytest.mark.usefixtures("no_pool")
 def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
-    cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    address = cluster(PYTHONPATH=str(Path(__file__).parent))
+    address, _ = cluster(2, PYTHONPATH=str(Path(__file__).parent))
     for name in (address, "auto"):
         monkeypatch.setenv("RAY_ADDRESS", address)
         with contextlib.closing(RayPool(4, never_built, name, worker_factory=Answering)) as pool:
@@ -490,15 +439,14 @@ def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
 
 @pytest.mark.usefixtures("no_pool")
 def test_a_cluster_is_told_how_a_run_is_doing(
-    cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What Prometheus reads from its node, under the run's name. What tells it there comes with ray[default]."""
     pytest.importorskip("prometheus_client")
-    monkeypatch.setenv("HOME", str(tmp_path))
     quick = {"RAY_metrics_report_interval_ms": "500"}
     for name, value in quick.items():
         monkeypatch.setenv(name, value)
-    address = cluster(PYTHONPATH=str(Path(__file__).parent), **quick)
+    address, _ = cluster(2, PYTHONPATH=str(Path(__file__).parent), **quick)
     with contextlib.closing(RayPool(1, never_built, address, worker_factory=Stepping, run="a run")) as pool:
         pool.evaluate(make_task(), make_recipes(512))
         os.kill(pool.pids()[0], signal.SIGKILL)
@@ -536,10 +484,9 @@ class Stepping(Answering):
 
 
 def test_a_cluster_that_wants_a_token(
-    cluster: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    address = cluster(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0123456789abcdef" * 4)
+    address, _ = cluster(2, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0123456789abcdef" * 4)
     with pytest.raises(
         PoolError, match=rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
     ):
