@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
+from rich.table import Table
 
 from cluster import checkpoint, experiment, tables
 from cluster.checkpoint import CheckpointError
@@ -242,7 +244,7 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
     if problem:
         fail(PROG, problem, again, FAILED)
     if results and results.runs:
-        console.print(results.closing())
+        results.show(console)
     if status == "KILLED":
         print(f"{PROG}: stopped; {again}", file=sys.stderr)
     elif failed:
@@ -305,7 +307,9 @@ class Results:
             if found:
                 drives[learner] = found
         if drives:
-            report.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, _route_title(drives))
+            compared = {group.learner for group in self.groups if group.scenario == "seamless"}
+            missing = [name for learner, name in tables.NAMES.items() if learner in compared - set(drives)]
+            report.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, _route_title(drives, missing))
 
     def _on_seamless(self, learner: str) -> list[Run]:
         """The learner's runs there: the one whose velocity error is the median first."""
@@ -330,21 +334,31 @@ class Results:
         }
         return {name: value for name, value in found.items() if math.isfinite(value)}
 
-    def closing(self) -> str:
-        """What was found, and where it is told."""
-        said = "\n".join(f"- {sentence.replace('**', '')}" for sentence in tables.findings(self.groups))
-        return f"{said}\ntables and pictures: {_shown(self.path)}/"
+    def show(self, console: Console) -> None:
+        """Print the tables without their quartiles, and where the whole ones are."""
+        console.print(tables.introduction(self.groups, self.plan).replace(", quartiles in brackets", ""))
+        for head, *rows in (tables.driving(self.groups), tables.errors(self.groups)):
+            table = Table(box=SIMPLE, padding=0, pad_edge=False, show_edge=False)
+            for name in head:  # a word a line, so that it is narrow
+                table.add_column(
+                    name.replace(",", "").replace(" ", "\n"), overflow="fold", no_wrap=name in ("road", "learner")
+                )
+            for row in rows:
+                table.add_row(*(cell.partition(" (")[0] for cell in row))
+            console.print(table, "")
+        console.print("\n".join(f"- {note}" for note in tables.notes(self.groups)), highlight=False)
+        console.print(f"tables and pictures: {_shown(self.path)}/", soft_wrap=True)
 
 
 def _last_if_none(value: float) -> float:
     return value if math.isfinite(value) else math.inf
 
 
-def _route_title(drives: dict) -> str:
-    several = max(len(found) for found in drives.values()) > 1
-    return "Errors along the seamless road, from the same start on a held-out map" + (
-        "\nlines: the seed whose mean error is the median; bands: all seeds; crosses: crashed" if several else ""
-    )
+def _route_title(drives: dict, missing: Sequence[str]) -> str:
+    title = "Errors along the seamless road, from the same start on a held-out map"
+    if max(len(found) for found in drives.values()) > 1:
+        title += "\nlines: the seed whose mean error is the median; bands: all seeds; crosses: crashed"
+    return title + (f"\nnot drawn: {', '.join(missing)}" if missing else "")
 
 
 # ------------------------------------------------------------------------------------------------ runs that are there
@@ -378,7 +392,7 @@ def _existing(console: Console, flags: CompareFlags) -> int:
     except BaseException:
         shutil.rmtree(path, ignore_errors=True)  # it was made just now
         raise
-    console.print(results.closing())
+    results.show(console)
     return 0
 
 

@@ -36,9 +36,9 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, 
     return summary
 
 
-def run(learner, scenario, seed, percent, training_s=10.0, success=0.9, traffic=0, observation="rays"):
+def run(learner, scenario, seed, percent, training_s=10.0, success=0.9, traffic=0, observation="rays", **more):
     """A finished run with its errors."""
     figures = dict.fromkeys([*RUN_FIGURES, *ERROR_FIGURES], 1.0)
-    figures |= {"velocity_error_percent": percent, "training_s": training_s, "success_rate": success}
+    figures |= {"velocity_error_percent": percent, "training_s": training_s, "success_rate": success} | more
     name = f"{scenario}-{learner}-s{seed}"
     return Run(Path(name), learner, scenario, seed, traffic, observation, name, figures)

@@ -1,14 +1,17 @@
-"""Tables of a comparison, what they say in words, and its picture."""
+"""Tables of a comparison, how far they can be believed, and its pictures."""
 
 import csv
 import io
 from pathlib import Path
 
 import numpy as np
+import pytest
 from finished_runs import run
 from PIL import Image
+from rich.console import Console
 
 from cluster import report, tables
+from cluster.compare import Results, _route_title
 from cluster.experiment import Budget, Plan
 from gridsim.scenarios import REGISTRY
 
@@ -50,60 +53,46 @@ def test_runs_of_different_traffic_and_views_are_not_mixed():
     assert len(tables.group(runs)) == 3
 
 
-def experiment_of(low, high, scenarios=ALL, **more):
-    """Two seeds each, one percent apart; errors of evolution and of the DQN."""
+def experiment_of(seeds, **more):
+    """All roads, with so many seeds of evolution and of the DQN."""
     return tables.group(
         [
-            run(learner, scenario, seed, percent[scenario] + seed, **more.get(learner, {}))
-            for scenario in scenarios
-            for learner, percent in (("evolution", low), ("dqn", high))
-            for seed in range(2)
+            run(learner, scenario, seed, 5.0 + seed, **more.get(learner, {}))
+            for scenario in ALL
+            for learner in ("evolution", "dqn")
+            for seed in range(seeds)
         ]
     )
 
 
-LOW, HIGH = dict.fromkeys(ALL, 5.0), dict.fromkeys(ALL, 9.0)
+def test_few_seeds_allow_no_verdict():
+    for seeds in (1, 2):
+        assert tables.notes(experiment_of(seeds))[1:] == [f"Too few seeds for a verdict ({seeds}; 3 or more)."]
+    few = [run("dqn", "city", 0, 1.0), *(run("evolution", "city", seed, 1.0) for seed in range(3))]
+    assert tables.notes(tables.group(few))[-1] == "Too few seeds for a verdict (1; 3 or more)."
+    (chance,) = tables.notes(experiment_of(3))[1:]
+    assert "in 10 % of comparisons, by chance" in chance
+    assert "holds the true median in 75%" in chance
 
 
-def test_claim_holds():
-    said = tables.findings(experiment_of(LOW, HIGH, evolution={"training_s": 5.0}))
-    assert "claim that evolution's is smaller than the DQN's holds.**" in said[0]
-    assert "highway (5.5 against 9.5 %)" in said[0]
-    assert "No seed of one learner is among the other's on highway, curved" in said[0]
-    assert "not smaller" not in said[0]
-    assert "shorter than the DQN's on every road" in said[1]
+def test_unequal_training_is_told():
+    def told(**dqn):
+        return [note for note in tables.notes(experiment_of(1, dqn=dqn)) if note.startswith("Training")]
+
+    assert told(training_s=20.0) == []  # with as many car-steps
+    assert told(training_s=20.0, car_steps=5.0) == [f"Training took unequal time and car-steps on {', '.join(ALL)}."]
 
 
-def test_claim_holds_in_part():
-    said = tables.findings(experiment_of(LOW, {**HIGH, "city": 4.5}, evolution={"training_s": 50.0}))
-    assert "does not hold on all roads: on 4 of 5 only" in said[0]
-    assert "not smaller on city (5.5 against 5.0 %)" in said[0]
-    assert "Seeds overlap on city." in said[0]
-    assert "shorter than the DQN's on 0 of 5 roads" in said[1]
-
-
-def test_claim_does_not_hold():
-    assert "does not hold on any road.**" in tables.findings(experiment_of(HIGH, LOW))[0]
-    assert "does not hold on any road.**" in tables.findings(experiment_of(LOW, LOW))[0]  # equal is not smaller
-
-
-def test_claim_is_about_all_five_roads():
-    said = tables.findings(experiment_of(LOW, HIGH, ("city", "curved")))
-    assert "holds on the 2 roads that were compared, not all five" in said[0]
-    assert "cannot tell" in tables.findings(tables.group([run("evolution", "city", 0, 1.0)]))[0]
-
-
-def test_small_errors_of_those_who_crash_are_no_praise():
-    said = " ".join(tables.findings(experiment_of(LOW, HIGH, dqn={"success": 0.1})))
-    assert "no praise where fewer than half of the held-out drives succeed: DQN on highway" in said
-    assert "no praise" not in " ".join(tables.findings(experiment_of(LOW, HIGH)))
-
-
-def test_few_seeds_are_not_oversold():
-    said = tables.findings(experiment_of(LOW, HIGH))[-1]
-    assert "probability of 50 %, not 95 %" in said
-    assert "in 33 % of comparisons" in said
-    assert "One seed" in tables.findings(tables.group([run("dqn", "city", 0, 1.0)]))[-1]
+@pytest.mark.parametrize("plan", [None, PLAN])
+def test_the_terminal_shows_the_tables(tmp_path, plan):
+    results = Results(tmp_path, plan)
+    results.runs = [run("evolution", "curved", 0, 12.5), run("random", "seamless", 0, 5.0, car_steps=3e6)]
+    console = Console(width=80, file=io.StringIO())
+    results.show(console)
+    text = console.file.getvalue()
+    assert max(map(len, text.splitlines()[:-1])) <= 80
+    for word in ("evolution", "90", "12.5", "Too few seeds for a verdict (1; 3 or more)."):
+        assert word in text
 
 
 def test_picture_shows_who_was_compared(tmp_path):
@@ -112,7 +101,7 @@ def test_picture_shows_who_was_compared(tmp_path):
         wanted = 0.75 * np.array(colour) + 0.25 * 255
         return (np.abs(pixels - wanted).max(axis=2) < 6).sum() > 500
 
-    groups = experiment_of(LOW, HIGH)
+    groups = experiment_of(2)
     report.comparison(groups, tmp_path / "two.png")
     report.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
@@ -120,3 +109,8 @@ def test_picture_shows_who_was_compared(tmp_path):
     assert has(tmp_path / "two.png", dqn)
     assert has(tmp_path / "one.png", evolution)
     assert not has(tmp_path / "one.png", dqn)
+
+
+def test_the_route_tells_who_is_not_drawn():
+    assert _route_title({"evolution": [None]}, ["DQN"]).endswith("\nnot drawn: DQN")
+    assert "not drawn" not in _route_title({"evolution": [None], "dqn": [None]}, [])
