@@ -271,7 +271,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         flags = parse(kind, prog, arguments, base)
     if flags.traffic and is_map_file(flags.scenario):
         print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
-        flags = dataclasses.replace(flags, traffic=0)
+        return _prepare(kind, [*arguments, "--traffic", "0"])
     check_workers(flags.workers, flags.address, flags.patience)
     if resume:
         flags = flags.extending(base)
@@ -450,7 +450,7 @@ def _run(
         summary = session.complete(flags.workers, shown.note)
     if session.lost:
         print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
-    console.print(report.held_out_table("The champion on held-out roads", summary["held_out"]))
+    console.print(report.held_out_table("The champion on held-out drives", summary["held_out"]))
     found = "solved" if summary["solved"] else "the best so far"
     name = session.learning.step_name
     return (

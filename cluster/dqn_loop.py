@@ -261,7 +261,8 @@ class Dqn(Learning):
     def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super()._restore(arrays, meta)
         self.learner.restore(_named(arrays, "learner_"), meta["learner"])
-        self.replay.restore(_named(arrays, "replay_"), meta["replay"])
+        if "replay" in meta:  # a run that has ended kept none; extended, it fills a new one before it learns on
+            self.replay.restore(_named(arrays, "replay_"), meta["replay"])
         probe, probe_q = arrays["probe"], arrays["probe_q"]
         if (
             probe.ndim != 2

@@ -44,12 +44,13 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
         return values
 
     if history and "fitness/best" in history[0]:
-        plot(axes[0], "fitness/best", _BEST, "best")
-        mean, std = plot(axes[0], "fitness/mean", _MEAN, "mean"), np.array([row["fitness/std"] for row in history])
-        axes[0].fill_between(step, mean - std, mean + std, color=_MEAN, alpha=0.2, linewidth=0)
+        best, mean_of, success = "leader", "members, mean", ("leader/success_rate", "leader")
+        plot(axes[0], "fitness/best", _BEST, best)
+        mean, std = plot(axes[0], "fitness/mean", _MEAN, mean_of), np.array([row["fitness/std"] for row in history])
+        band = {"color": _MEAN, "alpha": 0.2, "linewidth": 0, "label": "members, standard deviation"}
+        axes[0].fill_between(step, mean - std, mean + std, **band)
         axes[0].set(title="fitness", ylim=(0, 1.05))
-        best, mean_of, success = "best", "mean", ("leader/success_rate", "leader, training")
-        plot(axes[1], "target_m", _OTHER, "episode length", linestyle=":", drawstyle="steps-mid")
+        plot(axes[1], "target_m", _OTHER, "members, episode length", linestyle=":", drawstyle="steps-mid")
     else:
         plot(axes[0], "q/mean", _BEST, "Q, mean")
         plot(axes[0], "loss", _OTHER, "loss")

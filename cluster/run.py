@@ -37,7 +37,7 @@ from cluster.tracking_address import TrackingError
 from evolution.curriculum import HELD_OUT_SEEDS
 from evolution.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
-from gridsim.maps import map_digest
+from gridsim.maps import map_digest, short_lap
 from gridsim.scenarios import is_map_file, label
 
 HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
@@ -243,7 +243,9 @@ class Session:
 
     def learn(self) -> None:
         """Learn to the end, saving after every step."""
-        learning = self.learning
+        learning, scenario = self.learning, self.run.settings.scenario
+        if is_map_file(scenario) and (problem := short_lap(scenario, learning.sim)):
+            learning.warn(problem)
         for step, past in enumerate(learning.history):  # what MLflow has is skipped
             self._log(step, past, learning.wall_before_s - past["wall_s"])
         if learning.history:
@@ -298,7 +300,7 @@ class Session:
         checkpoint.write_atomic(self.run.path / HISTORY, self.learning.history_csv(), durable=False)
 
     def finish(self, workers: int) -> dict[str, Any]:
-        """Measure the champion on held-out roads and write what is left: champion, elites, summary, pictures.
+        """Measure the champion on held-out drives and write what is left: champion, elites, summary, pictures.
 
         Returns: the summary.
         """
@@ -351,8 +353,9 @@ class Session:
 
     def complete(self, workers: int, note: Callable[[str], None]) -> dict[str, Any]:
         """`finish`, and hand all that there is to MLflow; `note` is told what is going on. Returns the summary."""
-        note(f"measuring {'and filming ' if self.film else ''}the champion on held-out roads")
+        note(f"measuring {'and filming ' if self.film else ''}the champion on held-out drives")
         summary = self.finish(workers)
+        self._drop_replay()
         note("logging to MLflow")
         if not summary["mlflow_run_id"]:
             with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
@@ -361,6 +364,15 @@ class Session:
         self.tracker.describe(tracking_run.describe(self.run, summary))
         self.tracker.log_artifacts(self.run.path)
         return summary
+
+    def _drop_replay(self) -> None:
+        """Take a DQN's replay, most of its checkpoint, out of what is kept of a run that has ended."""
+        path = self.run.path / CHECKPOINT
+        with contextlib.suppress(CheckpointError):  # then it stays
+            arrays, meta = checkpoint.load(path)
+            if meta.pop("replay", None):
+                kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
+                checkpoint.save(path, kept, meta)
 
     @contextlib.contextmanager
     def _filmed(self, seed: int, start: np.ndarray, world: np.ndarray, title: str) -> Iterator[None]:

@@ -29,9 +29,11 @@ from PIL import Image
 
 from gridsim.config import SimConfig, VehicleConfig
 from gridsim.network import make_network
-from gridsim.raster import OUTSIDE, complete_starts, find_starts, signed_clearance
+from gridsim.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
 from gridsim.roads import (
     CELLS_PER_M,
+    FIELD_FLOOR,
+    FIELD_UNITS,
     HEADING_BINS,
     HEADING_WRAP,
     MEMORY_LIMIT_CELLS,
@@ -42,7 +44,7 @@ from gridsim.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.scenarios import FILE_SPEEDS, START_SPEED, Scenario
+from gridsim.scenarios import FILE_SPEEDS, START_SPEED, Scenario, label
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -92,6 +94,19 @@ def load_map(name: str, config: SimConfig | None = None) -> Scenario:
     """
     path = Path(os.path.abspath(name))
     return _load(str(path), *(_stamp(file) for file in _files(path)), config=config or SimConfig())
+
+
+def short_lap(name: str, config: SimConfig) -> str:
+    """A line to warn with where a file's road is too short for a lap that counts twice, else ""."""
+    road, revisit = load_map(name, config).road, config.episode.revisit
+    nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
+    length = road_length(nodes)
+    if length > 1.05 * revisit:  # it is an estimate
+        return ""
+    return (
+        f"{label(name)} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts nothing: "
+        "cars end idle in their second lap. Make the road longer, or its resolution larger"
+    )
 
 
 def map_digest(name: str) -> str:

@@ -165,13 +165,29 @@ def _longest(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> flo
     return float((sector * math.pi / 36)[ways[sector % 72] >= 0.9 * ways[best]].mean())
 
 
-def _large(wide: np.ndarray) -> np.ndarray:
-    """Which nodes belong to a connected part that extends some tens of metres; over the sides of the field as well."""
+def _parts(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Connected parts: labels of nodes, 0 is none, and the part of each label; over the sides of the field as well."""
     labels, count = ndimage.label(wide)
     seams = np.concatenate([np.stack([labels[0], labels[-1]]), np.stack([labels[:, 0], labels[:, -1]])], axis=1)
     seams = seams[:, (seams > 0).all(axis=0)]
     joined = coo_array((np.ones(seams.shape[1]), (seams[0], seams[1])), shape=(count + 1, count + 1))
-    _, group = connected_components(joined, directed=False)
+    return labels, connected_components(joined, directed=False)[1]
+
+
+def road_length(nodes: np.ndarray) -> float:
+    """About how many m of road hang together: the largest part's area over its width. Within 10 % for a ring."""
+    road = nodes > 0.0
+    labels, group = _parts(road)
+    middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
+    area = np.bincount(group[labels[road]]) * _NODE**2
+    part = group[labels[middle]]
+    width = 2.0 * np.bincount(part, nodes[middle]) / np.maximum(np.bincount(part), 1)
+    return float((area / np.maximum(width, _NODE)).max())
+
+
+def _large(wide: np.ndarray) -> np.ndarray:
+    """Which nodes belong to a connected part that extends some tens of metres; over the sides of the field as well."""
+    labels, group = _parts(wide)
     boxes = ndimage.find_objects(labels)
     size = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
     extent = np.bincount(group, weights=size)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cluster import dqn_loop
+from cluster.checkpoint import CheckpointError
 from cluster.dqn_loop import Dqn
 from cluster.learning import Maps
 from cluster.pool import Chunk, PoolError, SerialPool, new_collected
@@ -80,6 +81,16 @@ def test_large_values_can_be_saved_and_taken_up_again(loop):
     again = loop(learning_rate=1e30)
     again.restore(*learning.state())
     assert again.counts() == learning.counts()
+
+
+@pytest.mark.parametrize("change", [lambda a: a[:-1], lambda a: a.astype(np.int32)])
+@pytest.mark.parametrize("name", ["replay_actions", "replay_observations"])
+def test_a_replay_of_another_run_is_refused(loop, name, change):
+    learning = loop()
+    learning.timed(learning.step(), 1.0, None)
+    arrays, meta = learning.state()
+    with pytest.raises(CheckpointError, match="the checkpoint does not belong to this run"):
+        loop().restore(arrays | {name: change(arrays[name])}, meta)
 
 
 @pytest.mark.parametrize("gene", [np.nan, np.inf])

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +24,13 @@ from pictures import (
 from PIL import Image
 
 from cluster.champion import Champion, evaluate
+from cluster.cli import EvolveFlags, _prepare
 from cluster.run import RunError, new_run, open_run, read_config
 from cluster.settings import EvolveSettings
 from evolution.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.env import GridSimEnv, GridSimVectorEnv
-from gridsim.maps import MapFile, load_map, map_digest, read_free, read_map_file
+from gridsim.maps import MapFile, load_map, map_digest, read_free, read_map_file, short_lap
 from gridsim.raster import signed_clearance
 from gridsim.scenarios import Scenario, build, label, sample_starts, starts_at
 from gridsim.simulator import Simulator
@@ -127,6 +129,18 @@ def test_starts_head_along_a_ring(tmp_path):
     turn = np.abs((starts[:, 2] - tangent + math.pi / 2) % math.pi - math.pi / 2)
     assert np.degrees(turn).max() < 10.0
     assert np.histogram(tangent, 8)[0].min() > 20  # all around
+
+
+@pytest.mark.parametrize(("radius", "short"), [(18.0, True), (30.0, True), (36.0, False)])
+@pytest.mark.parametrize("half_width", [2.0, 5.0])
+def test_a_ring_too_short_to_count_is_told(tmp_path, radius, short, half_width):
+    pixels = picture(lambda x, y: half_width - np.abs(np.hypot(x - 45, y - 45) - radius), 90.0, 90.0)
+    said = short_lap(save(tmp_path / "ring.png", pixels), SimConfig())
+    assert bool(said) == short
+    if short:
+        about = re.match(r"ring has about (\d+) m of road\. What is driven again within 200 m counts nothing", said)
+        assert about is not None
+        assert float(about[1]) == pytest.approx(2 * math.pi * radius, rel=0.1)
 
 
 def test_starts_are_on_the_road_and_not_in_the_shed(tmp_path):
@@ -317,6 +331,13 @@ def test_environments_and_champions_drive_on_it(track, tmp_path):
     assert GridSimEnv(track.name).reset(seed=1)[0].shape == (32,)
     champion = Champion(np.zeros(PolicySpec.parse("mlp:2").size, np.float32), "mlp:2", track.name, SimConfig())
     assert evaluate(champion, episodes=8)["episodes"] == 8
+
+
+def test_traffic_that_a_map_cannot_have_changes_nothing(tmp_path, capsys):
+    name = save(tmp_path / "a.png", picture())
+    asked, plain = (_prepare(EvolveFlags, ["--scenario", name, "--traffic", n])[1].settings for n in ("3", "0"))
+    assert asked == plain
+    assert capsys.readouterr().err == f"gridsim-evolve: {name} has no lanes for traffic; running without\n"
 
 
 def test_runs_know_their_map_again(tmp_path, monkeypatch):
