@@ -12,6 +12,7 @@ from rich.console import Console
 
 from cluster import report, tables
 from cluster.compare import Results, _route_title
+from cluster.coordinator import COLUMNS
 from cluster.experiment import Budget, Plan
 from gridsim.scenarios import REGISTRY
 
@@ -87,9 +88,9 @@ def test_unequal_training_is_told():
 def test_the_terminal_shows_the_tables(tmp_path, plan):
     results = Results(tmp_path, plan)
     results.runs = [run("evolution", "curved", 0, 12.5), run("random", "seamless", 0, 5.0, car_steps=3e6)]
-    console = Console(width=80, file=io.StringIO())
-    results.show(console)
-    text = console.file.getvalue()
+    shown = io.StringIO()
+    results.show(Console(width=80, file=shown))
+    text = shown.getvalue()
     assert max(map(len, text.splitlines()[:-1])) <= 80
     for word in ("evolution", "90", "12.5", "Too few seeds for a verdict (1; 3 or more)."):
         assert word in text
@@ -114,3 +115,15 @@ def test_picture_shows_who_was_compared(tmp_path):
 def test_the_route_tells_who_is_not_drawn():
     assert _route_title({"evolution": [None]}, ["DQN"]).endswith("\nnot drawn: DQN")
     assert "not drawn" not in _route_title({"evolution": [None], "dqn": [None]}, [])
+
+
+def test_curves_call_each_figure_by_one_name(tmp_path, monkeypatch):
+    figure, axes = report._figure(15, 3.8, 4)
+    monkeypatch.setattr(report, "_figure", lambda *shape: (figure, axes))
+    report.curves([dict.fromkeys(COLUMNS, 0.5)] * 2, tmp_path / "curves.png", "generation")
+    assert [[text.get_text() for text in axis.get_legend().get_texts()] for axis in axes] == [
+        ["leader", "members, mean", "members, standard deviation"],
+        ["members, episode length", "leader", "members, mean"],
+        ["leader", "members, mean"],
+        ["champion, validation", "leader"],
+    ]
