@@ -4,23 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import gc
-import io
 import math
 import os
-import re
-import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
 from rich.console import Console
 
+from cluster.command import (
+    FAILED,
+    INTERRUPTED,
+    TERMINATED,
+    Stopped,
+    UsageError,
+    called,
+    cores,
+    fail,
+    main,
+    parse,
+    stoppable,
+    typed,
+    undisturbed,
+    warn_of_crowd,
+)
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError, check_workers
 from gridsim.scenarios import is_map_file
 
@@ -32,10 +44,6 @@ if TYPE_CHECKING:
     from cluster.tracking import Status
     from cluster.warm import Warming
 
-T = TypeVar("T")
-FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-
-
 REMOVED = {
     "islands": "a run has one population; use --recombination all, the default, which needs no others",
     "island-car-steps": "a run has one population; use --car-steps for its budget",
@@ -45,15 +53,6 @@ REMOVED = {
     "ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
 }
 """Flags of gridsim-evolve that version 0.1 had, and what takes their place."""
-
-
-class UsageError(Exception):
-    """Wrong use; the message is shown in one line."""
-
-
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -126,36 +125,6 @@ class EvaluateFlags:
     """Print one JSON object and nothing else."""
 
 
-def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:
-    """Read the command line. Ends the process: 0 after --help, 2 with a clear line for wrong use."""
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            if default is None:
-                return tyro.cli(kind, prog=prog, args=arguments)
-            return tyro.cli(kind, prog=prog, args=arguments, default=default)
-    except SystemExit as stop:
-        if not stop.code:
-            raise
-    # tyro draws a box; its first paragraph says what is wrong.
-    lines = [re.sub(r"[│╭╮╰╯]", "", line).strip() for line in errors.getvalue().splitlines()]
-    lines = [line for line in lines if not line.startswith("─ ") or "─────" not in line]
-    text: list[str] = []
-    for line in lines:
-        if set(line) <= {"─"} and text:
-            break
-        if line and not set(line) <= {"─"}:
-            text.append(line)
-    fail(prog, " ".join(text) or "cannot read these flags", f"see {prog} --help")
-
-
-def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
-    """End with one clear line, and perhaps a second one that says what to do."""
-    line = " ".join(message.split())
-    print(f"{prog}: error: {line}", *([hint] if hint else []), sep="\n", file=sys.stderr, flush=True)
-    raise SystemExit(code)
-
-
 def process_age_s() -> float:
     """Seconds since this process was started (0 where the system does not tell)."""
     try:
@@ -165,37 +134,6 @@ def process_age_s() -> float:
             return max(0.0, float(file.read().split()[0]) - ticks / os.sysconf("SC_CLK_TCK"))
     except (OSError, ValueError, IndexError):
         return 0.0
-
-
-class Stopped(BaseException):
-    """SIGTERM."""
-
-
-@contextlib.contextmanager
-def stoppable() -> Iterator[None]:
-    """SIGTERM raises Stopped in the main thread, as Ctrl-C raises KeyboardInterrupt."""
-
-    def stop(*_: object) -> None:
-        raise Stopped
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    except SystemError as error:  # what Ray makes of it where it waits
-        raise error.__cause__ or error from None
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Iterator[None]:
-    """No signal may cut short the saving and closing."""
-    before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM)]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
 
 
 # ------------------------------------------------------------------------------------------------------------- learn
@@ -213,16 +151,7 @@ def dqn_main() -> None:
 
 def _learn_main(kind: type[Flags]) -> None:
     started = time.perf_counter() - process_age_s()
-    try:
-        with stoppable():
-            code = _learn(kind, sys.argv[1:], started)
-        gc.freeze()  # otherwise the final garbage collection traverses all PyTorch objects, which takes two seconds
-        sys.exit(code)
-    except KeyboardInterrupt:  # before there was anything to save
-        print(f"{kind.command}: stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    except Stopped:
-        sys.exit(TERMINATED)
+    main(kind.command, lambda: _learn(kind, sys.argv[1:], started))
 
 
 def _given(arguments: Sequence[str], flag: str) -> str:
@@ -333,6 +262,7 @@ def settings_of(flags: Flags) -> RunSettings:
 
 
 def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
+    from cluster.pool import PoolError, SerialPool
     from cluster.tracking_address import TrackingError, check_uri
 
     prog = kind.command
@@ -341,7 +271,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         flags, run = _prepare(kind, arguments)
         from cluster import warm
         from cluster.learning import Maps
-        from cluster.pool import PoolError, SerialPool
+        from cluster.ray_pool import RayPool, check_address
         from cluster.run import is_finished, make_tracker
         from gridsim.config import SimConfig
 
@@ -356,34 +286,30 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
             return 0
         saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
         uri = check_uri(flags.tracking_uri or saved or None)
-    except (UsageError, SettingsError, TrackingError) as error:
+        address = flags.address or os.environ.get("RAY_ADDRESS") or None
+        if address and flags.workers:
+            address = check_address(address)
+    except (UsageError, SettingsError, TrackingError, PoolError) as error:
         fail(prog, str(error))
 
+    warn_of_crowd(prog, flags.workers, flags.address)
     made = _make_folder(prog, run)
-    maps = Maps(run.settings.scenario, SimConfig())
-    warming = warm.begin(run.settings)
-    pool: WorkerPool
-    try:
-        if flags.workers == 0:
-            pool = SerialPool(maps.build)
-        else:
-            from cluster.ray_pool import RayPool
-
-            address = flags.address or os.environ.get("RAY_ADDRESS") or None
-            pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience, run=run.name)
-    except PoolError as error:
-        warming.stop()
-        maps.close()
-        _discard(made)
-        fail(prog, str(error))
-
     tracker = make_tracker(run, uri, flags.experiment)
+    closing = contextlib.ExitStack()
     status: Status = "FAILED"
     code = FAILED
     message = ""
-    again = f"continue with: {prog} --resume {_shown(run.path)}"
+    again = f"continue with: {called(prog)} --resume {typed(run.path)}"
     try:
         with stoppable():
+            maps = Maps(run.settings.scenario, SimConfig())
+            closing.callback(maps.close)
+            warming = warm.begin(run.settings)
+            closing.callback(warming.stop)
+            pool: WorkerPool = SerialPool(maps.build)
+            if flags.workers:
+                pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience, run=run.name)
+            closing.callback(pool.close)
             message = _run(console, run, pool, maps, tracker, flags, started, warming)
         status, code = "FINISHED", 0
     except KeyboardInterrupt:
@@ -398,17 +324,15 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
             raise
         message = str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # to go on would be to come to the same
-            again = f"repeat it with: {prog} --config {_shown(run.path)}/config.json --learning-rate ..."
+            again = f"repeat it with: {called(prog)} --config {typed(run.path)}/config.json --learning-rate ..."
     finally:
-        with _undisturbed():
+        with undisturbed():
             if status == "KILLED":
                 Console(stderr=True).print("stopping; a moment ...", style="dim")
-            warming.stop()
-            pool.close()
-            maps.close()
+            closing.close()
             lost = tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
     if lost:
-        later = f"; send it later with: {prog} --resume {_shown(run.path)}" if status == "FINISHED" else ""
+        later = f"; send it later with: {called(prog)} --resume {typed(run.path)}" if status == "FINISHED" else ""
         print(f"{prog}: warning: {lost}{later}", file=sys.stderr)
     resumable = (run.path / "checkpoint.npz").is_file()
     if status == "KILLED":
@@ -443,11 +367,11 @@ def _run(
     maps.ahead(session.learning.curriculum.map_seeds[:3])
     warm.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
     run.write_config()
-    with progress.Progress(console, session, _shown(run.path)) as shown:
-        session.on_row = shown.row
-        session.learning.on_progress = shown.members
+    with progress.Progress(console, session, typed(run.path)) as bar:
+        session.on_row = bar.row
+        session.learning.on_progress = bar.members
         session.learn()
-        summary = session.complete(flags.workers, shown.note)
+        summary = session.complete(flags.workers, bar.note)
     if session.lost:
         print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
     console.print(report.held_out_table("The champion on held-out drives", summary["held_out"]))
@@ -455,8 +379,9 @@ def _run(
     name = session.learning.step_name
     return (
         f"{found} after {summary[name + 's']} {name}s, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
-        f"{summary['wall_s']:.0f} s\nrun: {_shown(run.path)}   champion: {_shown(run.path / 'champion.npz')}\n"
-        f"watch it: gridsim-watch {_shown(run.path)}\ncompare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
+        f"{summary['wall_s']:.0f} s\nrun: {typed(run.path)}   champion: {typed(run.path / 'champion.npz')}\n"
+        f"watch it: {called('gridsim-watch')} {typed(run.path)}\n"
+        f"compare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
     )
 
 
@@ -478,13 +403,6 @@ def _discard(made: list[Path]) -> None:
             if path == made[0]:
                 (path / "config.json").unlink(missing_ok=True)
             path.rmdir()
-
-
-def _shown(path: Path) -> str:
-    """A path as the user would type it."""
-    with contextlib.suppress(ValueError):
-        return str(path.resolve().relative_to(Path.cwd()))
-    return str(path)
 
 
 # ---------------------------------------------------------------------------------------------------------- evaluate

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import os
@@ -24,7 +23,19 @@ from rich.table import Table
 
 from cluster import checkpoint, experiment, tables
 from cluster.checkpoint import CheckpointError
-from cluster.cli import FAILED, INTERRUPTED, TERMINATED, Stopped, cores, fail, parse, stoppable
+from cluster.command import (
+    FAILED,
+    INTERRUPTED,
+    TERMINATED,
+    Stopped,
+    called,
+    cores,
+    fail,
+    main,
+    parse,
+    typed,
+    warn_of_crowd,
+)
 from cluster.experiment import Budget, Cell, CellError, ComparisonFolder, Plan
 from cluster.finished import (
     ERROR_FIGURES,
@@ -117,14 +128,7 @@ KEPT = ("runs", "output", "name", "reference")  # go with --runs
 
 def compare_main() -> None:
     """Entry point of `gridsim-compare`."""
-    try:
-        with stoppable():
-            sys.exit(_compare(sys.argv[1:]))
-    except KeyboardInterrupt:  # before there was anything to keep, or for the second time
-        print(f"{PROG}: stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    except Stopped:
-        sys.exit(TERMINATED)
+    main(PROG, lambda: _compare(sys.argv[1:]))
 
 
 def _compare(arguments: Sequence[str]) -> int:
@@ -145,6 +149,7 @@ def _compare(arguments: Sequence[str]) -> int:
         fail(PROG, str(error))
     except TrackingError as error:
         fail(PROG, str(error))
+    warn_of_crowd(PROG, flags.workers, flags.address)
     return _experiment(console, folder, cells, flags, uri)
 
 
@@ -240,7 +245,7 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
     lost = _close(tracker, results, status) if tracker else None
     if lost:
         print(f"{PROG}: warning: {lost}", file=sys.stderr)
-    again = f"continue with: {PROG} --resume {_shown(folder.path)}"
+    again = f"continue with: {called(PROG)} --resume {typed(folder.path)}"
     if problem:
         fail(PROG, problem, again, FAILED)
     if results and results.runs:
@@ -347,7 +352,7 @@ class Results:
                 table.add_row(*(cell.partition(" (")[0] for cell in row))
             console.print(table, "")
         console.print("\n".join(f"- {note}" for note in tables.notes(self.groups)), highlight=False)
-        console.print(f"tables and pictures: {_shown(self.path)}/", soft_wrap=True)
+        console.print(f"tables and pictures: {typed(self.path)}/", soft_wrap=True)
 
 
 def _last_if_none(value: float) -> float:
@@ -419,7 +424,7 @@ class Progress:
         )
         self._task = self._bar.add_task("compare", total=self._total, completed=self._total - self._left, text="")
         there = f", {self._total - self._left} of them finished" if self._left < self._total else ""
-        console.print(f"comparing {self._total} runs{there} -> {_shown(path)}", soft_wrap=True)
+        console.print(f"comparing {self._total} runs{there} -> {typed(path)}", soft_wrap=True)
 
     def __enter__(self) -> Progress:
         self._bar.start()
@@ -474,10 +479,3 @@ class Progress:
         minutes, rest = divmod(round(seconds), 60)
         hours, minutes = divmod(minutes, 60)
         return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def _shown(path: Path) -> str:
-    """A path as the user would type it."""
-    with contextlib.suppress(ValueError):
-        return str(path.resolve().relative_to(Path.cwd()))
-    return str(path)

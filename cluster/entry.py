@@ -1,12 +1,16 @@
-"""Entry points of the console scripts: nothing but a guard, so that Ctrl-C is quiet even while libraries load."""
+"""Entry points of the console scripts: --version, and a guard, so that Ctrl-C is quiet even while libraries load."""
 
 from __future__ import annotations
 
 import sys
 from importlib import import_module
+from importlib.metadata import version
 
 
 def _enter(name: str, module: str = "cluster.cli") -> None:
+    if "--version" in sys.argv[1:]:
+        print(f"gridsim {version('gridsim')}")
+        return
     try:
         commands = import_module(module)
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from rich.console import Console
 from cluster import checkpoint
 from cluster.champion import Champion, UnfinishedError, load_champion
 from cluster.checkpoint import CheckpointError
-from cluster.cli import INTERRUPTED, UsageError, fail, parse
+from cluster.command import INTERRUPTED, UsageError, called, fail, parse
 from cluster.run import CHECKPOINT, CONFIG, ELITES, RunError, read_config
 from cluster.settings import MAX_TRAFFIC
 from cluster.video import SUFFIXES, Recording, VideoError, frames, others, picture, record, write_video
@@ -358,4 +358,4 @@ def drive_main() -> None:
 
 def _kept(recorder: Recorder | None) -> None:
     if recorder is not None:
-        print(f"kept {recorder.rows} steps; watch them: gridsim-watch {recorder.path}")
+        print(f"kept {recorder.rows} steps; watch them: {called('gridsim-watch')} {recorder.path}")

@@ -23,7 +23,8 @@ from hosts import HOME, Host
 from packaging.requirements import Requirement
 
 from cluster import shipping
-from cluster.cli import EvolveFlags, parse
+from cluster.cli import EvolveFlags
+from cluster.command import parse
 from gridsim.jit import CACHE_FOLDER
 
 CLOUDS = ("aws", "gcp")

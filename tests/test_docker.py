@@ -25,7 +25,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from cluster import cli
+from cluster import cli, command
 from cluster.settings import DqnSettings, EvolveSettings
 from cluster.warm import everything_by_default
 from gridsim.scenarios import REGISTRY
@@ -232,7 +232,7 @@ def test_the_guides_commands_are_read_by_the_real_parser() -> None:
     commands = re.findall(r"gridsim-evolve ([^`\n]*)", text.replace("\n", " \n"))
     assert len(commands) >= 3
     for line in commands:
-        cli.parse(cli.EvolveFlags, "gridsim-evolve", shlex.split(line.replace("$WORKERS", "8")))
+        command.parse(cli.EvolveFlags, "gridsim-evolve", shlex.split(line.replace("$WORKERS", "8")))
     for option in re.findall(r"--file (\S+)", text):
         assert (ROOT / option).is_file()
 

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import finish, ray_workers, rows, start, summary, wait_until
+from commands import BIN, finish, ray_workers, rows, start, summary, wait_until
 
 from cluster.checkpoint import load, save
 
@@ -82,7 +82,7 @@ def test_ctrl_c_saves(reference, tmp_path):
     os.kill(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert "continue with: gridsim-dqn --resume runs/c" in err
+    assert f"continue with: {BIN}/gridsim-dqn --resume runs/c" in err
     assert "replay_actions" in load(run / "checkpoint.npz")[0]
     done = dqn("--resume", "runs/c", "--workers", "0", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

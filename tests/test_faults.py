@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import all_in_mlflow, end, finish, ray_workers, rows, start, summary, wait_until
+from commands import BIN, all_in_mlflow, end, finish, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
 from cluster.coordinator import Evolution
@@ -243,7 +243,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     assert err.splitlines()[0].startswith(
         "gridsim-evolve: error: there has been no worker for 15 s (--patience): Ray has"
     )
-    assert err.splitlines()[1:] == ["continue with: gridsim-evolve --resume runs/h"]
+    assert err.splitlines()[1:] == [f"continue with: {BIN}/gridsim-evolve --resume runs/h"]
     done = finish("gridsim-evolve", "--workers", "0", "--resume", "runs/h", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert same(run, reference)

@@ -271,7 +271,7 @@ def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayP
 
 
 def test_sigterm_is_seen_while_ray_waits(pool: RayPool, folder: Path) -> None:
-    from cluster.cli import Stopped, stoppable  # not with the stand-ins above: a worker must not load it
+    from cluster.command import Stopped, stoppable  # not with the stand-ins above: a worker must not load it
 
     pool.evaluate(make_task(), make_recipes(4))  # they are up
     (folder / "sleep-100").write_text("3")

@@ -17,7 +17,7 @@ import pytest
 
 from cluster import checkpoint, video
 from cluster.champion import load_champion
-from cluster.cli import UsageError
+from cluster.command import UsageError
 from cluster.video import Filming, Recording, VideoError, frames, picture, record, write_video
 from cluster.watch import Elites, watch_main
 from evolution.curriculum import spread_starts

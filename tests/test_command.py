@@ -1,0 +1,131 @@
+"""What the commands share: their help, wrong flags, what they call each other, --version."""
+
+import itertools
+import re
+import shlex
+import sys
+from importlib.metadata import version
+
+import pytest
+from commands import finish
+
+from cluster import command, ray_pool
+from cluster.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
+from cluster.command import called, parse, warn_of_crowd
+from cluster.compare import CompareFlags
+from cluster.pool import PoolError
+from cluster.watch import DriveFlags, WatchFlags
+
+FLAGS = {
+    "gridsim-evolve": EvolveFlags,
+    "gridsim-dqn": DqnFlags,
+    "gridsim-evaluate": EvaluateFlags,
+    "gridsim-watch": WatchFlags,
+    "gridsim-drive": DriveFlags,
+    "gridsim-compare": CompareFlags,
+}
+
+
+def printed_help(prog, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    with pytest.raises(SystemExit) as ended:
+        parse(FLAGS[prog], prog, ["--help"])
+    assert not ended.value.code
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+@pytest.mark.parametrize("prog", FLAGS)
+def test_help_fills_its_lines(prog, columns, monkeypatch, capsys):
+    lines = printed_help(prog, columns, monkeypatch, capsys).splitlines()
+    assert max(map(len, lines)) <= columns
+    width = max(map(len, lines)) - 2  # without the box, which is there where a terminal can show it
+    texts = [line.strip("│").rstrip() for line in lines]
+    for line, after in itertools.pairwise(texts):
+        if line.startswith(" " * 10) and after.startswith(" " * 10):
+            word = re.split(r"[ ,]", after.strip())[0]
+            assert len(line) + 1 + len(word) > width - 1, f"{line!r} has room for {word!r}"
+
+
+@pytest.mark.parametrize(
+    ("prog", "name"), [("gridsim-watch", "SOURCE"), ("gridsim-evaluate", "CHAMPION"), ("gridsim-compare", "[RUNS]")]
+)
+def test_what_is_given_without_a_flag_has_a_name(prog, name, monkeypatch, capsys):
+    lines = printed_help(prog, 80, monkeypatch, capsys).splitlines()
+    assert lines[0] == f"usage: {prog} [-h] [OPTIONS] {name}"
+
+
+def refused(prog, line, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(FLAGS[prog], prog, shlex.split(line))
+    assert ended.value.code == 2
+    return capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("prog", "line", "said"),
+    [
+        ("gridsim-evolve", "--sede 3", "unrecognized --sede; did you mean --seed?"),
+        ("gridsim-evolve", "--mutation_rat=0.1", "unrecognized --mutation-rat; did you mean --mutation-rate?"),
+        ("gridsim-watch", "--folow runs/x", "unrecognized --folow; did you mean --follow?"),
+        ("gridsim-dqn", "--frobnicate", "unrecognized --frobnicate"),
+        ("gridsim-evolve", "stray", "Unrecognized options: stray"),
+        (
+            "gridsim-evolve",
+            "--observation radar",
+            "invalid choice 'radar' for argument '--observation'. Expected one of ('rays', 'grid').",
+        ),
+    ],
+)
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, terminal, monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+    assert refused(prog, line, capsys) == [f"{prog}: error: {said}", f"see {prog} --help"]
+
+
+def test_the_other_form_of_a_switch_is_known(capsys):
+    assert not parse(DqnFlags, "gridsim-dqn", ["--no-double"]).double
+
+
+def test_a_command_is_called_as_this_one_was(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "venv/bin"
+    folder.mkdir(parents=True)
+    for name in ("gridsim-evolve", "gridsim-watch"):
+        (folder / name).touch()
+    monkeypatch.setattr(sys, "argv", ["venv/bin/gridsim-evolve"])
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    assert called("gridsim-watch") == "venv/bin/gridsim-watch"
+    monkeypatch.setenv("PATH", f"/bin:{folder}")
+    assert called("gridsim-watch") == "gridsim-watch"
+    monkeypatch.setattr(sys, "argv", ["-c"])
+    assert called("gridsim-watch") == "gridsim-watch"
+
+
+@pytest.mark.parametrize("prog", FLAGS)
+def test_each_command_tells_its_version(prog, tmp_path):
+    done = finish(prog, "--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"gridsim {version('gridsim')}\n", "")
+
+
+def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(command, "cores", lambda: 2)
+
+    def no_ray(workers, *_, **__):
+        assert workers == 1000
+        raise PoolError("no Ray in this test")
+
+    monkeypatch.setattr(ray_pool, "RayPool", no_ray)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["gridsim-evolve", "--workers", "1000", "--scenario", "curved"])
+    with pytest.raises(SystemExit) as ended:
+        evolve_main()
+    assert ended.value.code == 1
+    warning, error = capsys.readouterr().err.splitlines()
+    assert warning.startswith("gridsim-evolve: warning: 1,000 workers on 2 cores")
+    assert error == "gridsim-evolve: error: no Ray in this test"
+    warn_of_crowd("gridsim-compare", 4, "")
+    warn_of_crowd("gridsim-compare", 1000, "head:6379")
+    assert capsys.readouterr().err == ""
