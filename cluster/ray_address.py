@@ -13,7 +13,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -128,6 +128,39 @@ def end_at_once() -> None:
     if not _ends_at_once.is_set() and hasattr(libc, "on_exit"):  # glibc's; the last to be registered comes first
         _ends_at_once.set()
         libc.on_exit(ctypes.cast(libc._exit, ctypes.c_void_p), None)
+
+
+def _started_by(threads: Iterable[Path]) -> list[int]:
+    """Processes that threads have started, and what these have, by the files in which Linux tells of them."""
+    found: list[int] = []
+    for children in threads:
+        with contextlib.suppress(OSError):
+            found += [int(process) for process in children.read_text().split()]
+    return found and found + _started_by(
+        file for process in found for file in Path(f"/proc/{process}/task").glob("*/children")
+    )
+
+
+def abandon(thread: threading.Thread, booted: threading.Event) -> bool:
+    """End what a thread has started of a Ray of our own that is not up yet, and remove its folder of logs.
+
+    Starting takes seconds, on a busy machine half a minute, and cannot be stopped: the thread goes on waiting for Ray's
+    processes when they are gone. Returns whether it was done: not if Ray is up meanwhile, nor where the system does not
+    tell a thread's processes (macOS).
+    """
+    own = Path(f"/proc/self/task/{thread.native_id}/children")
+    root = Path(os.environ.get("RAY_TMPDIR") or os.environ.get("TMPDIR") or "/tmp")
+    if not own.exists():
+        return False
+    # It waits for Ray's first process to write this file, and nothing else can run in ours until it does.
+    while not (ports := sorted(root.glob(f"ray/session_*_{os.getpid()}/gcs_server_port_*"))):
+        if booted.wait(0.01):
+            return False
+    for process in _started_by([own]):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+    shutil.rmtree(ports[-1].parent, ignore_errors=True)
+    return True
 
 
 @contextlib.contextmanager

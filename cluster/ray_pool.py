@@ -60,6 +60,7 @@ from cluster.ray_address import (
     OWN_ENVIRONMENT,
     STORE_BYTES,
     TOKEN,
+    abandon,
     end_at_once,
     environment,
     has_token,
@@ -147,7 +148,7 @@ class RayPool:
         self._metre_s: dict[tuple[type, Limits], float] = {}  # what a metre of such tasks took the last time
         self._session: str | None = None  # folder of our own Ray's logs
         self._failure: BaseException | None = None
-        self._connected = self._troubled = False
+        self._starting = self._leaving = self._connected = self._troubled = False
         self._booted, self._closed = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
         self._thread.start()
@@ -328,7 +329,9 @@ class RayPool:
         if self._closed.is_set():
             return
         with no_interrupt():  # a second Ctrl-C must not leave half of it behind
-            self._booted.wait(CONNECT_S)  # what is only just starting cannot be stopped
+            self._leaving = True
+            if self._starting and not (self.address is None and abandon(self._thread, self._booted)):
+                self._booted.wait(CONNECT_S)
             if self._connected:
                 import ray
 
@@ -340,7 +343,8 @@ class RayPool:
                     shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never clears up its logs
             self._slots = []
             self._closed.set()
-            self._thread.join(1.0)
+            if self._connected:
+                self._thread.join(1.0)
 
     def _boot(self) -> None:
         """Bring up Ray and ask it for the workers; then wait, since Ray's processes die with this thread."""
@@ -353,6 +357,9 @@ class RayPool:
             ray_worker: Any = importlib.import_module("ray._private.worker")
             ray_worker._worker_logs_enabled = False  # else it prints each worker's death, `log_to_driver` or not
             map_bytes = MAP_BYTES
+            self._starting = True
+            if self._leaving:
+                return
             if self.address is None:
                 store = store_bytes()
                 map_bytes = store * MAP_BYTES // STORE_BYTES

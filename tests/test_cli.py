@@ -152,6 +152,25 @@ def test_config_repeats_and_init_continues(reference, tmp_path):
     assert summary(tmp_path / "runs/warm")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
 
 
+@pytest.mark.e2e
+@pytest.mark.parametrize("after_s", [0.0, 0.5, 1.5])
+def test_sigterm_while_ray_starts_ends_soon_and_leaves_nothing(tmp_path, after_s):
+    with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
+        process = start("gridsim-evolve", "--workers", "2", *SMALL, cwd=tmp_path, RAY_TMPDIR=short)
+        wait_until(lambda: list(Path(short).glob("ray/session_2*")))
+        time.sleep(after_s)
+        children = descendants(process.pid)
+        began = time.monotonic()
+        process.terminate()
+        _, err = process.communicate(timeout=60)
+        assert time.monotonic() - began < 5  # 0.2 s where nothing else is going on
+        assert process.returncode == 143, err
+        assert err.splitlines()[-1] == "gridsim-evolve: stopped; no generation was done yet"
+        wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 10)
+        assert list(Path(short).glob("ray/session_2*")) == []
+    assert not (tmp_path / "runs").exists()
+
+
 WRONG = {
     "rays policy on the grid": (["--observation", "grid", "--policy", "mlp:6,7"], "sees the rays"),
     "grid policy on rays": (["--policy", "cnn"], "--observation grid"),

@@ -28,11 +28,12 @@ pytestmark = pytest.mark.e2e
 SCRIPT = """
     import ctypes
     import sys
+    from cluster.command import main
     from cluster.ray_pool import RayPool
     from test_pool import make_recipes, make_task, never_built
     from test_ray_process import Slow
 
-    if __name__ == "__main__":
+    def hold():
         # What C++ does as a process ends aborts it, as destructors may whose objects Ray's threads still use.
         libc = ctypes.CDLL(None)
         libc.__cxa_atexit(ctypes.cast(libc.abort, ctypes.c_void_p), None, None)
@@ -44,9 +45,13 @@ SCRIPT = """
             sys.stdout.flush()
             pool.evaluate(make_task(), make_recipes(int(sys.argv[2])))
         except KeyboardInterrupt:
-            sys.exit(130)
+            return 130
         finally:
             pool.close()
+        return 0
+
+    if __name__ == "__main__":
+        main("test", hold)
 """
 
 
