@@ -22,22 +22,22 @@ from typing import Any
 import numpy as np
 from simulation import ROWS  # beside this file
 
-from cluster.learning import Maps
-from cluster.pool import Chunk, WorkerPool
-from cluster.ray_pool import RayPool
-from cluster.run import Session, make_tracker, new_run
-from cluster.settings import EvolveSettings
-from cluster.tracking_address import check_uri
-from cluster.worker import Task, Worker
-from evolution import fitness
-from evolution.breeding import Kind, Mutation, breed, moments
-from evolution.policy import PolicySpec
-from evolution.recombination import Recombination
-from evolution.rollout import EPISODE, RESULT, Limits, evaluate, no_traffic, targets
-from evolution.search import recipes as some_recipes
+from cluster.training.trainer import Maps
+from cluster.workers.pool import Chunk, WorkerPool
+from cluster.workers.ray_pool import RayPool
+from cluster.runs.run import Session, make_tracker, new_run
+from cluster.runs.settings import EvolveSettings
+from cluster.tracking.address import check_uri
+from cluster.workers.worker import Task, Worker
+from evolution.search import fitness
+from evolution.search.breeding import Kind, Mutation, breed, moments
+from evolution.networks.policy import PolicySpec
+from evolution.search.recombination import Recombination
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, no_traffic, targets
+from evolution.search.base import recipes as some_recipes
 from gridsim.config import SimConfig
-from gridsim.ego import End
-from gridsim.scenarios import build, sample_starts
+from gridsim.car.ego import End
+from gridsim.maps.scenarios import build, sample_starts
 
 POLICY = "mlp:6,7"  # 311 genes
 CHILDREN = 100_000  # members that the coordinator alone is timed with

@@ -6,12 +6,12 @@ import argparse
 
 import numpy as np
 
-from cluster.learning import Maps, held_out_episodes
-from evolution.curriculum import HELD_OUT_EPISODES
+from cluster.training.trainer import Maps, held_out_episodes
+from evolution.episodes.curriculum import HELD_OUT_EPISODES
 from gridsim.config import SimConfig
-from gridsim.ego import DISTANCE, PACED, End
-from gridsim.reference import ReferenceDriver
-from gridsim.scenarios import REGISTRY
+from gridsim.car.ego import DISTANCE, PACED, End
+from gridsim.reference.driver import ReferenceDriver
+from gridsim.maps.scenarios import REGISTRY
 
 TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default is none
 

@@ -1,7 +1,7 @@
 """A generation on 1 to 10,000 workers, as a discrete-event simulation fed by what `ceilings.py` measured.
 
-The coordinator is one thread, as in `cluster.ray_pool`: it sends chunks to who is free, looks at all who are busy, and
-takes in what has come. The chunks are those of `cluster.pool.cut`. Simulated are its time, the network's latency and
+The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to who is free, looks at all who are busy, and
+takes in what has come. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the network's latency and
 the bandwidth of its own link, the search's few rows on their way to the nodes, and the evaluation of the members and of
 the leader, whose long episodes go out first. All members count as one group. Not simulated: who is on trial for
 champion, maps, deaths, and other people's load.
@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.pool import Chunk, cut, metres
-from cluster.worker import Task
-from evolution.breeding import RECIPE, Mutation
-from evolution.rollout import EPISODE, RESULT, Limits, no_traffic
+from cluster.workers.pool import Chunk, cut, metres
+from cluster.workers.worker import Task
+from evolution.search.breeding import RECIPE, Mutation
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
 from gridsim.config import SimConfig
 
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)

@@ -34,17 +34,17 @@ from typing import Literal
 import numpy as np
 from peers import NOT_INSTALLED, PEERS  # beside this file
 
-import gridsim.env
-from cluster.champion import Champion, load_champion
-from cluster.checkpoint import CheckpointError
-from evolution.breeding import Kind, Mutation, breed
-from evolution.episodes import lane_starts
-from evolution.policy import PolicySpec, decide, encode, pack, packed_size, scratch_size
-from evolution.rollout import Limits, evaluate
-from evolution.search import recipes as some_recipes
-from gridsim.ego import DISTANCE
+import gridsim.envs.env
+from cluster.runs.champion import Champion, load_champion
+from cluster.runs.checkpoint import CheckpointError
+from evolution.search.breeding import Kind, Mutation, breed
+from evolution.episodes.starts import lane_starts
+from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size, scratch_size
+from evolution.episodes.rollout import Limits, evaluate
+from evolution.search.base import recipes as some_recipes
+from gridsim.car.ego import DISTANCE
 from gridsim.jit import njit
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build
+from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build
 
 MAPS = 8
 EPISODES = 16  # of the rollout, over all maps
@@ -97,7 +97,7 @@ def vector_env(
     steps: int = 200,
 ) -> tuple[float, float]:
     """(car-steps/s, m/s driven) of `env.step`: without the network's own time; a step that only resets is none."""
-    env = gridsim.env.GridSimVectorEnv(
+    env = gridsim.envs.env.GridSimVectorEnv(
         CARS, maps=maps, config=champion.sim, traffic=traffic, observation=observation, scenario=champion.scenario
     )
     layers = PolicySpec.parse(champion.policy).layers

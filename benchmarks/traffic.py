@@ -25,13 +25,13 @@ import time
 
 import numpy as np
 
-from gridsim.boxes import boxes_touch
+from gridsim.sensing.boxes import boxes_touch
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
-from gridsim.network import Network, wrapped
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.traffic import drivers, flow
-from gridsim.world import COS, LANE, SIN, SPEED, X, Y, spawn
+from gridsim.maps.network import Network, wrapped
+from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.traffic.behaviour import drivers, flow
+from gridsim.traffic.world import COS, LANE, SIN, SPEED, X, Y, spawn
 
 CARS = 6  # where the scenario's default is none
 

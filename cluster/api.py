@@ -9,11 +9,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cluster.champion import Champion, evaluate, load_champion
-from cluster.coordinator import Evolution
-from cluster.learning import Maps
-from cluster.pool import SerialPool, WorkerPool
-from cluster.settings import EvolveSettings
+from cluster.runs.champion import Champion, evaluate, load_champion
+from cluster.training.evolution import Evolution
+from cluster.training.trainer import Maps
+from cluster.workers.pool import SerialPool, WorkerPool
+from cluster.runs.settings import EvolveSettings
 from gridsim.config import SimConfig
 
 __all__ = ["Champion", "EvolveSettings", "evaluate", "evolve", "load_champion"]
@@ -32,8 +32,8 @@ def evolve(
     Args:
         settings: as the command's flags; default all of theirs.
         fitness: scores float64 [n], greater is better, from the episodes' results (structured, [n, episodes], with
-            fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.ego.End`)) and
-            the episodes' targets (m). It runs here, never in the workers. Default: `evolution.fitness.scalar`.
+            fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.car.ego.End`)) and
+            the episodes' targets (m). It runs here, never in the workers. Default: `evolution.search.fitness.scalar`.
         workers: Ray workers on this machine; 0 evaluates in this process.
         on_generation: told the number of generations done and the last one's figures.
 
@@ -46,7 +46,7 @@ def evolve(
     maps = Maps(settings.scenario, SimConfig())
     pool: WorkerPool
     if workers:
-        from cluster.ray_pool import RayPool
+        from cluster.workers.ray_pool import RayPool
 
         pool = RayPool(workers, maps.build)
     else:

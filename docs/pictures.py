@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from cluster.champion import load_champion
-from cluster.video import picture, record
-from evolution.episodes import lane_starts
-from gridsim.render import Renderer
-from gridsim.scenarios import HELD_OUT_SEED, build
+from cluster.runs.champion import load_champion
+from cluster.report.film import picture, record
+from evolution.episodes.starts import lane_starts
+from gridsim.view.render import Renderer
+from gridsim.maps.scenarios import HELD_OUT_SEED, build
 
 SIZE = (480, 360)
 TRAFFIC = 24  # more than usual, so that there is something to see

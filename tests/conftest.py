@@ -18,7 +18,7 @@ from commands import BIN, answers, end, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from gridsim.scenarios import Scenario
+    from gridsim.maps.scenarios import Scenario
 
 # Tests take nothing from the machine's home (a cluster's token) or shell (a cluster's or tracking server's address).
 # Caches stay where they are, as compiling all kernels takes minutes.
@@ -54,8 +54,8 @@ def root() -> Path:
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
-    from cluster.tracker import Tracker
-    from cluster.tracking_address import check_uri
+    from cluster.tracking.tracker import Tracker
+    from cluster.tracking.address import check_uri
 
     folder = tmp_path_factory.mktemp("mlflow")
     begun = Tracker(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {})
@@ -68,7 +68,7 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def uri(empty_database: Path, tmp_path: Path) -> str:
     """MLflow's address of a database that holds nothing but the experiment `other`."""
-    from cluster.tracking_address import check_uri
+    from cluster.tracking.address import check_uri
 
     (tmp_path / "store").mkdir()
     shutil.copy(empty_database, tmp_path / "store" / "mlflow.db")
@@ -78,7 +78,7 @@ def uri(empty_database: Path, tmp_path: Path) -> str:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short pauses of a tracker."""
-    from cluster import tracker, tracking_address
+    from cluster.tracking import tracker, address as tracking_address
 
     monkeypatch.setattr(tracker, "FLUSH_S", 0.05)
     monkeypatch.setattr(tracker, "RETRY_S", 0.1)
@@ -89,7 +89,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="session")
 def maps() -> dict[str, list[Scenario]]:
     """Two maps of each scenario."""
-    from gridsim.scenarios import REGISTRY, build
+    from gridsim.maps.scenarios import REGISTRY, build
 
     return {name: [build(name, seed) for seed in range(2)] for name in REGISTRY}
 

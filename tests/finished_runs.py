@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.champion import Champion
-from cluster.finished import ERROR_FIGURES, RUN_FIGURES, Run
-from evolution.policy import PolicySpec
+from cluster.runs.champion import Champion
+from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
+from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
 HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 900.0, "speed_mps": 7.0, "collision_rate": 0.5}

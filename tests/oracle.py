@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gridsim.config import SimConfig
-from gridsim.roads import Strips
+from gridsim.maps.roads import Strips
 
 SQUARE = 4.0  # m, side of the squares in which new ground is counted
 SAME_VISIT = 12.0  # m of driving: back in a square so soon is the same visit

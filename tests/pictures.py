@@ -7,9 +7,9 @@ import yaml
 from PIL import Image
 
 from gridsim.config import SimConfig, constants
-from gridsim.ego import collides
+from gridsim.car.ego import collides
 from gridsim.jit import njit
-from gridsim.roads import Strips, clearance, freeze
+from gridsim.maps.roads import Strips, clearance, freeze
 
 PPM = 16
 W, H = 100.0, 72.0  # m

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from test_pool import MAPS, Answering, drive_task, make_recipes, make_task
 
-from cluster.actor import Actor, News, Shared
-from cluster.pool import Chunk, SerialPool, new_outcome
-from cluster.worker import Worker
+from cluster.workers.actor import Actor, News, Shared
+from cluster.workers.pool import Chunk, SerialPool, new_outcome
+from cluster.workers.worker import Worker
 
 
 class Map:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
-from cluster.checkpoint import CheckpointError, save
-from cluster.run import RunFolder
-from cluster.settings import DqnSettings, SettingsError
-from evolution.policy import PolicySpec
-from evolution.rollout import Limits, trajectory
-from gridsim.ego import STEERING
-from gridsim.scenarios import build
+from cluster.runs.checkpoint import CheckpointError, save
+from cluster.runs.run import RunFolder
+from cluster.runs.settings import DqnSettings, SettingsError
+from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import Limits, trajectory
+from gridsim.car.ego import STEERING
+from gridsim.maps.scenarios import build
 
 SMALL = EvolveSettings(scenario="curved", population=32, generations=2, seed=3)
 

@@ -26,8 +26,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from cluster import checkpoint
-from cluster.checkpoint import CheckpointError, load, save, write_atomic
+from cluster.runs import checkpoint
+from cluster.runs.checkpoint import CheckpointError, load, save, write_atomic
 
 META = {
     "generation": 7,
@@ -464,7 +464,7 @@ def test_synced_before_and_after_it_is_renamed(saved, monkeypatch):
 def test_a_killed_writer_leaves_a_whole_file(tmp_path):
     path = tmp_path / "checkpoint.npz"
     script = (
-        "import sys, numpy as np; from cluster.checkpoint import save\n"
+        "import sys, numpy as np; from cluster.runs.checkpoint import save\n"
         "for i in range(10**9):\n"
         "    save(sys.argv[1], {'x': np.full(1 << 18, i, np.float32)}, {'i': i}); print(i, flush=True)"
     )

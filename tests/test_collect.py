@@ -8,22 +8,22 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from cluster.champion import load_champion
-from cluster.pool import SerialPool
-from cluster.worker import CollectTask, Worker
-from evolution import convnet
-from evolution.collecting import collect
-from evolution.episodes import lane_starts
-from evolution.experience import NO_ACTION, Experience, ages, join, to_bytes, unpack
-from evolution.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
-from evolution.rollout import Limits, evaluate, no_traffic
+from cluster.runs.champion import load_champion
+from cluster.workers.pool import SerialPool
+from cluster.workers.worker import CollectTask, Worker
+from evolution.networks import convnet
+from evolution.episodes.collecting import collect
+from evolution.episodes.starts import lane_starts
+from evolution.dqn.experience import NO_ACTION, Experience, ages, join, to_bytes, unpack
+from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
+from evolution.episodes.rollout import Limits, evaluate, no_traffic
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.ego import STEERING, End
-from gridsim.env import GridSimVectorEnv
-from gridsim.grid import CELLS, grid_table, grids, push_frames
+from gridsim.car.ego import STEERING, End
+from gridsim.envs.env import GridSimVectorEnv
+from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 from gridsim.jit import njit
-from gridsim.scenarios import Scenario, build
-from gridsim.simulator import Simulator
+from gridsim.maps.scenarios import Scenario, build
+from gridsim.envs.simulator import Simulator
 
 F = np.float32
 CONFIG = SimConfig()

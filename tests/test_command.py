@@ -9,12 +9,14 @@ from importlib.metadata import version
 import pytest
 from commands import finish
 
-from cluster import command, ray_pool
-from cluster.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
-from cluster.command import called, parse, warn_of_crowd
-from cluster.compare import CompareFlags
-from cluster.pool import PoolError
-from cluster.watch import DriveFlags, WatchFlags
+from cluster.commands import common as command
+
+from cluster.workers import ray_pool
+from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
+from cluster.commands.common import called, parse, warn_of_crowd
+from cluster.commands.compare import CompareFlags
+from cluster.workers.pool import PoolError
+from cluster.commands.watch import DriveFlags, WatchFlags
 
 FLAGS = {
     "gridsim-evolve": EvolveFlags,

@@ -12,15 +12,15 @@ import pytest
 import tracked
 from finished_runs import make_run
 
-from cluster import compare
-from cluster.experiment import Budget, ComparisonFolder, Plan
-from gridsim.scenarios import REGISTRY
+from cluster.commands import compare
+from cluster.comparison.plan import Budget, ComparisonFolder, Plan
+from gridsim.maps.scenarios import REGISTRY
 
 ALL = tuple(REGISTRY)
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, Budget(car_steps=1000))
 
 
-CODE = "from cluster.entry import compare_main; compare_main()"
+CODE = "from cluster.commands.entry import compare_main; compare_main()"
 
 
 def refused(monkeypatch, capsys, *arguments):

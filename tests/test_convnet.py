@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evolution import convnet
-from evolution.breeding import RECIPE, Kind, Mutation, breed
-from evolution.episodes import lane_starts
-from evolution.policy import CnnSpec, PolicySpec
-from evolution.rollout import Limits, evaluate, trajectory
-from evolution.tiles import plain_dense, plain_tile, vector_dense, vector_tile
+from evolution.networks import convnet
+from evolution.search.breeding import RECIPE, Kind, Mutation, breed
+from evolution.episodes.starts import lane_starts
+from evolution.networks.policy import CnnSpec, PolicySpec
+from evolution.episodes.rollout import Limits, evaluate, trajectory
+from evolution.networks.dense import plain_dense, plain_tile, vector_dense, vector_tile
 from gridsim.config import SensorConfig, SimConfig
-from gridsim.ego import DISTANCE, STEPS, End
-from gridsim.grid import grid_table, grids, push_frames
-from gridsim.scenarios import build
-from gridsim.simulator import Simulator
+from gridsim.car.ego import DISTANCE, STEPS, End
+from gridsim.sensing.grid import grid_table, grids, push_frames
+from gridsim.maps.scenarios import build
+from gridsim.envs.simulator import Simulator
 
 torch = pytest.importorskip("torch")
 

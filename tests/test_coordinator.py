@@ -8,21 +8,21 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from cluster.checkpoint import CheckpointError, load, save
-from cluster.coordinator import Evolution
-from cluster.learning import MAX_TRIED, Champion, Maps
-from cluster.pool import PoolError, SerialPool
-from cluster.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
-from cluster.settings import EvolveSettings
-from evolution.breeding import RECIPE, Kind, breed
-from evolution.curriculum import CrashError
-from evolution.episodes import Episodes
-from evolution.policy import PolicySpec
-from evolution.recombination import Recombination
-from evolution.rollout import targets
-from evolution.two_parents import TwoParents
+from cluster.runs.checkpoint import CheckpointError, load, save
+from cluster.training.evolution import Evolution
+from cluster.training.trainer import MAX_TRIED, Champion, Maps
+from cluster.workers.pool import PoolError, SerialPool
+from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
+from cluster.runs.settings import EvolveSettings
+from evolution.search.breeding import RECIPE, Kind, breed
+from evolution.episodes.curriculum import CrashError
+from evolution.episodes.starts import Episodes
+from evolution.networks.policy import PolicySpec
+from evolution.search.recombination import Recombination
+from evolution.episodes.rollout import targets
+from evolution.search.two_parents import TwoParents
 from gridsim.config import SimConfig
-from gridsim.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
+from gridsim.traffic.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from evolution.curriculum import Curriculum, CurriculumConfig
-from evolution.rollout import RESULT
-from gridsim.ego import End
-from gridsim.scenarios import build
-from gridsim.world import FIELDS, LANE
+from evolution.episodes.curriculum import Curriculum, CurriculumConfig
+from evolution.episodes.rollout import RESULT
+from gridsim.car.ego import End
+from gridsim.maps.scenarios import build
+from gridsim.traffic.world import FIELDS, LANE
 
 CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
 CARS = 4

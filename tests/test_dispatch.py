@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.dispatch import BACKOFF_S, LATE, LATE_S, MAX_BACKOFF_S, MAX_KILLS, QUEUE, Dispatch
-from cluster.pool import Chunk
+from cluster.workers.dispatch import BACKOFF_S, LATE, LATE_S, MAX_BACKOFF_S, MAX_KILLS, QUEUE, Dispatch
+from cluster.workers.pool import Chunk
 
 
 def rows(*sizes: int) -> list[Chunk]:

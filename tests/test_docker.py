@@ -25,10 +25,10 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from cluster import cli, command
-from cluster.settings import DqnSettings, EvolveSettings
-from cluster.warm import everything_by_default
-from gridsim.scenarios import REGISTRY
+from cluster.commands import cli, common as command
+from cluster.runs.settings import DqnSettings, EvolveSettings
+from cluster.workers.kernels import everything_by_default
+from gridsim.maps.scenarios import REGISTRY
 
 ROOT = Path(__file__).parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -158,10 +158,10 @@ def test_no_compiler_gets_in_and_kernels_are_compiled_by_the_user_from_sources_o
     steps = instructions()
     assert "apt-get" not in DOCKERFILE
     runs = [k for k, (name, rest) in enumerate(steps) if name == "RUN"]
-    at = {what: next(k for k in runs if what in steps[k][1]) for what in ("touch", "cluster.warm", "command -v gcc")}
+    at = {what: next(k for k in runs if what in steps[k][1]) for what in ("touch", "cluster.workers.kernels", "command -v gcc")}
     user = max(k for k, (name, _) in enumerate(steps) if name == "USER")
-    assert at["touch"] < user < at["cluster.warm"]
-    assert steps[at["cluster.warm"]][1].split() == ["python", "-m", "cluster.warm", "everything"]
+    assert at["touch"] < user < at["cluster.workers.kernels"]
+    assert steps[at["cluster.workers.kernels"]][1].split() == ["python", "-m", "cluster.workers.kernels", "everything"]
     assert subprocess.run(["/bin/sh", "-c", steps[at["command -v gcc"]][1]], env={"PATH": "/nowhere"}).returncode == 0
     wanted = everything_by_default()
     assert {s.scenario for s in wanted} == set(REGISTRY)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from evolution import convnet, policy
-from evolution.dqn import DqnConfig, DqnLearner, QNetwork, Training, device_of, new_weights, tanh
-from evolution.experience import NO_ACTION, Experience
-from evolution.policy import CnnSpec, PolicySpec
-from evolution.replay import Batch, PriorityConfig, Replay
-from gridsim.ego import End
-from gridsim.roads import freeze
+from evolution.networks import convnet, policy
+from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, Training, device_of, new_weights, tanh
+from evolution.dqn.experience import NO_ACTION, Experience
+from evolution.networks.policy import CnnSpec, PolicySpec
+from evolution.dqn.replay import Batch, PriorityConfig, Replay
+from gridsim.car.ego import End
+from gridsim.maps.roads import freeze
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:5")

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cluster import dqn_loop
-from cluster.checkpoint import CheckpointError
-from cluster.dqn_loop import Dqn
-from cluster.learning import Maps
-from cluster.pool import Chunk, PoolError, SerialPool, new_collected
-from cluster.settings import DqnSettings, SettingsError
-from cluster.worker import Worker
+from cluster.training import dqn as dqn_loop
+from cluster.runs.checkpoint import CheckpointError
+from cluster.training.dqn import Dqn
+from cluster.training.trainer import Maps
+from cluster.workers.pool import Chunk, PoolError, SerialPool, new_collected
+from cluster.runs.settings import DqnSettings, SettingsError
+from cluster.workers.worker import Worker
 from gridsim.config import SimConfig
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")

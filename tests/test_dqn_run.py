@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import BIN, finish, ray_workers, rows, start, summary, wait_until
 
-from cluster.checkpoint import load, save
+from cluster.runs.checkpoint import load, save
 
 SMALL = [
     *("--scenario", "curved", "--traffic", "2", "--policy", "mlp:12", "--seed", "5"),

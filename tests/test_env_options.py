@@ -11,13 +11,13 @@ from driving import SENSING, drive
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from gridsim.ego import DISTANCE, SPEED
-from gridsim.env import GridSimEnv, GridSimVectorEnv, env_id
-from gridsim.grid import CELLS, grid_table, grids
-from gridsim.scenarios import REGISTRY, Scenario
-from gridsim.simulator import views
-from gridsim.vehicle import Action
-from gridsim.world import LANE
+from gridsim.car.ego import DISTANCE, SPEED
+from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.sensing.grid import CELLS, grid_table, grids
+from gridsim.maps.scenarios import REGISTRY, Scenario
+from gridsim.envs.simulator import views
+from gridsim.car.vehicle import Action
+from gridsim.traffic.world import LANE
 
 # --- the checker
 

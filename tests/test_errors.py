@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cluster import cli
-from cluster.champion import Champion, load_champion
-from cluster.errors import errors, series
-from evolution.policy import PolicySpec
-from evolution.rollout import Limits, trajectory
+from cluster.commands import cli
+from cluster.runs.champion import Champion, load_champion
+from cluster.comparison.errors import errors, series
+from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import Limits, trajectory
 from gridsim.config import SimConfig
-from gridsim.drive import DriveError, Recorder
-from gridsim.errors import APART, TURN, Errors, Series, combine, driven, error_series, error_series_beside, poses_of
-from gridsim.reference import ReferenceDriver
-from gridsim.routes import ReferenceConfig, plan, profile, top_speed
-from gridsim.scenarios import HELD_OUT_SEED, REGISTRY, build, sample_starts
-from gridsim.world import FIELDS
+from gridsim.view.drive import DriveError, Recorder
+from gridsim.reference.errors import APART, TURN, Errors, Series, combine, driven, error_series, error_series_beside, poses_of
+from gridsim.reference.driver import ReferenceDriver
+from gridsim.reference.routes import ReferenceConfig, plan, profile, top_speed
+from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build, sample_starts
+from gridsim.traffic.world import FIELDS
 
 INTERVAL = REGISTRY["seamless"].speed_interval
 TOP = top_speed(INTERVAL, ReferenceConfig())

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution import convnet
-from evolution.experience import (
+from evolution.networks import convnet
+from evolution.dqn.experience import (
     NO_ACTION,
     OLDEST,
     UNITS,
@@ -22,8 +22,8 @@ from evolution.experience import (
     to_bytes,
     unpack,
 )
-from evolution.policy import SPEED_SCALE, CnnSpec, MlpSpec, PolicySpec
-from gridsim.grid import CELLS, FREE, OCCUPIED, UNKNOWN
+from evolution.networks.policy import SPEED_SCALE, CnnSpec, MlpSpec, PolicySpec
+from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 from gridsim.jit import njit
 
 F = np.float32

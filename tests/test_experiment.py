@@ -10,14 +10,16 @@ from finished_runs import make_run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster import checkpoint, experiment
-from cluster.cells import Cells, settings_of
-from cluster.experiment import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
-from cluster.finished import LEARNERS, ExperimentError, learner_of
-from cluster.run import RunFolder
-from cluster.settings import DqnSettings, to_dict
-from evolution.policy import PolicySpec
-from gridsim.scenarios import REGISTRY
+from cluster.runs import checkpoint
+
+from cluster.comparison import plan as experiment
+from cluster.comparison.cells import Cells, settings_of
+from cluster.comparison.plan import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
+from cluster.comparison.results import LEARNERS, ExperimentError, learner_of
+from cluster.runs.run import RunFolder
+from cluster.runs.settings import DqnSettings, to_dict
+from evolution.networks.policy import PolicySpec
+from gridsim.maps.scenarios import REGISTRY
 
 ALL = tuple(REGISTRY)
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, Budget(car_steps=1000))

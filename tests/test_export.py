@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from cluster.champion import Champion
-from evolution.export import example, to_torch
-from evolution.policy import CnnSpec, PolicySpec
+from cluster.runs.champion import Champion
+from evolution.networks.export import example, to_torch
+from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig
-from gridsim.grid import CELLS, FREE, OCCUPIED, UNKNOWN
+from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 
 torch = pytest.importorskip("torch")
 

@@ -21,14 +21,14 @@ import pytest
 from commands import BIN, all_in_mlflow, end, finish, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
-from cluster.coordinator import Evolution
-from cluster.learning import Maps
-from cluster.pool import SerialPool
-from cluster.ray_pool import RayPool
-from cluster.settings import EvolveSettings
-from cluster.worker import Task, Worker
+from cluster.training.evolution import Evolution
+from cluster.training.trainer import Maps
+from cluster.workers.pool import SerialPool
+from cluster.workers.ray_pool import RayPool
+from cluster.runs.settings import EvolveSettings
+from cluster.workers.worker import Task, Worker
 from gridsim.config import SimConfig
-from gridsim.scenarios import Scenario
+from gridsim.maps.scenarios import Scenario
 
 pytestmark = pytest.mark.e2e
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution.fitness import elements, scalar
-from evolution.rollout import RESULT
+from evolution.search.fitness import elements, scalar
+from evolution.episodes.rollout import RESULT
 
 TARGET = 500.0
 

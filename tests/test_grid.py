@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from gridsim.config import SensorConfig, SimConfig
-from gridsim.ego import COS, SIN, X, Y
-from gridsim.grid import CELL, CELLS, FREE, OCCUPIED, UNKNOWN, centres, fill_grid, grid_table, grids, push_frames
-from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import Simulator
+from gridsim.car.ego import COS, SIN, X, Y
+from gridsim.sensing.grid import CELL, CELLS, FREE, OCCUPIED, UNKNOWN, centres, fill_grid, grid_table, grids, push_frames
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.envs.simulator import Simulator
 
 F = np.float32
 CONFIG = SimConfig()

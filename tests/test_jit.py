@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evolution.breeding import RECIPE, Mutation, breed, moments
-from evolution.collecting import collect
-from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, Limits, evaluate
+from evolution.search.breeding import RECIPE, Mutation, breed, moments
+from evolution.episodes.collecting import collect
+from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import EPISODE, Limits, evaluate
 from gridsim import jit
 from gridsim.config import SimConfig, constants
-from gridsim.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y, drive, look, place
-from gridsim.roads import Strips, clearance_nodes, make_road
-from gridsim.scenarios import Scenario, build, sample_starts
-from gridsim.sensors import LANES, fan
+from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y, drive, look, place
+from gridsim.maps.roads import Strips, clearance_nodes, make_road
+from gridsim.maps.scenarios import Scenario, build, sample_starts
+from gridsim.sensing.rays import LANES, fan
 
 F = np.float32
 
@@ -29,7 +29,9 @@ F = np.float32
 CALLER = """
 import json
 import numpy as np
-from gridsim import ego, jit, roads
+from gridsim import jit
+from gridsim.car import ego
+from gridsim.maps import roads
 from gridsim.config import SimConfig, constants
 u, f = np.uint32, np.float32
 byte = 150  # of clearance at every node: 2.69 m above the floor of -2 m
@@ -111,7 +113,7 @@ def test_an_edit_of_any_file_is_another_cache_folder(copy, tmp_path):
     digests = python(DIGESTS, copy, tmp_path / "cache")
     assert digests.pop("after") == digests["before"]
     files = {str(p.relative_to(copy)) for p in copy.glob("*/*.py")}
-    assert {"gridsim/vehicle.py", "gridsim/config.py", "evolution/policy.py"} < files
+    assert {"gridsim/car/vehicle.py", "gridsim/config.py", "evolution/networks/policy.py"} < files
     assert set(digests) == files | {"before"}
     assert len(set(digests.values())) == len(digests)
 

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import crashes, picture, save, strip
 
-from cluster.settings import EvolveSettings, SettingsError, from_dict
-from gridsim.maps import MAX_PIXELS, load_map
+from cluster.runs.settings import EvolveSettings, SettingsError, from_dict
+from gridsim.maps.files import MAX_PIXELS, load_map
 
 
 def refused(name):

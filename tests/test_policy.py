@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution.policy import (
+from evolution.networks.policy import (
     ACTIONS,
     BLOCK,
     INPUTS,

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.pool import (
+from cluster.workers.pool import (
     CHUNK_S,
     METRE_S,
     WORTH_SENDING_S,
@@ -27,15 +27,15 @@ from cluster.pool import (
     new_collected,
     new_outcome,
 )
-from cluster.worker import CollectTask, Task, Worker
-from evolution.breeding import RECIPE, Kind, Mutation
-from evolution.episodes import lane_starts
-from evolution.experience import Experience, to_bytes
-from evolution.policy import PolicySpec
-from evolution.rollout import EPISODE, RESULT, Limits, no_traffic
+from cluster.workers.worker import CollectTask, Task, Worker
+from evolution.search.breeding import RECIPE, Kind, Mutation
+from evolution.episodes.starts import lane_starts
+from evolution.dqn.experience import Experience, to_bytes
+from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
 from gridsim.config import SimConfig
-from gridsim.scenarios import Scenario, build
-from gridsim.world import FIELDS
+from gridsim.maps.scenarios import Scenario, build
+from gridsim.traffic.world import FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
 Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # what `Worker.evaluate` returns
@@ -399,6 +399,6 @@ def test_closing_twice_is_fine() -> None:
 
 
 def test_the_serial_pool_needs_no_ray(root: os.PathLike) -> None:
-    code = "import sys, cluster.pool; print('ray' in sys.modules)"
+    code = "import sys, cluster.workers.pool; print('ray' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60)
     assert done.stdout == "False\n"

@@ -30,12 +30,12 @@ from test_pool import (
     never_built,
 )
 
-from cluster.pool import PoolError, SerialPool
-from cluster.ray_pool import RayPool, check_address
-from cluster.worker import CollectTask, Task
-from evolution.breeding import RECIPE
-from evolution.experience import Experience, to_bytes
-from gridsim.scenarios import Scenario
+from cluster.workers.pool import PoolError, SerialPool
+from cluster.workers.ray_pool import RayPool, check_address
+from cluster.workers.worker import CollectTask, Task
+from evolution.search.breeding import RECIPE
+from evolution.dqn.experience import Experience, to_bytes
+from gridsim.maps.scenarios import Scenario
 
 pytestmark = pytest.mark.e2e
 
@@ -271,7 +271,7 @@ def test_an_exception_ends_the_run_in_one_line_and_is_not_tried_again(pool: RayP
 
 
 def test_sigterm_is_seen_while_ray_waits(pool: RayPool, folder: Path) -> None:
-    from cluster.command import Stopped, stoppable  # not with the stand-ins above: a worker must not load it
+    from cluster.commands.common import Stopped, stoppable  # not with the stand-ins above: a worker must not load it
 
     pool.evaluate(make_task(), make_recipes(4))  # they are up
     (folder / "sleep-100").write_text("3")

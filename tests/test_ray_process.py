@@ -18,18 +18,18 @@ import pytest
 from test_pool import Answering, Evaluated, never_built
 from test_ray_pool import gone
 
-from cluster.pool import PoolError
-from cluster.ray_pool import RayPool, check_address
-from cluster.worker import Task
-from gridsim.scenarios import Scenario
+from cluster.workers.pool import PoolError
+from cluster.workers.ray_pool import RayPool, check_address
+from cluster.workers.worker import Task
+from gridsim.maps.scenarios import Scenario
 
 pytestmark = pytest.mark.e2e
 
 SCRIPT = """
     import ctypes
     import sys
-    from cluster.command import main
-    from cluster.ray_pool import RayPool
+    from cluster.commands.common import main
+    from cluster.workers.ray_pool import RayPool
     from test_pool import make_recipes, make_task, never_built
     from test_ray_process import Slow
 

@@ -7,13 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from gridsim import paint, render
+from gridsim.view import paint, render
 from gridsim.config import SimConfig
-from gridsim.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
-from gridsim.render import Renderer, between
-from gridsim.roads import clearance
-from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import Simulator
+from gridsim.car.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
+from gridsim.view.render import Renderer, between
+from gridsim.maps.roads import clearance
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.envs.simulator import Simulator
 
 BARE = {**os.environ}
 for _name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR"):
@@ -221,7 +221,7 @@ def test_wrong_numbers_are_one_line(scenario, arguments, expected):
         Renderer(scenario, **arguments)
 
 
-WINDOW = "from gridsim.render import NoDisplayError, Window\ntry:\n    Window((320, 240))\n    print('open')\n" + (
+WINDOW = "from gridsim.view.render import NoDisplayError, Window\ntry:\n    Window((320, 240))\n    print('open')\n" + (
     "except NoDisplayError as error:\n    print(error)\n"
 )
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evolution.experience import NO_ACTION, Experience, observation_dtype_and_width
-from evolution.policy import PolicySpec
-from evolution.replay import Batch, PriorityConfig, Replay
-from gridsim.ego import End
+from evolution.dqn.experience import NO_ACTION, Experience, observation_dtype_and_width
+from evolution.networks.policy import PolicySpec
+from evolution.dqn.replay import Batch, PriorityConfig, Replay
+from gridsim.car.ego import End
 
 RAYS, GRID, FRAME = (PolicySpec.parse(text) for text in ("mlp:3", "cnn:8,8,8@4", "cnn:8,8,8@1"))
 TERMINAL = (End.COLLISION, End.IDLE, End.SUCCESS)

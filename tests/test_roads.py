@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridsim.roads import (
+from gridsim.maps.roads import (
     CELLS_PER_M,
     FIELD_FLOOR,
     FIELD_UNITS,
@@ -22,7 +22,7 @@ from gridsim.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.scenarios import ROAD_FIELDS, Scenario, build
+from gridsim.maps.scenarios import ROAD_FIELDS, Scenario, build
 
 F = np.float32
 SIDE = 64.0  # m, of the small maps

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from cluster.champion import load_champion
-from cluster.worker import Task, Worker
-from evolution.breeding import RECIPE, Mutation
-from evolution.episodes import lane_starts
-from evolution.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
-from evolution.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
+from cluster.runs.champion import load_champion
+from cluster.workers.worker import Task, Worker
+from evolution.search.breeding import RECIPE, Mutation
+from evolution.episodes.starts import lane_starts
+from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
 from gridsim.config import SimConfig
-from gridsim.ego import (
+from gridsim.car.ego import (
     COS,
     SIN,
     SPEED,
@@ -22,10 +22,10 @@ from gridsim.ego import (
     Y,
 )
 from gridsim.jit import njit
-from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import Simulator
-from gridsim.world import ALONG, LANE, SHIFT, spawn
-from gridsim.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.envs.simulator import Simulator
+from gridsim.traffic.world import ALONG, LANE, SHIFT, spawn
+from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
 F = np.float32
 CONFIG = SimConfig()

@@ -10,15 +10,15 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-import gridsim.city as city
-import gridsim.curved as curved
-import gridsim.highway as highway
+import gridsim.maps.generators.city as city
+import gridsim.maps.generators.curved as curved
+import gridsim.maps.generators.highway as highway
 from gridsim.config import SimConfig, constants
-from gridsim.ego import collides
-from gridsim.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
-from gridsim.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
-from gridsim.scenarios import REGISTRY, Scenario, build, sample_starts
-from gridsim.seamless import FEWEST_ROUNDABOUTS
+from gridsim.car.ego import collides
+from gridsim.maps.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
+from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
+from gridsim.maps.scenarios import REGISTRY, Scenario, build, sample_starts
+from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
 
 LAID = range(16)  # seeds of which strips and lanes are looked at
 BUILT = (0, 1)  # ... whole maps

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from gridsim.config import SimConfig, constants
-from gridsim.ego import collides
-from gridsim.lanes import LANE_STEP
-from gridsim.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
-from gridsim.seamless import (
+from gridsim.car.ego import collides
+from gridsim.maps.lanes import LANE_STEP
+from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
+from gridsim.maps.generators.seamless import (
     DIRECTIONS,
     FLARE_HALF,
     HALF_ROAD,

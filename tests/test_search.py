@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evolution.policy import PolicySpec
-from evolution.recombination import Recombination
-from evolution.search import SearchConfig, checked, ranks, recipes, split, tournament_weights, tournaments
-from evolution.two_parents import TwoParents
+from evolution.networks.policy import PolicySpec
+from evolution.search.recombination import Recombination
+from evolution.search.base import SearchConfig, checked, ranks, recipes, split, tournament_weights, tournaments
+from evolution.search.two_parents import TwoParents
 
 SPEC = PolicySpec.parse("mlp:1")
 SEARCHES = [Recombination, TwoParents]

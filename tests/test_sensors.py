@@ -8,10 +8,10 @@ import oracle
 import pytest
 
 from gridsim.config import SensorConfig, SimConfig, constants
-from gridsim.roads import HEADING_BINS, Strips, clearance_nodes, make_road
-from gridsim.scenarios import build
-from gridsim.sensors import AMONG_THIN_WALLS, PLAIN, fan, fast_march, fast_march_thin, march, sense
-from gridsim.vector import LANES
+from gridsim.maps.roads import HEADING_BINS, Strips, clearance_nodes, make_road
+from gridsim.maps.scenarios import build
+from gridsim.sensing.rays import AMONG_THIN_WALLS, PLAIN, fan, fast_march, fast_march_thin, march, sense
+from gridsim.sensing.simd import LANES
 
 F = np.float32
 K = constants(SimConfig())

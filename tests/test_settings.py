@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from cluster.settings import DqnSettings, EvolveSettings, SettingsError, from_dict, to_dict
-from evolution.search import SearchConfig
-from gridsim.scenarios import REGISTRY
+from cluster.runs.settings import DqnSettings, EvolveSettings, SettingsError, from_dict, to_dict
+from evolution.search.base import SearchConfig
+from gridsim.maps.scenarios import REGISTRY
 
 
 def test_the_policy_follows_the_observation():

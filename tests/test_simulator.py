@@ -8,7 +8,7 @@ import oracle
 import pytest
 
 from gridsim.config import EpisodeConfig, SimConfig, constants
-from gridsim.ego import (
+from gridsim.car.ego import (
     COS,
     DISTANCE,
     FIELDS,
@@ -27,11 +27,11 @@ from gridsim.ego import (
     look,
     place,
 )
-from gridsim.roads import Strips, clearance_nodes, make_road
-from gridsim.scenarios import build, sample_starts
-from gridsim.sensors import LANES, fan
-from gridsim.simulator import Simulator
-from gridsim.vehicle import Action
+from gridsim.maps.roads import Strips, clearance_nodes, make_road
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.sensing.rays import LANES, fan
+from gridsim.envs.simulator import Simulator
+from gridsim.car.vehicle import Action
 
 F = np.float32
 CONFIG = SimConfig()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.statistics import separation_by_chance, span_coverage, spread
+from cluster.comparison.statistics import separation_by_chance, span_coverage, spread
 
 
 def test_median_and_quartiles():

@@ -10,11 +10,13 @@ from finished_runs import run
 from PIL import Image
 from rich.console import Console
 
-from cluster import report, tables
-from cluster.compare import Results, _route_title
-from cluster.coordinator import COLUMNS
-from cluster.experiment import Budget, Plan
-from gridsim.scenarios import REGISTRY
+from cluster.report import pictures as report
+
+from cluster.comparison import tables
+from cluster.commands.compare import Results, _route_title
+from cluster.training.evolution import COLUMNS
+from cluster.comparison.plan import Budget, Plan
+from gridsim.maps.scenarios import REGISTRY
 
 ALL = tuple(REGISTRY)
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, Budget(car_steps=1000))

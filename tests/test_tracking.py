@@ -13,9 +13,9 @@ import time
 import pytest
 from tracked import NAMES, PARAMS, TAGS, client, row, runs, steps, tracker, with_path
 
-import cluster.commit
-from cluster.commit import git_commit
-from cluster.tracking_address import check_uri
+import cluster.tracking.commit
+from cluster.tracking.commit import git_commit
+from cluster.tracking.address import check_uri
 
 # ---------------------------------------------------------------------------------------------- what is logged
 
@@ -218,8 +218,8 @@ def test_resume_of_a_run_that_was_thrown_away(uri):
 
 RUN = """
 import sys, time
-from cluster.tracker import Tracker
-from cluster.tracking_address import check_uri
+from cluster.tracking.tracker import Tracker
+from cluster.tracking.address import check_uri
 tracker = Tracker(check_uri("sqlite:///mlflow.db"), "driving", "a run", {}, {}, key="the-key")
 names = %r
 for step in range(100000):
@@ -262,8 +262,8 @@ def test_killed_at_any_moment_and_resumed(tmp_path, monkeypatch, kills):
 
 QUIET = """
 import sys, time
-from cluster.tracker import Tracker
-from cluster.tracking_address import check_uri
+from cluster.tracking.tracker import Tracker
+from cluster.tracking.address import check_uri
 assert not [name for name in ("mlflow", "sqlalchemy", "requests") if name in sys.modules]
 started = time.perf_counter()
 tracker = Tracker(check_uri(sys.argv[1]), "driving", "a run", {}, {})
@@ -328,7 +328,7 @@ def test_git_commit(tmp_path, monkeypatch):
         return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.strip()
 
     def told(folder, **environment):
-        script = "from cluster.commit import git_commit; print(git_commit())"
+        script = "from cluster.tracking.commit import git_commit; print(git_commit())"
         environment = {**os.environ, "PYTHONPATH": str(folder), **environment}
         done = subprocess.run([sys.executable, "-c", script], cwd="/", env=environment, capture_output=True, text=True)
         assert done.stderr == ""
@@ -337,7 +337,7 @@ def test_git_commit(tmp_path, monkeypatch):
     for place in ("repository", "repository/.venv/site-packages", "outside"):
         (tmp_path / place / "cluster").mkdir(parents=True)
         (tmp_path / place / "cluster" / "__init__.py").touch()
-        shutil.copy(cluster.commit.__file__, tmp_path / place / "cluster")
+        shutil.copy(cluster.tracking.commit.__file__, tmp_path / place / "cluster")
     assert told(tmp_path / "outside") == "unknown"
     git("init")
     assert told(tmp_path / "repository") == "unknown"

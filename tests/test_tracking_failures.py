@@ -14,7 +14,7 @@ import time
 import pytest
 from tracked import client, free_port, mlflow_server, row, steps, tracker
 
-from cluster.tracking_address import TrackingError, check_uri
+from cluster.tracking.address import TrackingError, check_uri
 
 # ---------------------------------------------------------------------------------------------- what goes wrong
 

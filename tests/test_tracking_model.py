@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from tracked import client, drive_both, row, steps, tracker
 
-from cluster.champion import Champion, load_champion
-from cluster.settings import EvolveSettings
-from cluster.tracking import save_model, saved_champion
-from cluster.tracking_run import torch_model
-from evolution.export import example, to_torch
-from evolution.policy import PolicySpec
+from cluster.runs.champion import Champion, load_champion
+from cluster.runs.settings import EvolveSettings
+from cluster.tracking.mlflow_run import save_model, saved_champion
+from cluster.tracking.description import torch_model
+from evolution.networks.export import example, to_torch
+from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
 torch = pytest.importorskip("torch")

@@ -2,9 +2,9 @@
 
 import pytest
 
-from cluster.run import new_run
-from cluster.settings import DqnSettings, EvolveSettings
-from cluster.tracking_run import Bests, describe, group, model_name, params, tags, title
+from cluster.runs.run import new_run
+from cluster.runs.settings import DqnSettings, EvolveSettings
+from cluster.tracking.description import Bests, describe, group, model_name, params, tags, title
 
 SUMMARY = {
     "generations": 48,

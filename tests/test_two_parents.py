@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from searching import first_gene, leader, told
 
-from evolution.breeding import Kind, Mutation, breed
-from evolution.policy import PolicySpec
-from evolution.search import SearchConfig, ranks
-from evolution.two_parents import PARENTS, TwoParents
+from evolution.search.breeding import Kind, Mutation, breed
+from evolution.networks.policy import PolicySpec
+from evolution.search.base import SearchConfig, ranks
+from evolution.search.two_parents import PARENTS, TwoParents
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:3")

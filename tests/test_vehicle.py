@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridsim.config import Constants, EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
-from gridsim.vehicle import Action, act, advance, path_curvature
+from gridsim.car.vehicle import Action, act, advance, path_curvature
 
 CONFIG = SimConfig()
 K = constants(CONFIG)

@@ -15,18 +15,20 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from cluster import checkpoint, video
-from cluster.champion import load_champion
-from cluster.command import UsageError
-from cluster.video import Filming, Recording, VideoError, frames, picture, record, write_video
-from cluster.watch import Elites, watch_main
-from evolution.curriculum import spread_starts
+from cluster.runs import checkpoint
+
+from cluster.report import film as video
+from cluster.runs.champion import load_champion
+from cluster.commands.common import UsageError
+from cluster.report.film import Filming, Recording, VideoError, frames, picture, record, write_video
+from cluster.commands.watch import Elites, watch_main
+from evolution.episodes.curriculum import spread_starts
 from gridsim.config import SimConfig
-from gridsim.drive import Recorder, pose, unhurried
-from gridsim.ego import DISTANCE, End
-from gridsim.render import Renderer
-from gridsim.scenarios import build, sample_starts
-from gridsim.simulator import Simulator
+from gridsim.view.drive import Recorder, pose, unhurried
+from gridsim.car.ego import DISTANCE, End
+from gridsim.view.render import Renderer
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.envs.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["--workers", "0", "--population", "48", "--generations", "4", "--seed", "5"]
@@ -36,7 +38,7 @@ def run(command, *arguments, cwd, timeout=240, **environment):
     """A command, run to its end without a display: `run("watch", ...)` is gridsim-watch."""
     bare = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
     return subprocess.run(
-        [sys.executable, "-c", f"from cluster.entry import {command}_main; {command}_main()", *map(str, arguments)],
+        [sys.executable, "-c", f"from cluster.commands.entry import {command}_main; {command}_main()", *map(str, arguments)],
         cwd=cwd,
         env={**bare, "PYTHONPATH": str(ROOT), **environment},
         stdin=subprocess.DEVNULL,
@@ -301,7 +303,7 @@ def test_follow_takes_the_newest_elite_while_the_run_goes_on(run_folder, tmp_pat
     shutil.copy(run_folder / "runs/ref/config.json", folder)
     assert "has no champion.npz yet" in run("watch", "going", cwd=tmp_path).stderr
     process = subprocess.Popen(
-        [sys.executable, "-c", "from cluster.entry import watch_main; watch_main()", "going", "--follow",
+        [sys.executable, "-c", "from cluster.commands.entry import watch_main; watch_main()", "going", "--follow",
          "--seconds", "1", "--size", "64x64"],
         cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT), "SDL_VIDEODRIVER": "dummy"},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -7,13 +7,13 @@ import pytest
 from pictures import picture, save
 
 from gridsim.config import SimConfig
-from gridsim.maps import load_map
-from gridsim.network import lane_length
-from gridsim.scenarios import REGISTRY, build, sample_starts
-from gridsim.simulator import Simulator
-from gridsim.traffic import drivers, flow
-from gridsim.vehicle import Action
-from gridsim.world import (
+from gridsim.maps.files import load_map
+from gridsim.maps.network import lane_length
+from gridsim.maps.scenarios import REGISTRY, build, sample_starts
+from gridsim.envs.simulator import Simulator
+from gridsim.traffic.behaviour import drivers, flow
+from gridsim.car.vehicle import Action
+from gridsim.traffic.world import (
     AFTER,
     ALONG,
     FACTOR,

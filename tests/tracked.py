@@ -9,9 +9,9 @@ import sys
 import time
 from pathlib import Path
 
-from cluster import tracking
-from cluster.tracker import Tracker
-from cluster.tracking_address import TrackingError, check_uri
+from cluster.tracking import mlflow_run as tracking
+from cluster.tracking.tracker import Tracker
+from cluster.tracking.address import TrackingError, check_uri
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}
@@ -110,7 +110,7 @@ def drive_both(champion, network, traffic=0):
 FRESH = """
 import sys
 import mlflow.pytorch
-from cluster.champion import load_champion
+from cluster.runs.champion import load_champion
 from tracked import drive_both
 mlflow.set_tracking_uri(sys.argv[1])
 print(*drive_both(load_champion(sys.argv[3]), mlflow.pytorch.load_model(sys.argv[2]), int(sys.argv[4])))

@@ -1,0 +1,445 @@
+"""The commands: parse, build, run. Wrong use ends with one clear line and 2, Ctrl-C with a clean save and 130."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from cluster.commands.common import (
+    FAILED,
+    INTERRUPTED,
+    TERMINATED,
+    Stopped,
+    UsageError,
+    called,
+    cores,
+    fail,
+    main,
+    parse,
+    stoppable,
+    typed,
+    undisturbed,
+    warn_of_crowd,
+)
+from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError, check_workers
+from gridsim.maps.scenarios import is_map_file
+
+if TYPE_CHECKING:
+    from cluster.training.trainer import Maps
+    from cluster.workers.pool import WorkerPool
+    from cluster.runs.run import RunFolder
+    from cluster.tracking.tracker import Tracker
+    from cluster.tracking.mlflow_run import Status
+    from cluster.workers.kernels import Warming
+
+REMOVED = {
+    "islands": "a run has one population; use --recombination all, the default, which needs no others",
+    "island-car-steps": "a run has one population; use --car-steps for its budget",
+    "parents": "the mating pool of --recombination two has a fixed size; use --tournament for selection pressure",
+    "crossover": "all children of --recombination two have two parents; use --recombination",
+    "bump-rate": "mutation is Gaussian; use --sigma for its size",
+    "ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
+}
+"""Flags of gridsim-evolve that version 0.1 had, and what takes their place."""
+
+
+@dataclass(frozen=True)
+class RunFlags:
+    """Where a learner's run is computed, kept and logged."""
+
+    workers: int = field(default_factory=cores)
+    """Worker processes; 0 evaluates in this process."""
+    output: str = "runs"
+    """Folder in which the run's folder is made."""
+    name: str = ""
+    """Name of the run; by default made of scenario, algorithm, seed and time."""
+    resume: str = ""
+    """Folder of a run to continue, exactly where its checkpoint stands."""
+    config: str = ""
+    """A run's config.json: repeat that run; flags beside it change it."""
+    init: str = ""
+    """A champion.npz, or a run's folder, to start from in place of random networks."""
+    address: str = ""
+    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
+    patience: float = 0.0
+    """Seconds to wait for workers when there are none; 0: 300 on a cluster, else 60. Then it stops, to be resumed."""
+    tracking_uri: str = ""
+    """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
+    experiment: str = "gridsim"
+    """MLflow's experiment."""
+
+
+@dataclass(frozen=True)
+class EvolveFlags(RunFlags, EvolveSettings):
+    """Evolve a driver: a population of neural networks is evaluated in parallel and recombined.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
+    curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+
+@dataclass(frozen=True)
+class DqnFlags(RunFlags, DqnSettings):
+    """Train a driver by deep Q-learning: the workers collect experience while the learner trains on what they brought.
+
+    The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
+    curves, on the same axes as those of gridsim-evolve. The champion is the network that did best on validation. It
+    depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
+    """
+
+
+Flags = EvolveFlags | DqnFlags
+
+
+@dataclass(frozen=True)
+class EvaluateFlags:
+    """Drive a champion through episodes on maps it never saw, and say how good it is."""
+
+    champion: tyro.conf.Positional[str]
+    """A champion.npz, or a run's folder."""
+    scenario: str = ""
+    """Road to drive on; by default the one it learned on."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
+    episodes: int = 64
+    """How many; the default 64 are the held-out episodes of every run."""
+    seed: int = 2_000_000
+    """Seed of the first map; those of held-out maps begin at 2,000,000."""
+    errors: bool = False
+    """Also its velocity and steering errors against the reference driver."""
+    reference: str = ""
+    """A drive.csv of gridsim-drive: errors against that drive, on its map and in its traffic, in place of --errors."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+
+def process_age_s() -> float:
+    """Seconds since this process was started (0 where the system does not tell)."""
+    try:
+        with open("/proc/self/stat", encoding="ascii") as file:
+            ticks = float(file.read().rsplit(")", 1)[1].split()[19])
+        with open("/proc/uptime", encoding="ascii") as file:
+            return max(0.0, float(file.read().split()[0]) - ticks / os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+# ------------------------------------------------------------------------------------------------------------- learn
+
+
+def evolve_main() -> None:
+    """Entry point of `gridsim-evolve`."""
+    _learn_main(EvolveFlags)
+
+
+def dqn_main() -> None:
+    """Entry point of `gridsim-dqn`."""
+    _learn_main(DqnFlags)
+
+
+def _learn_main(kind: type[Flags]) -> None:
+    started = time.perf_counter() - process_age_s()
+    main(kind.command, lambda: _learn(kind, sys.argv[1:], started))
+
+
+def _given(arguments: Sequence[str], flag: str) -> str:
+    """A flag's value, looked up before the real parsing (whose defaults depend on it)."""
+    value = ""
+    for k, argument in enumerate(arguments):
+        if argument == flag and k + 1 < len(arguments):
+            value = arguments[k + 1]
+        elif argument.startswith(flag + "="):
+            value = argument[len(flag) + 1 :]
+    return value
+
+
+def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
+    """Flags and the run's folder, checked; nothing is written yet. Raises UsageError, SettingsError."""
+    from cluster.runs import run as runs
+    from cluster.runs.champion import load_champion
+    from cluster.runs.checkpoint import CheckpointError
+    from evolution.networks.policy import PolicySpec
+
+    prog = kind.command
+    if kind is EvolveFlags:
+        for argument in arguments:
+            flag = argument.partition("=")[0].removeprefix("--").replace("_", "-")
+            if argument.startswith("--") and flag in REMOVED:
+                raise UsageError(f"--{flag} was removed: {REMOVED[flag]}")
+    resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
+    if {"-h", "--help"} & set(arguments) or not (resume or config):
+        flags = parse(kind, prog, arguments)
+    elif resume and config:
+        raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
+    else:
+        try:
+            if resume:
+                run = runs.open_run(Path(resume))
+                settings, init = run.settings, run.init
+            else:
+                settings, init = runs.read_config(Path(config))
+        except runs.RunError as error:
+            raise UsageError(str(error)) from error
+        if settings.command != prog:
+            raise UsageError(f"{resume or config} is a run of {settings.command}; give it to that command")
+        base = kind(**dataclasses.asdict(settings), init=init)
+        if resume:
+            base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
+        flags = parse(kind, prog, arguments, base)
+    if flags.traffic and is_map_file(flags.scenario):
+        print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
+        return _prepare(kind, [*arguments, "--traffic", "0"])
+    check_workers(flags.workers, flags.address, flags.patience)
+    if resume:
+        flags = flags.extending(base)
+        for f in dataclasses.fields(kind):
+            if f.name in ("workers", "address", "patience", "tracking_uri", "experiment"):
+                continue
+            now, then = getattr(flags, f.name), getattr(base, f.name)
+            if f.name in kind.unbound and (now or math.inf) >= (then or math.inf):  # 0: any number
+                continue
+            if f.name == "output":
+                now, then = Path(now).resolve(), Path(then).resolve()
+            if now != then:
+                raise UsageError(
+                    f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
+                )
+        run.settings = settings_of(flags)
+        run.settings.check()
+        _check_device(flags)
+        return flags, run
+    settings = settings_of(flags)
+    settings.check()
+    _check_device(flags)
+    digest = ""
+    if flags.init:
+        try:
+            champion = load_champion(flags.init)
+        except CheckpointError as error:
+            raise UsageError(f"--init {error}") from error
+        if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
+            raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
+        if not np.isfinite(champion.genome).all():
+            raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
+        digest = champion.sha256
+    try:
+        return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
+    except runs.RunError as error:
+        raise UsageError(str(error)) from error
+
+
+def _check_device(flags: Flags) -> None:
+    """Raises UsageError for a device that is not there."""
+    if isinstance(flags, DqnFlags) and flags.device == "cuda":
+        from evolution.dqn.learner import device_of
+
+        try:
+            device_of(flags.device)
+        except ValueError as error:
+            if flags.resume:
+                raise UsageError(
+                    f"{flags.resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
+                ) from error
+            raise UsageError(f"--device {flags.device}: {error}") from error
+
+
+def settings_of(flags: Flags) -> RunSettings:
+    """What decides the champion."""
+    kind = EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings
+    return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})
+
+
+def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
+    from cluster.workers.pool import PoolError, SerialPool
+    from cluster.tracking.address import TrackingError, check_uri
+
+    prog = kind.command
+    console = Console()
+    try:
+        flags, run = _prepare(kind, arguments)
+        from cluster.workers import kernels as warm
+        from cluster.training.trainer import Maps
+        from cluster.workers.ray_pool import RayPool, check_address
+        from cluster.runs.run import is_finished, make_tracker
+        from gridsim.config import SimConfig
+
+        if is_finished(run):
+            from cluster.tracking.resend import send
+
+            first = kind.counts[0]
+            sent, lost = send(run, flags.tracking_uri, flags.experiment)
+            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
+            if lost:
+                print(f"{prog}: warning: {lost}", file=sys.stderr)
+            return 0
+        saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
+        uri = check_uri(flags.tracking_uri or saved or None)
+        address = flags.address or os.environ.get("RAY_ADDRESS") or None
+        if address and flags.workers:
+            address = check_address(address)
+    except (UsageError, SettingsError, TrackingError, PoolError) as error:
+        fail(prog, str(error))
+
+    warn_of_crowd(prog, flags.workers, flags.address)
+    made = _make_folder(prog, run)
+    tracker = make_tracker(run, uri, flags.experiment)
+    closing = contextlib.ExitStack()
+    status: Status = "FAILED"
+    code = FAILED
+    message = ""
+    again = f"continue with: {called(prog)} --resume {typed(run.path)}"
+    try:
+        with stoppable():
+            maps = Maps(run.settings.scenario, SimConfig())
+            closing.callback(maps.close)
+            warming = warm.begin(run.settings)
+            closing.callback(warming.stop)
+            pool: WorkerPool = SerialPool(maps.build)
+            if flags.workers:
+                pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience, run=run.name)
+            closing.callback(pool.close)
+            message = _run(console, run, pool, maps, tracker, flags, started, warming)
+        status, code = "FINISHED", 0
+    except KeyboardInterrupt:
+        status, code = "KILLED", INTERRUPTED
+    except Stopped:
+        status, code = "KILLED", TERMINATED
+    except Exception as error:
+        from cluster.runs.checkpoint import CheckpointError
+        from evolution.episodes.curriculum import CrashError
+
+        if not isinstance(error, PoolError | CheckpointError | CrashError | FloatingPointError | MemoryError | OSError):
+            raise
+        message = str(error) or type(error).__name__
+        if isinstance(error, FloatingPointError):  # to go on would be to come to the same
+            again = f"repeat it with: {called(prog)} --config {typed(run.path)}/config.json --learning-rate ..."
+    finally:
+        with undisturbed():
+            if status == "KILLED":
+                Console(stderr=True).print("stopping; a moment ...", style="dim")
+            closing.close()
+            lost = tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
+    if lost:
+        later = f"; send it later with: {called(prog)} --resume {typed(run.path)}" if status == "FINISHED" else ""
+        print(f"{prog}: warning: {lost}{later}", file=sys.stderr)
+    resumable = (run.path / "checkpoint.npz").is_file()
+    if status == "KILLED":
+        where = again if resumable else f"no {kind.counts[0]} was done yet"
+        print(f"{prog}: stopped; {where}", file=sys.stderr)
+        if not resumable:
+            _discard(made)
+    elif status == "FAILED":
+        if not resumable:
+            _discard(made)
+        fail(prog, message, again if resumable else "", FAILED)
+    else:
+        console.print(message, soft_wrap=True)
+    return code
+
+
+def _run(
+    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: Flags,
+    started: float, warming: Warming,
+) -> str:  # fmt: skip
+    """Learn and finish. Returns the closing words."""
+    from cluster.commands import progress
+    from cluster.report import pictures as report
+    from cluster.workers import kernels as warm
+    from cluster.runs.champion import load_champion
+    from cluster.runs.run import Session
+
+    initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
+    session = Session(run, pool, maps, tracker, started, initial)
+    session.learning.warn = lambda text: print(f"{flags.command}: warning: {text}", file=sys.stderr, flush=True)
+    if warming.processes:
+        with console.status("compiling the simulator for this machine, once (some 10 s)"):
+            warming.wait()
+    maps.ahead(session.learning.curriculum.map_seeds[:3])
+    warm.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
+    run.write_config()
+    with progress.Progress(console, session, typed(run.path)) as bar:
+        session.on_row = bar.row
+        session.learning.on_progress = bar.members
+        session.learn()
+        summary = session.complete(flags.workers, bar.note)
+    if session.lost:
+        print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
+    console.print(report.held_out_table("The champion on held-out drives", summary["held_out"]))
+    found = "solved" if summary["solved"] else "the best so far"
+    name = session.learning.step_name
+    return (
+        f"{found} after {summary[name + 's']} {name}s, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
+        f"{summary['wall_s']:.0f} s\nrun: {typed(run.path)}   champion: {typed(run.path / 'champion.npz')}\n"
+        f"watch it: {called('gridsim-watch')} {typed(run.path)}\n"
+        f"compare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
+    )
+
+
+def _make_folder(prog: str, run: RunFolder) -> list[Path]:
+    """Make a run's folder. Returns the folders that were made for it, the innermost first."""
+    made = [path for path in (run.path, *run.path.parents) if not path.exists()]
+    try:
+        run.path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        _discard(made)
+        fail(prog, f"{run.path} cannot be made: {error.strerror}; choose another --output")
+    return made
+
+
+def _discard(made: list[Path]) -> None:
+    """Remove the folders of a run in which nothing was done."""
+    with contextlib.suppress(OSError):
+        for path in made:
+            if path == made[0]:
+                (path / "config.json").unlink(missing_ok=True)
+            path.rmdir()
+
+
+# ---------------------------------------------------------------------------------------------------------- evaluate
+
+
+def evaluate_main() -> None:
+    """Entry point of `gridsim-evaluate`."""
+    prog = "gridsim-evaluate"
+    try:
+        flags = parse(EvaluateFlags, prog, sys.argv[1:])
+        from cluster.runs.champion import evaluate, load_champion
+        from cluster.runs.checkpoint import CheckpointError
+        from cluster.comparison.errors import errors
+
+        try:
+            champion = load_champion(flags.champion)
+            traffic = None if flags.traffic == -1 else flags.traffic
+            chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
+            missed = None
+            if flags.errors or flags.reference:  # first: a wrong --reference is told at once
+                missed = errors(champion, *chosen, flags.reference or None).figures()
+            figures = evaluate(champion, *chosen)
+        except (CheckpointError, ValueError) as error:
+            fail(prog, str(error))
+        if flags.json:
+            import json
+
+            print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
+        else:
+            from cluster.report.pictures import errors_table, held_out_table
+
+            title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
+            Console().print(held_out_table(title, figures))
+            if missed is not None:
+                Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
+    except KeyboardInterrupt:
+        print(f"{prog}: stopped", file=sys.stderr)
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,125 @@
+"""How far a champion drives from a reference: the reference driver, or a person's recorded drive."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+import numpy as np
+
+from cluster.runs.champion import Champion, held_out
+from cluster.training.trainer import Maps
+from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import Limits, trajectory
+from gridsim.view.drive import Drive, DriveError, read_drive, replay
+from gridsim.reference.errors import TURN, Driven, Errors, Series, combine, driven, error_series, error_series_beside, poses_of
+from gridsim.maps.scenarios import HELD_OUT_SEED, Scenario
+
+_STRETCH = 1.0  # m of a recording that are worth another start
+_DRIFT = 0.5  # m by which a drive, replayed, may miss what was recorded
+
+
+def errors(
+    champion: Champion,
+    scenario: str | None = None,
+    episodes: int = 64,
+    seed: int = HELD_OUT_SEED,
+    traffic: int | None = None,
+    reference: str | os.PathLike[str] | None = None,
+) -> Errors:
+    """Velocity and steering errors of a champion, as one over all that it drives.
+
+    Args: as `champion.evaluate`'s; or a recorded drive, which brings its own map, start and traffic.
+    Raises: ValueError with one line as `champion.evaluate`, or if nothing can be compared; DriveError (a ValueError)
+    for a file that is no recorded drive, or of another map.
+    """
+    found = series(champion, scenario, episodes, seed, traffic, reference)
+    return combine([part.errors(champion.sim.vehicle) for part in found])
+
+
+def series(
+    champion: Champion,
+    scenario: str | None = None,
+    episodes: int = 64,
+    seed: int = HELD_OUT_SEED,
+    traffic: int | None = None,
+    reference: str | os.PathLike[str] | None = None,
+) -> list[Series]:
+    """What `errors` is made of: a champion and the reference along each route, in the order of the episodes.
+
+    An episode in which it came nowhere has none. Beside a recorded drive there is one for each stretch of it that
+    the champion followed.
+    """
+    name = scenario or champion.scenario
+    maps = Maps(name, champion.sim)
+    try:
+        if reference is not None:
+            return _beside(champion, maps, name, traffic, reference)
+        chosen = held_out(champion, maps, name, episodes, seed, traffic)
+        found = []
+        for row, world in zip(chosen.rows, chosen.worlds, strict=True):
+            road = maps.get(chosen.maps[row["map"]])
+            path = _drive(champion, road, row["start"], world, champion.sim.episode.target)
+            part = None if path is None else error_series(path, road, sim=champion.sim)
+            if part is not None and len(part.arc) > 1:
+                found.append(part)
+        return found
+    finally:
+        maps.close()
+
+
+def _drive(champion: Champion, road: Scenario, start: np.ndarray, world: np.ndarray, target: float) -> Driven | None:
+    """The path of an episode of so many m; None if the car never came forward."""
+    episode = champion.sim.episode
+    limits = Limits(target, round(episode.time_limit / episode.control_period))
+    spec = PolicySpec.parse(champion.policy)
+    _, states, _ = trajectory(spec, champion.genome, road, start, limits, champion.sim, world)
+    try:
+        return driven(poses_of(states), road)
+    except ValueError:
+        return None
+
+
+def _beside(
+    champion: Champion, maps: Maps, name: str, traffic: int | None, reference: str | os.PathLike[str]
+) -> list[Series]:
+    """A champion beside a recorded drive: wherever their paths part, it begins anew a bit further on.
+
+    Of several episodes in the file, the longest is taken.
+    """
+    kept = read_drive(reference)
+    if kept.scenario != name:
+        raise DriveError(f"{reference} was driven on {kept.scenario}, not on {name}: choose that scenario")
+    if traffic not in (None, kept.traffic):
+        raise DriveError(f"{reference} was driven among {kept.traffic} cars, not {traffic}: leave traffic out")
+    road = maps.get(kept.map_seed)
+    poses, _, _, worlds = replay(kept, road)
+    away = np.abs(poses[:, :2] - kept.poses[:, :2]).max()
+    if away > _DRIFT:
+        raise DriveError(f"{reference}: replayed, the drive is {away:.1f} m off: it was driven on another map")
+    rows, recorded = _longest(kept, road)
+    found = []
+    arc, end = 0.0, float(recorded.arc[-1])
+    while end - arc > _STRETCH:
+        k = int(np.searchsorted(recorded.arc, arc))
+        row = rows[recorded.rows[k]]
+        path = _drive(champion, road, kept.poses[row], worlds[row], end - float(recorded.arc[k]))
+        reached = float(recorded.arc[k])
+        if path is not None:
+            part, reached = error_series_beside(path, recorded, road, k)
+            if len(part.arc) > 1:
+                found.append(part)
+        arc = reached + TURN
+    return found
+
+
+def _longest(kept: Drive, road: Scenario) -> tuple[np.ndarray, Driven]:
+    """The rows of the longest episode of a recording, and its path."""
+    episodes = []
+    for episode in range(int(kept.episodes[-1]) + 1):
+        rows = np.flatnonzero(kept.episodes == episode)
+        with contextlib.suppress(ValueError):  # who never came forward
+            episodes.append((rows, driven(kept.poses[rows], road)))
+    if not episodes:
+        raise DriveError("nothing was driven in the recording that could be compared with")
+    return max(episodes, key=lambda found: float(found[1].arc[-1]))

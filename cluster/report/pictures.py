@@ -1,0 +1,219 @@
+"""What a run leaves to look at: pictures for its folder, tables for the terminal."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from gridsim.car.ego import X, Y
+from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS
+from gridsim.maps.scenarios import Scenario
+
+if TYPE_CHECKING:
+    from cluster.comparison.tables import Group
+    from gridsim.reference.errors import Series
+
+_BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
+_ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
+_LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00", "random": "#868e96"}
+
+
+def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Any, Any]:
+    """A figure that needs no display and no global state, and the axes of its columns, or of its rows."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False, sharex=rows > 1).ravel()
+
+
+def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
+    """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
+    figure, axes = _figure(15, 3.8, 4)
+    step = np.arange(len(history))
+
+    def plot(axis: Any, name: str, color: str, label: str, **style: Any) -> np.ndarray:
+        values = np.array([row[name] for row in history])
+        axis.plot(step, values, color=color, label=label, **style)
+        return values
+
+    if history and "fitness/best" in history[0]:
+        best, mean_of, success = "leader", "members, mean", ("leader/success_rate", "leader")
+        plot(axes[0], "fitness/best", _BEST, best)
+        mean, std = plot(axes[0], "fitness/mean", _MEAN, mean_of), np.array([row["fitness/std"] for row in history])
+        band = {"color": _MEAN, "alpha": 0.2, "linewidth": 0, "label": "members, standard deviation"}
+        axes[0].fill_between(step, mean - std, mean + std, **band)
+        axes[0].set(title="fitness", ylim=(0, 1.05))
+        plot(axes[1], "target_m", _OTHER, "members, episode length", linestyle=":", drawstyle="steps-mid")
+    else:
+        plot(axes[0], "q/mean", _BEST, "Q, mean")
+        plot(axes[0], "loss", _OTHER, "loss")
+        axes[0].set(title="Q values, loss")
+        best, mean_of, success = "network, validation", "training", ("network/success_rate", "network, validation")
+    for axis, name, title in ((axes[1], "distance_m", "distance, m"), (axes[2], "speed_mps", "speed, m/s")):
+        plot(axis, f"{name}/best", _BEST, best)
+        plot(axis, f"{name}/mean", _MEAN, mean_of)
+        axis.set(title=title)
+    plot(axes[3], "validation/success_rate", _BEST, "champion, validation")
+    plot(axes[3], success[0], _OTHER, success[1], alpha=0.5)
+    axes[3].set(title="success rate", ylim=(-0.02, 1.05))
+    for axis in axes:
+        axis.set_xlabel(step_name)
+        axis.grid(alpha=0.25)
+        axis.legend(frameon=False, fontsize=8)
+    figure.savefig(Path(path), dpi=100)
+
+
+def draw_map(axis: Any, scenario: Scenario) -> None:
+    """Draw a scenario's drivable area and lane marks."""
+    road = scenario.road
+    nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
+    width, height = float(road.width), float(road.height)
+    extent = (0.0, width, 0.0, height)
+    axis.set_facecolor(_WALL)
+    axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
+    axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
+    axis.set(xlim=(0, width), ylim=(0, height), aspect="equal", xlabel="x, m", ylabel="y, m")
+
+
+def trajectory(scenario: Scenario, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
+    """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
+    from matplotlib.collections import LineCollection
+
+    from gridsim.car.ego import SPEED
+
+    figure, (axis,) = _figure(8.6, 7.6)
+    draw_map(axis, scenario)
+    points = states[:, [X, Y]].astype(np.float64)
+    steps = np.stack([points[:-1], points[1:]], axis=1)
+    near = np.abs(points[1:] - points[:-1]).max(axis=1) < min(scenario.road.width, scenario.road.height) / 2
+    lines = LineCollection(list(steps[near]), cmap="plasma", linewidths=2.0)
+    lines.set_array(states[:-1, SPEED][near])
+    lines.set_clim(0.0, float(scenario.road.speed_high))
+    axis.add_collection(lines)
+    axis.plot(*points[0], marker="o", color="#2f9e44", markersize=9, markeredgecolor="white", label="start")
+    axis.plot(*points[-1], marker="X", color="#e03131", markersize=10, markeredgecolor="white", label="end")
+    axis.legend(loc="upper right")
+    axis.set_title(title)
+    figure.colorbar(lines, ax=axis, shrink=0.8, label="speed, m/s")
+    figure.savefig(Path(path), dpi=100)
+
+
+def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
+    """Draw velocity error and training time of each road and learner to a PNG.
+
+    Bars are medians over seeds, whiskers quartiles, dots the seeds.
+    """
+    roads = list(dict.fromkeys(group.road for group in groups))
+    names = list(dict.fromkeys((group.name, group.learner, group.observation) for group in groups))
+    width = 0.8 / len(names)
+    figure, axes = _figure(max(9.0, 3.0 + 2.2 * len(roads)), 4.6, 2)
+    panels = (
+        ("velocity_error_percent", "velocity error, % of the reference's speed"),
+        ("training_s", "training time, s"),
+    )
+    for axis, (name, title) in zip(axes, panels, strict=True):
+        for group in groups:
+            which = [other[0] for other in names].index(group.name)
+            place = roads.index(group.road) + (which - (len(names) - 1) / 2) * width
+            found = group.spread(name)
+            if not found.n:
+                axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
+                continue
+            whiskers = [[found.median - found.lower], [found.upper - found.median]] if found.n > 1 else None
+            hatch = "//" if group.observation == "grid" and len({view for _, _, view in names}) > 1 else None
+            axis.bar(
+                place, found.median, 0.92 * width, color=_LEARNERS[group.learner], alpha=0.75, yerr=whiskers, capsize=3,
+                hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2,
+            )  # fmt: skip
+            seeds = [value for value in group.values(name) if np.isfinite(value)]
+            beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
+            axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
+                      markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
+        axis.set_title(title)
+        axis.set_xticks(range(len(roads)), roads)
+        axis.set_xlim(-0.5, len(roads) - 0.5)
+        axis.set_ylim(bottom=0.0)
+        axis.grid(axis="y", alpha=0.25, zorder=0)
+        axis.spines[["top", "right"]].set_visible(False)
+    from matplotlib.patches import Patch
+
+    patches = [Patch(color=_LEARNERS[learner], alpha=0.75, label=name) for name, learner, _ in names]
+    figure.legend(
+        handles=patches, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
+        title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
+    )  # fmt: skip
+    figure.savefig(Path(path), dpi=100)
+
+
+def along_route(
+    drives: Mapping[str, Sequence[Series]], names: Mapping[str, str], metres: float, path: str | os.PathLike[str],
+    title: str,
+) -> None:  # fmt: skip
+    """Draw velocity and steering error along a route to a PNG.
+
+    Args: for each learner its seeds' drives from the same start, the one to be drawn as a line first, the others as
+    the band from the smallest to the largest error; what learners are called; how far along the route.
+    """
+    figure, axes = _figure(12.0, 6.2, rows=2)
+    for axis, name, unit in zip(axes, ("velocity_error", "steering_error"), ("m/s", "degrees"), strict=True):
+        axis.axhline(0.0, color="#212529", linewidth=1.2, label="reference", zorder=3)
+        for learner, found in drives.items():
+            colour = _LEARNERS[learner]
+            arc = np.arange(0.0, min(metres, max(float(series.arc[-1]) for series in found)), 0.5)
+            errors = np.array(
+                [np.interp(arc, series.arc, getattr(series, name), right=np.nan) for series in found]
+            )  # fmt: skip
+            there = np.isfinite(errors).any(axis=0)
+            if len(found) > 1:
+                low, high = np.nanmin(errors[:, there], axis=0), np.nanmax(errors[:, there], axis=0)
+                axis.fill_between(arc[there], low, high, color=colour, alpha=0.16, linewidth=0, zorder=1)
+            axis.plot(arc, errors[0], color=colour, linewidth=1.4, label=names[learner], zorder=4)
+            if found[0].arc[-1] < metres:
+                axis.plot(found[0].arc[-1], getattr(found[0], name)[-1], marker="X", color=colour, markersize=9,
+                          markeredgecolor="white", linestyle="", zorder=5)  # fmt: skip
+        axis.set_ylabel(f"{name.replace('_', ' ')}, {unit}")
+        axis.grid(alpha=0.25)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[0].set_title(title)
+    axes[0].set_xlim(0.0, metres)
+    axes[-1].set_xlabel("distance along the route, m")
+    lines, words = axes[0].get_legend_handles_labels()
+    figure.legend(lines, words, loc="outside lower center", ncols=len(words), frameon=False)
+    figure.savefig(Path(path), dpi=100)
+
+
+def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
+    """The closing table: how good a champion is where it never was."""
+    table = Table(title=title, title_justify="left", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    table.add_row("episodes", f"{figures['episodes']:.0f}")
+    table.add_row("success (2,000 m without a collision)", f"{figures['success_rate']:.1%}")
+    table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
+    table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
+    table.add_row("collisions", f"{figures['collision_rate']:.1%}")
+    return table
+
+
+def errors_table(title: str, figures: Mapping[str, float]) -> Table:
+    """Velocity and steering errors, `gridsim.reference.errors.Errors.figures`."""
+    table = Table("", "mean", "max", title=title, title_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, unit, digits in (("velocity", "mps", 2), ("steering", "deg", 1)):
+        shown = "m/s" if unit == "mps" else "degrees"
+        table.add_row(
+            f"{name} error, {shown}",
+            *(f"{figures[f'{name}_{kind}_{unit}']:.{digits}f}" for kind in ("mean", "max")),
+        )
+        of = "the reference's mean speed" if unit == "mps" else "the steering limit"
+        table.add_row(f"  % of {of}", *(f"{figures[f'{name}_{kind}_percent']:.1f}" for kind in ("mean", "max")))
+    table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
+    return table

@@ -1,0 +1,208 @@
+"""Champions: what is written of them, and what a person does with one: load it, drive it, evaluate it.
+
+>>> champion = load_champion("runs/NAME")  # doctest: +SKIP
+>>> env = champion.make_env()  # doctest: +SKIP
+>>> evaluate(champion, "seamless", episodes=64)  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cluster.runs import checkpoint
+from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
+from cluster.training.trainer import Maps, summarise
+from cluster.runs.settings import MAX_TRAFFIC, SETTINGS, EvolveSettings
+from evolution.networks import convnet
+from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
+from evolution.episodes.starts import Episodes
+from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
+from evolution.episodes.rollout import Limits
+from evolution.episodes.rollout import evaluate as roll_out
+from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
+from gridsim.maps.scenarios import HELD_OUT_SEED, check_name, default_traffic
+
+
+@dataclass(frozen=True)
+class Champion:
+    """A genome and what is needed to run it.
+
+    Attributes:
+        genome: float32 [genes].
+        policy: its network, as in `mlp:6,7`.
+        scenario: where it learned.
+        sim: the simulator's numbers it learned with.
+        traffic: other cars it learned among.
+    """
+
+    genome: np.ndarray
+    policy: str
+    scenario: str
+    sim: SimConfig
+    traffic: int = 0
+
+    def __repr__(self) -> str:
+        return f"<Champion {self.policy} of {self.scenario}: {self.genome.size:,} genes, sha256 {self.sha256[:8]}>"
+
+    @property
+    def sha256(self) -> str:
+        """Of the genome's bytes."""
+        return hashlib.sha256(self.genome.tobytes()).hexdigest()
+
+    @property
+    def observation(self) -> Observation:
+        """What it sees: rays or grid."""
+        return PolicySpec.parse(self.policy).observation
+
+    def act(self, observation: np.ndarray, speed: float | np.ndarray | None = None) -> int | np.ndarray:
+        """The action for an observation, or actions [n] for n of them.
+
+        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed, and what else it may see
+        (`make_env` gives it). Of the grid, what `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the
+        speed in m/s, which a grid does not show: the environment's `info["speed_mps"]`.
+        Raises: ValueError with one line for an observation that this champion does not see.
+        """
+        spec = PolicySpec.parse(self.policy)
+        if isinstance(spec, CnnSpec):
+            if speed is None:
+                raise ValueError(f'{spec} needs the speed beside the grid: act(observation, info["speed_mps"])')
+            return convnet.act_on(spec, self.genome, observation, speed)
+        return act_on(
+            spec,
+            self.genome,
+            observation,
+            self.sim.sensors.range,
+            self.sim.vehicle.speed_limit,
+            math.radians(self.sim.vehicle.steering_limit),
+        )
+
+    def make_env(self, scenario: str | None = None, **options: Any) -> Any:
+        """A Gymnasium environment on the champion's scenario, or another."""
+        from gridsim.envs.env import GridSimEnv
+
+        spec = PolicySpec.parse(self.policy)
+        sees: dict[str, Any] = {"observation": spec.observation}
+        if isinstance(spec, CnnSpec):
+            sees["frames"] = spec.frames
+        elif isinstance(spec, MlpSpec):
+            sees |= {"motion": spec.motion, "steering": spec.steering}
+        if scenario in (None, self.scenario):
+            sees["traffic"] = self.traffic
+        return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **{**sees, **options})
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write champion.npz. Raises CheckpointError if that cannot be done."""
+        meta = {
+            "policy": self.policy,
+            "scenario": self.scenario,
+            "traffic": self.traffic,
+            "sim": dataclasses.asdict(self.sim),
+        }
+        checkpoint.save(path, {"genome": self.genome}, meta)
+
+
+class UnfinishedError(CheckpointError):
+    """A run that has no champion yet; the message is one line for the user."""
+
+
+def load_champion(path: str | os.PathLike[str]) -> Champion:
+    """Read a champion.npz, given the file or its run's folder.
+
+    Raises: UnfinishedError for a run that has no champion yet, CheckpointError with one line for what is missing,
+    damaged, hostile or no champion.
+    """
+    path = Path(path)
+    if path.is_dir():
+        _check_finished(path)
+        path /= CHAMPION
+    arrays, meta = checkpoint.load(path)
+    try:
+        genome, sim = arrays["genome"], meta["sim"]
+        spec = PolicySpec.parse(meta["policy"])
+        if genome.dtype != np.float32 or genome.shape != (spec.size,):
+            raise ValueError(f"its genome does not fit {spec}")
+        config = SimConfig(
+            VehicleConfig(**sim["vehicle"]),
+            SensorConfig(**sim["sensors"]),
+            EpisodeConfig(**sim["episode"]),
+            TrafficConfig(**sim.get("traffic", {})),
+        )
+        return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: no champion: {error}") from error
+
+
+def _check_finished(run: Path) -> None:
+    """Raises: CheckpointError with one line where a folder has no champion.npz."""
+    if (run / CHAMPION).exists():
+        return
+    if not (run / CONFIG).is_file():
+        raise CheckpointError(f"{run} is no run's folder: it has neither {CHAMPION} nor {CONFIG}")
+    try:
+        command = json.loads((run / CONFIG).read_text(encoding="utf-8"))["command"]
+        SETTINGS[command]
+    except (OSError, ValueError, KeyError, TypeError):
+        command = EvolveSettings.command
+    resumable = (run / CHECKPOINT).is_file()
+    again = f"continue it with: {command} --resume {run}"
+    if not resumable:
+        again = f"start it anew with: {command} --config {run / CONFIG}"
+    raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
+
+
+def evaluate(
+    champion: Champion,
+    scenario: str | None = None,
+    episodes: int = 64,
+    seed: int = HELD_OUT_SEED,
+    traffic: int | None = None,
+) -> dict[str, float]:
+    """Drive a champion through episodes on maps it never saw, in this process.
+
+    Args: a scenario's name (default: the champion's own); how many episodes; the first map's seed; other cars on the
+    road (default: as many as it learned among, or as the other scenario has by default).
+    Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means). With the defaults these are the
+    held-out figures of summary.json.
+    Raises: ValueError for an unknown scenario or fewer than one episode.
+    """
+    name = scenario or champion.scenario
+    maps = Maps(name, champion.sim)
+    try:
+        chosen = held_out(champion, maps, name, episodes, seed, traffic)
+        episode = champion.sim.episode
+        limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
+        scenarios = [maps.get(s) for s in chosen.maps]
+        results = roll_out(
+            PolicySpec.parse(champion.policy),
+            champion.genome[None],
+            scenarios,
+            chosen.rows,
+            limits,
+            champion.sim,
+            worlds=chosen.worlds,
+        )[0]
+        return summarise(results[0], episode.control_period)
+    finally:
+        maps.close()
+
+
+def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int, traffic: int | None) -> Episodes:
+    """The episodes that `evaluate` drives. Raises: ValueError as it does."""
+    check_name(name)
+    if episodes < 1:
+        raise ValueError(f"episodes must be 1 or more, not {episodes}")
+    if traffic is None:
+        traffic = champion.traffic if name == champion.scenario else default_traffic(name)
+    if not 0 <= traffic <= MAX_TRAFFIC:
+        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
+    used = max(len(HELD_OUT_SEEDS), episodes // 8)
+    return spread_starts(maps.get, range(seed, seed + used), episodes, traffic)

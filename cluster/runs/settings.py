@@ -1,0 +1,376 @@
+"""What a run was asked to do: the fields are the command's flags, and config.json is them written down."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
+
+from cluster.runs.checkpoint import MAX_BYTES
+from evolution.episodes.curriculum import CurriculumConfig
+from evolution.dqn.experience import observation_dtype_and_width
+from evolution.networks.policy import Observation, PolicySpec
+from evolution.dqn.replay import MAX_N_STEP
+from evolution.search.base import SearchConfig
+from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
+
+MAX_WORKERS = 10_000
+MAX_POPULATION = 1_000_000
+MAX_TRAFFIC = 100
+MAX_ELITES = 10_000
+MAX_REPLAY = 10_000_000
+REPLAY_BYTES = 16  # of a row, beside the observation, at most
+REPLAY_SHARE = 0.75  # of the largest checkpoint
+LEAST_GROUP = 16  # members of a group, of whom the best are to be good
+MAX_STEPS = 10**15  # car-steps or episodes
+MAX_UPDATES = 1_000_000  # for each thousand car-steps
+# Of evolution, by default.
+CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 90_000_000
+
+S = TypeVar("S", bound="RunSettings")
+
+
+class SettingsError(ValueError):
+    """Settings that make no sense; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What any learner's run depends on: two runs with equal settings have the same champion."""
+
+    command: ClassVar[str]  # that makes such a run
+    default_policies: ClassVar[dict[Observation, str]]
+    unbound: ClassVar[tuple[str, ...]]  # what may be greater when a run is resumed: it only ends later
+    counts: ClassVar[tuple[str, ...]]  # what a checkpoint tells of how far a run has come, integers
+
+    scenario: str = "seamless"
+    """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as the scenario has by default. A map from a file has no lanes for them."""
+    seed: int = 0
+    """Seed of every random number of the run."""
+    observation: Observation = "rays"
+    """What the network sees: 31 ranges, or the occupancy grid; and the speed."""
+    policy: str = ""
+    """Network; by default one that suits the observation."""
+    car_steps: int = 0
+    """Car-steps at most, checked after each generation or evaluation; 0: any number."""
+    until: float = 0.985
+    """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
+
+    pace: float = 0.0
+    """Mean speed in m/s below which a champion's success counts for less, and which training's time limits follow; 0:
+    the scenario's own, a little above its lower speed."""
+
+    def __post_init__(self) -> None:
+        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
+            object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
+        if self.traffic == -1:
+            object.__setattr__(self, "traffic", default_traffic(self.scenario))
+        if not self.policy:
+            object.__setattr__(self, "policy", self.default_policy())
+
+    def default_policy(self) -> str:
+        """The network that suits the observation."""
+        return self.default_policies.get(self.observation, "")
+
+    @property
+    def algorithm(self) -> str:
+        """What learns: evolution, random or dqn."""
+        raise NotImplementedError
+
+    def curriculum(self) -> CurriculumConfig:
+        """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
+        low, _ = speed_interval(self.scenario)
+        pace, champion_pace = (low + 0.8, low + 0.3) if self.traffic else (low + 2.0, low + 0.85)
+        if self.pace:
+            pace, champion_pace = self.pace + 1.15, self.pace
+        # What befalls a car in traffic is chance: it takes more episodes to tell who drives well.
+        episodes = 3 if self.traffic else 1
+        return CurriculumConfig(pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes)
+
+    def extending(self, base: RunSettings) -> Self:
+        """These, asked for where a run of `base` goes on: its bounds may be greater."""
+        return self
+
+    def ended(self, so_far: Mapping[str, Any]) -> bool:
+        """Whether a run that has come so far (`counts`, and `solved`) has nothing left to do."""
+        return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
+
+    def check(self) -> None:
+        """Raises SettingsError, one line that says what to change."""
+        try:
+            check_name(self.scenario)
+            if is_map_file(self.scenario):
+                build(self.scenario, 0)  # kept, so that it is read once
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
+        if not 0 <= self.traffic <= MAX_TRAFFIC:
+            raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
+        if self.traffic and is_map_file(self.scenario):
+            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
+        if not 0 <= self.seed < 1 << 63:
+            raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
+        if not 0 <= self.car_steps <= MAX_STEPS:
+            raise SettingsError(f"--car-steps must be 0 to {MAX_STEPS:,}, not {self.car_steps:,}")
+        if not self.until > 0.0:
+            raise SettingsError(f"--until must be above 0, not {self.until}")
+        low, high = speed_interval(self.scenario)
+        if self.pace and not low <= self.pace <= high:
+            raise SettingsError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
+        try:
+            spec = PolicySpec.parse(self.policy)
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
+        if spec.observation != self.observation:
+            raise SettingsError(
+                f"policy {self.policy} sees the {spec.observation}; "
+                f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
+            )
+
+
+@dataclass(frozen=True)
+class EvolveSettings(RunSettings):
+    """What an evolution run depends on."""
+
+    command: ClassVar[str] = "gridsim-evolve"
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64+steering", "grid": "cnn:8,16,32@1"}
+    unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
+    counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
+
+    policy: str = ""
+    """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
+    closer, +steering if it sees how its own wheels stand; by default mlp:64+steering, in traffic
+    mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
+    of a dense layer and the number of frames, by default cnn:8,16,32@1."""
+    population: int = 256
+    """Members of a generation."""
+    generations: int = 0
+    """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
+    otherwise no more than 30 million car-steps, in traffic 90."""
+    recombination: Literal["all", "two"] = "all"
+    """Whose genes a child has: all winners of the tournaments, averaged into one centre (an evolution strategy), or
+    two parents' (the classic genetic algorithm)."""
+    tournament: int = 8
+    """Members of a tournament."""
+    sigma: float = 0.5
+    """Standard deviation of mutation; that of all winners' centre adapts from there."""
+    elites: int = 8
+    """With --recombination two: members that go on unmodified."""
+    mutation_rate: float = 0.03
+    """With --recombination two: share of a child's genes that are mutated."""
+    search: Literal["evolution", "random"] = "evolution"
+    """random: new random genomes in every generation, the baseline that evolution must beat."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.generations and not self.car_steps:
+            object.__setattr__(self, "car_steps", self.default_car_steps())
+
+    def default_policy(self) -> str:
+        usual = super().default_policy()
+        return usual.replace("+", "+motion+") if self.traffic and self.observation == "rays" else usual
+
+    def default_car_steps(self) -> int:
+        """Where neither generations nor car-steps are given."""
+        return CAR_STEPS_IN_TRAFFIC if self.traffic else CAR_STEPS
+
+    @property
+    def algorithm(self) -> str:
+        return self.search
+
+    def search_config(self) -> SearchConfig:
+        """The search's parameters."""
+        return SearchConfig(
+            self.population, self.curriculum().groups, self.tournament, self.sigma, self.elites, self.mutation_rate
+        )
+
+    def curriculum(self) -> CurriculumConfig:
+        usual = super().curriculum()
+        return replace(usual, groups=max(1, min(usual.groups, self.population // LEAST_GROUP)))
+
+    def extending(self, base: RunSettings) -> Self:
+        longer = isinstance(base, EvolveSettings) and self.generations > base.generations
+        # As for a new run that is given its --generations.
+        usual = self.car_steps == base.car_steps == self.default_car_steps()
+        return replace(self, car_steps=0) if longer and usual else self
+
+    def ended(self, so_far: Mapping[str, Any]) -> bool:
+        return super().ended(so_far) or 0 < self.generations <= int(so_far["generation"])
+
+    def check(self) -> None:
+        super().check()
+        if self.generations < 0:
+            raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
+        if self.population > MAX_POPULATION:
+            raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
+        _check_share(self, "mutation_rate")
+        for name in ("elites", "mutation_rate"):
+            if (
+                self.recombination == "all"
+                and self.search != "random"
+                and getattr(self, name) != getattr(EvolveSettings, name)
+            ):
+                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two")
+        classic = self.recombination == "two" or self.search == "random"
+        if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
+            raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
+        try:
+            self.search_config().check()
+        except ValueError as error:
+            raise SettingsError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class DqnSettings(RunSettings):
+    """What a run of the DQN depends on."""
+
+    command: ClassVar[str] = "gridsim-dqn"
+    default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
+    unbound: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
+    counts: ClassVar[tuple[str, ...]] = ("evaluation", "car_steps", "episodes", "updates", "converged")
+    #: What is 0 unless it is given. An update on grids takes a hundred times as long as one on rays, so that half an
+    #: hour has 2 million car-steps and not 400.
+    suited: ClassVar[dict[Observation, dict[str, Any]]] = {
+        "rays": {
+            "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3, "anneal": 30_000_000,
+            "target_period": 200, "evaluate_every": 1_000_000,
+        },
+        "grid": {
+            "replay": 100_000, "batch": 64, "updates": 16.0, "learning_rate": 5e-4, "anneal": 4_000_000,
+            "target_period": 500, "evaluate_every": 250_000,
+        },
+    }  # fmt: skip
+
+    policy: str = ""
+    """Network of the Q function: mlp: and the sizes of its hidden layers, with +steering if it sees how its own wheels
+    stand, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
+    layer and the number of frames, by default cnn:16,32,256@4."""
+    car_steps: int = 40_000_000
+    """Car-steps at most, checked after each evaluation; 0: any number."""
+    episodes: int = 0
+    """Training episodes at most, checked after each evaluation; 0: any number."""
+    converged: float = 0.01
+    """Stop when the Q values of fixed observations change by less than this share of their spread from one evaluation
+    to the next, three times in a row; 0: never."""
+    evaluate_every: int = 0
+    """Car-steps from one evaluation to the next; 0: a million, on the grid 250,000."""
+    batch: int = 0
+    """Transitions of one update; 0: 256, on the grid 64."""
+    updates: float = 0.0
+    """Updates for each thousand car-steps collected; 0: 4, on the grid 16."""
+    replay: int = 0
+    """Observations that the replay buffer holds; 0: a million, of grids a hundred thousand."""
+    prioritised: bool = False
+    """Draw transitions by their errors (Schaul et al. 2016) in place of uniformly."""
+    double: bool = True
+    """Double DQN (van Hasselt et al. 2016)."""
+    n_step: int = 1
+    """Steps of rewards in a target."""
+    discount: float = 0.99
+    """Discount factor of a step."""
+    learning_rate: float = 0.0
+    """Of Adam, at the start; it falls to a twentieth over --anneal. 0: 0.001, on the grid 0.0005."""
+    anneal: int = 0
+    """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth. 0: 30
+    million, on the grid 4 million."""
+    target_period: int = 0
+    """Updates from one copy of the target network to the next; 0: 200, on the grid 500."""
+    epsilon: float = 0.4
+    """Share of random actions of the episode that explores most; others of a batch explore less (Horgan et al.
+    2018)."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the learner computes: auto, cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in self.suited.get(self.observation, {}).items():
+            if not getattr(self, name):
+                object.__setattr__(self, name, value)
+
+    @property
+    def algorithm(self) -> str:
+        return "dqn"
+
+    def ended(self, so_far: Mapping[str, Any]) -> bool:
+        return super().ended(so_far) or bool(so_far["converged"]) or 0 < self.episodes <= int(so_far["episodes"])
+
+    def check(self) -> None:
+        super().check()
+        for name in ("evaluate_every", "batch", "replay", "n_step", "anneal", "target_period"):
+            if getattr(self, name) < 1:
+                raise SettingsError(f"--{name.replace('_', '-')} must be 1 or more, not {getattr(self, name)}")
+        for name, most in (
+            ("n_step", MAX_N_STEP), ("anneal", MAX_STEPS), ("episodes", MAX_STEPS), ("updates", MAX_UPDATES),
+        ):  # fmt: skip
+            if getattr(self, name) > most:
+                raise SettingsError(f"--{name.replace('_', '-')} must be {most:,} or less, not {getattr(self, name):,}")
+        for name in ("discount", "epsilon", "converged"):
+            _check_share(self, name)
+        for name in ("updates", "learning_rate"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise SettingsError(f"--{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
+        if self.episodes < 0:
+            raise SettingsError(f"--episodes must be 0 or more, not {self.episodes}")
+        if not self.batch <= self.replay <= MAX_REPLAY:
+            raise SettingsError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
+        self._check_replay_fits()
+        if self.device not in ("auto", "cpu", "cuda"):
+            raise SettingsError(f"--device must be auto, cpu or cuda, not {self.device}")
+
+    def _check_replay_fits(self) -> None:
+        """Raises SettingsError where a checkpoint could not hold the replay beside what else there is."""
+        dtype, width = observation_dtype_and_width(PolicySpec.parse(self.policy))
+        most = int(REPLAY_SHARE * MAX_BYTES) // (dtype.itemsize * width + REPLAY_BYTES)
+        if self.replay > most:
+            raise SettingsError(
+                f"--replay must be {most:,} or less for {self.policy}, not {self.replay:,}: a checkpoint holds no more"
+            )
+
+
+SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}
+
+
+def _check_share(settings: RunSettings, name: str) -> None:
+    value = getattr(settings, name)
+    if not 0.0 <= value <= 1.0:
+        raise SettingsError(f"--{name.replace('_', '-')} must be 0 to 1, not {value}")
+
+
+def check_workers(workers: int, address: str, patience_s: float) -> None:
+    """Raises SettingsError, one line, where a run cannot be computed like that; no result depends on it."""
+    if not 0 <= workers <= MAX_WORKERS:
+        raise SettingsError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
+    if workers == 0 and address:
+        raise SettingsError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
+    if not 0.0 <= patience_s < math.inf:
+        raise SettingsError(f"--patience must be 0 or more, not {patience_s:g}")
+
+
+def to_dict(settings: RunSettings) -> dict[str, Any]:
+    """Plain numbers and strings."""
+    return dataclasses.asdict(settings)
+
+
+def from_dict(kind: type[S], values: dict[str, Any]) -> S:
+    """The inverse of `to_dict`. Raises SettingsError for names or types that do not fit."""
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    unknown = sorted(set(values) - set(fields))
+    if unknown:
+        raise SettingsError(f"unknown setting {unknown[0]!r}")
+    defaults = kind()
+    for name, value in values.items():
+        wanted = type(getattr(defaults, name))
+        if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+            value = values[name] = float(value)
+        if type(value) is not wanted:
+            raise SettingsError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
+        choices = get_args(get_type_hints(kind)[name])
+        if choices and value not in choices:
+            raise SettingsError(f"setting {name!r} must be {' or '.join(choices)}, not {value!r}")
+    settings = kind(**values)
+    settings.check()
+    return settings

@@ -1,0 +1,184 @@
+"""What MLflow is told of a training run: its name, parameters, tags, description, best figures, and its champion."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from cluster.runs.champion import Champion
+from cluster.tracking.commit import git_commit
+from cluster.runs.settings import RunSettings, to_dict
+from cluster.tracking.tracker import Model
+from cluster.tracking.mlflow_run import MODEL, RUN_ID, Version
+from evolution.networks.policy import PolicySpec
+from gridsim.config import SimConfig
+from gridsim.maps.scenarios import label
+
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+
+    from cluster.runs.run import RunFolder
+
+BEST = {
+    "best_fitness": "fitness/best",
+    "best_distance_m": "distance_m/best",
+    "best_success_rate": "validation/success_rate",
+}
+"""MLflow's table of runs shows each metric's last value; these are logged when they grow, so that it is the best."""
+
+
+def what(settings: RunSettings) -> str:
+    """Scenario, algorithm and seed in one word, with which the name of a run begins unless another is given."""
+    road = re.sub(r"[^\w.+=@-]", "_", label(settings.scenario))  # as names of folders may be
+    return f"{road}-{settings.algorithm}-s{settings.seed}"
+
+
+def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
+    """Settings that are not what they are by default, but for those that decide when a run ends."""
+    kind = type(settings)
+    alike = {
+        name: getattr(settings, name)
+        for name in ("scenario", "observation", "traffic", "recombination")
+        if hasattr(settings, name)
+    }
+    usual = to_dict(kind(**alike)) | {"traffic": kind(scenario=settings.scenario).traffic}
+    if "recombination" in usual:
+        usual["recombination"] = "all"
+    left_out = {"seed", *settings.unbound, *without}
+    return {name: value for name, value in to_dict(settings).items() if name not in left_out and value != usual[name]}
+
+
+def title(name: str, settings: RunSettings) -> str:
+    """MLflow's name of a run: its folder's, and what that does not say and sets it apart."""
+    words = "" if f"{name}-".startswith(f"{what(settings)}-") else f": {what(settings)}"
+    more = unusual(settings)
+    parts = [str(more["policy"])] if "policy" in more else []
+    parts += [f"{settings.traffic} cars"] if "traffic" in more else []
+    return " ".join([name + words, *parts])
+
+
+def group(settings: RunSettings) -> str:
+    """What runs that differ in their seeds alone have in common, in words."""
+    words = [label(settings.scenario), settings.algorithm, settings.policy]
+    words += [f"{settings.traffic} cars"] if settings.traffic else []
+    more = unusual(settings, "traffic", "observation", "policy", "search")
+    return ", ".join([" ".join(words), *(f"{name} {value}" for name, value in more.items())])
+
+
+def params(settings: RunSettings) -> dict[str, str]:
+    """The whole configuration."""
+    found = {name: str(value) for name, value in to_dict(settings).items()}
+    found |= {f"curriculum/{k}": str(v) for k, v in dataclasses.asdict(settings.curriculum()).items()}
+    for part, values in dataclasses.asdict(SimConfig()).items():
+        found |= {f"{part}/{k}": str(v) for k, v in values.items()}
+    return found
+
+
+def tags(settings: RunSettings) -> dict[str, str]:
+    """What runs are found, grouped and coloured by; `group` is all but the seed."""
+    return {
+        "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
+        "search": settings.algorithm,
+        "scenario": settings.scenario,
+        "seed": str(settings.seed),
+        "policy": settings.policy,
+        "observation": settings.observation,
+        "traffic": str(settings.traffic),
+        "group": group(settings),
+        "git_commit": git_commit(),
+    }
+
+
+def held_out_metrics(figures: Mapping[str, float]) -> dict[str, float]:
+    """How the champion drives held-out roads, under MLflow's names."""
+    return {f"held_out/{name}": float(value) for name, value in figures.items() if name != "episodes"}
+
+
+def model_name(settings: RunSettings) -> str:
+    """The registered model that the champions of such runs are versions of."""
+    road = re.sub(r"[^\w.-]", "_", label(settings.scenario))  # an @ would be read as an alias
+    return f"gridsim-{road}-{settings.algorithm}"
+
+
+def headline(settings: RunSettings) -> str:
+    """What a run does, in a line."""
+    verb = {"dqn": "Deep Q-learning", "random": "Random search"}.get(settings.algorithm, "Evolution")
+    cars = f"among {settings.traffic} cars" if settings.traffic else "without traffic"
+    return f"{verb} of a `{settings.policy}` driver on **{label(settings.scenario)}**, {cars}, seed {settings.seed}."
+
+
+def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
+    """A run's description, Markdown: what it is, and once it is finished what came of it and how to see it."""
+    settings, folder = run.settings, run.path
+    if summary is None:
+        return f"{headline(settings)}\n\nIts folder: `{folder}`"
+    held_out, inputs = summary["held_out"], PolicySpec.parse(settings.policy).inputs
+    found = "Solved" if summary["solved"] else "The best so far"
+    step = next(name for name in ("generations", "evaluations") if name in summary)
+    return "\n".join([
+        headline(settings),
+        "",
+        f"{found} after {summary[step]:,} {step}, {summary['car_steps'] / 1e6:,.1f} million car-steps and "
+        f"{summary['wall_s']:,.0f} s. On {held_out['episodes']} held-out drives the champion succeeds in "
+        f"**{held_out['success_rate']:.1%}**, drives {held_out['distance_m']:,.0f} m at {held_out['speed_mps']:.2f} "
+        f"m/s, and collides in {held_out['collision_rate']:.1%}.",
+        "",
+        "Watch it: `champion.mp4` among the artifacts, or",
+        "",
+        f"    gridsim-watch {folder}",
+        "",
+        f"Load it, a torch model of the environment's observations, float32 [n, {inputs}], which is registered as "
+        f"`{model_name(settings)}`:",
+        "",
+        f'    mlflow.pytorch.load_model("runs:/{RUN_ID}/{MODEL}")',
+        "",
+        f"Repeat the run: `{settings.command} --config config.json`.",
+    ])  # fmt: skip
+
+
+def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str, float]) -> Model:
+    """The champion as a torch model: what is written, and what its registered version says."""
+
+    def build() -> tuple[torch.nn.Module, np.ndarray]:
+        from evolution.networks.export import example, to_torch
+
+        spec = PolicySpec.parse(champion.policy)
+        return to_torch(spec, champion.genome, champion.sim), example(spec, champion.sim)
+
+    facts = {
+        "policy": champion.policy,
+        "scenario": label(settings.scenario),
+        "algorithm": settings.algorithm,
+        "traffic": str(champion.traffic),
+        "seed": str(settings.seed),
+    }
+    version = Version(
+        model_name(settings),
+        champion.sha256,
+        about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
+        "observations and return a number for each of the eight actions, of which the greatest acts.",
+        note=f"{headline(settings)} {held_out['success_rate']:.1%} of the held-out drives succeed.",
+        tags={**facts, **{k: f"{v:.6g}" for k, v in held_out_metrics(held_out).items()}},
+    )
+    return Model(version, build, facts)
+
+
+class Bests:
+    """The best figures of a history, told row after row."""
+
+    def __init__(self) -> None:
+        self._best: dict[str, float] = {}
+
+    def __call__(self, row: Mapping[str, float]) -> dict[str, float]:
+        """Those of BEST that this row is the first to reach."""
+        grown = {
+            name: row[column]
+            for name, column in BEST.items()
+            if column in row and row[column] > self._best.get(name, -math.inf)
+        }
+        self._best |= grown
+        return grown

@@ -1,0 +1,386 @@
+"""A run as MLflow has it: found or created, its rows, files, description and model. The one module that imports MLflow.
+
+Everything here blocks and may raise whatever MLflow raises; any call can be repeated. `tracker.Tracker` makes these
+calls in its own thread and never lets a run wait.
+
+Models are written here and never read: GridSim drives `champion.npz` (`checkpoint.load`: arrays and a checksum, no
+pickle) and loads nothing from MLflow, whoever may write to the server. What is written is `torch.export`'s graph with
+its weights, MLflow's format `pt2`, never a pickled module. But `mlflow.pytorch.load_model`, in a program of the user's
+own, runs whatever a model's maker has put into it, in either format, unless MLFLOW_ALLOW_PICKLE_DESERIALIZATION is
+`false`: then it refuses all but plain tensors. Models that were written here load with it.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from cluster.tracking.commit import git_commit
+from cluster.tracking.address import TrackingError, connect, sqlite_path
+
+if TYPE_CHECKING:
+    from mlflow.entities import FileInfo, Metric, Run
+    from mlflow.tracking import MlflowClient
+
+Status = Literal["FINISHED", "KILLED", "FAILED"]
+
+KEY_TAG = "gridsim.key"
+"""The tag that a run is found again by, if it was killed before anybody knew its id."""
+NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "gridsim.note"
+"""MLflow's tag of the description, and ours that says which description was written here."""
+CHAMPION_TAG = "champion_sha256"
+"""The tag by which a registered version tells whose champion it is."""
+RUN_ID = "{run_id}"
+"""Stands in a description for MLflow's id of the run, which is not known when it is written."""
+MODEL = "model"
+"""Folder of the champion as a torch model, in a run's folder and among its artifacts."""
+
+# Only where the user has not decided otherwise. MLflow's own retries would go on for minutes; ours replace them.
+_ENVIRONMENT = {
+    "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
+    "MLFLOW_CONFIGURE_LOGGING": "false",
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
+}
+_LOGGERS = ("mlflow", "alembic", "sqlalchemy", "urllib3", "torch")
+
+
+def quiet() -> None:
+    """Set MLflow up so that nothing of it reaches the terminal: its errors reach the caller. What is set stays."""
+    for name, value in _ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    for name in _LOGGERS:
+        logger = logging.getLogger(name)
+        if not logger.handlers:
+            logger.addHandler(logging.NullHandler())
+            logger.propagate = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """Metrics of one step.
+
+    Attributes:
+        step: which.
+        metrics: values by name.
+        timestamp: ms since the epoch; fixed when the row is handed over, so that a repeated request is the same one.
+    """
+
+    step: int
+    metrics: Mapping[str, float]
+    timestamp: int
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which run is meant, and what a new one begins with.
+
+    Attributes:
+        uri: what `tracking_address.check_uri` returned.
+        experiment: name of MLflow's experiment.
+        name: of the run.
+        params, tags: its parameters and tags.
+        note: its description, Markdown.
+        key: the run's own unique name, by which it is found again (KEY_TAG).
+        run_id: MLflow's id of it, where that is known.
+        late: the run is over, and what MLflow has of it stays as it is: its status, its times, its files.
+        started: ms since the epoch at which a new one began; None is now.
+    """
+
+    uri: str
+    experiment: str
+    name: str
+    params: Mapping[str, str] = field(default_factory=dict)
+    tags: Mapping[str, str] = field(default_factory=dict)
+    note: str = ""
+    key: str = ""
+    run_id: str | None = None
+    late: bool = False
+    started: int | None = None
+
+
+@dataclass(frozen=True)
+class Version:
+    """What a registered model's version says of itself.
+
+    Attributes:
+        name: of the registered model.
+        champion_sha256: digest of the champion's genome; a run registers one champion once.
+        about: what all versions of the model have in common, Markdown.
+        note: what this one is, Markdown.
+        tags: more of it.
+    """
+
+    name: str
+    champion_sha256: str
+    about: str = ""
+    note: str = ""
+    tags: Mapping[str, str] = field(default_factory=dict)
+
+
+class LoggedRun:
+    """A run in MLflow, opened: found by its id or key, or created.
+
+    Attributes:
+        run_id: MLflow's id.
+        logged: the steps that MLflow has of each metric.
+    """
+
+    def __init__(self, identity: Identity):
+        """Import MLflow, open the store, find or create the run."""
+        quiet()
+        from mlflow.tracking import MlflowClient
+
+        self._identity = identity
+        path = sqlite_path(identity.uri)
+        if path and not path.exists():
+            _create_database(path)
+        self._client = MlflowClient(tracking_uri=identity.uri)
+        self._experiment_id = _experiment_id(self._client, identity.experiment, path)
+        self.logged: dict[str, set[int]] = {}
+        self._listed: dict[str | None, dict[str, int]] = {}  # folder -> sizes of the artifacts in it
+        run = self._find() or self._create()
+        self.run_id: str = run.info.run_id
+        self._artifacts: str = run.info.artifact_uri
+        self._over = identity.late and run.info.status == "FINISHED"
+
+    def _create(self) -> "Run":
+        from mlflow.entities import Param
+        from mlflow.tracking.context.git_context import GitRunContext
+        from mlflow.tracking.context.registry import resolve_tags
+
+        asked, commit = self._identity, git_commit()
+        natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]  # mlflow.user, mlflow.source.*
+        if commit != "unknown":
+            natural["mlflow.source.git.commit"] = commit
+        tags = {**natural, **self._tags(), **_note_tags(asked.note)}
+        run = self._client.create_run(self._experiment_id, asked.started, tags, asked.name)
+        self._client.log_batch(run.info.run_id, params=[Param(*param) for param in asked.params.items()])
+        return run
+
+    def _find(self) -> "Run | None":
+        """The run, with what it lacked of parameters and tags; None if this store has none, or only in its bin."""
+        from mlflow.entities import Param, RunTag
+
+        run = self._search()
+        if run is None:
+            return None
+        run_id, data = run.info.run_id, run.data
+        if not self._identity.late:
+            self._client.update_run(run_id, status="RUNNING")
+        for name in data.metrics:
+            self.logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
+        # MLflow lets no parameter change; what is different is told beside it.
+        resumed: dict[str, str] = {}
+        for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
+            resumed |= {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
+        params = [Param(*param) for param in self._identity.params.items() if param[0] not in data.params]
+        tags = {name: value for name, value in self._tags().items() if name not in data.tags} | resumed
+        self._client.log_batch(run_id, params=params, tags=[RunTag(*tag) for tag in tags.items()])
+        return run
+
+    def _search(self) -> "Run | None":
+        """The run by its id, or else by its key."""
+        from mlflow.exceptions import MlflowException
+
+        if self._identity.run_id:
+            try:
+                run = self._client.get_run(self._identity.run_id)
+            except MlflowException as error:
+                if error.error_code not in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
+                    raise
+            else:
+                if run.info.lifecycle_stage == "active":
+                    return run
+        wanted = f"tags.`{KEY_TAG}` = '{self._identity.key}'"
+        found = self._client.search_runs([self._experiment_id], wanted, max_results=1)
+        return self._client.get_run(found[0].info.run_id) if found else None
+
+    def _tags(self) -> dict[str, str]:
+        return {"git_commit": git_commit(), **self._identity.tags, KEY_TAG: self._identity.key}
+
+    def log(self, rows: Sequence[Row]) -> int:
+        """Log what MLflow does not have of some rows, in one request: all of it, or nothing. Returns: of how many."""
+        metrics = list(self._missing(rows))
+        if metrics:
+            self._client.log_batch(self.run_id, metrics=metrics)
+        for metric in metrics:
+            self.logged.setdefault(metric.key, set()).add(metric.step)
+        return len({metric.step for metric in metrics})
+
+    def _missing(self, rows: Sequence[Row]) -> "Iterator[Metric]":
+        from mlflow.entities import Metric
+
+        seen: set[tuple[str, int]] = set()
+        for row in rows:
+            for name, value in row.metrics.items():
+                if row.step not in self.logged.get(name, ()) and (name, row.step) not in seen:
+                    seen.add((name, row.step))
+                    yield Metric(name, value, row.timestamp, row.step)
+
+    def describe(self, text: str) -> None:
+        """Replace the run's description, unless somebody has written one of his own."""
+        from mlflow.entities import RunTag
+
+        text = text.replace(RUN_ID, self.run_id)
+        tags = self._client.get_run(self.run_id).data.tags
+        there = tags.get(NOTE_TAG, "")
+        if there != text and (not there or _note_tags(there)[OWN_NOTE_TAG] == tags.get(OWN_NOTE_TAG)):
+            self._client.log_batch(self.run_id, tags=[RunTag(*tag) for tag in _note_tags(text).items()])
+
+    def upload(self, path: Path, folder: str | None) -> bool:
+        """Store a file among the artifacts. False where the run is `late` and MLflow has it.
+
+        One by one: MLflow's own pool of threads would hold up the exit if a server hangs.
+        """
+        if self._identity.late and self._sizes(folder).get(path.name) == path.stat().st_size:
+            return False
+        self._client.log_artifact(self.run_id, str(path), folder)
+        return True
+
+    def _sizes(self, folder: str | None) -> dict[str, int]:
+        """Sizes in bytes of the artifacts in a folder, by name."""
+        if folder not in self._listed:
+            listed: list[FileInfo] = self._client.list_artifacts(self.run_id, folder)
+            self._listed[folder] = {Path(each.path).name: each.file_size or 0 for each in listed if not each.is_dir}
+        return self._listed[folder]
+
+    def register(self, version: Version) -> bool:
+        """Make the uploaded model the newest version of its name. False where this run's champion is one already."""
+        from mlflow.exceptions import MlflowException
+
+        client = self._client
+        found = client.search_model_versions(f"name = '{version.name}' and run_id = '{self.run_id}'")
+        if any(each.tags.get(CHAMPION_TAG) == version.champion_sha256 for each in found):
+            return False
+        try:
+            client.create_registered_model(version.name, description=version.about)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                raise
+        client.create_model_version(
+            version.name,
+            f"{self._artifacts.rstrip('/')}/{MODEL}",
+            self.run_id,
+            tags={CHAMPION_TAG: version.champion_sha256, **version.tags},
+            description=version.note,
+            await_creation_for=0,
+        )
+        return True
+
+    def end(self, status: Status, timestamp: int | None = None) -> None:
+        """End the run, now or at a time in ms since the epoch. One that is over stays as it is."""
+        if not (self._over and status == "FINISHED"):
+            self._client.set_terminated(self.run_id, status, timestamp)
+
+
+def _note_tags(text: str) -> dict[str, str]:
+    """A description, and the mark that it is ours."""
+    return {NOTE_TAG: text, OWN_NOTE_TAG: hashlib.sha256(text.encode()).hexdigest()} if text else {}
+
+
+# ------------------------------------------------------------------------------------------------ models
+
+
+def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, Any]) -> None:
+    """Write a torch module as MLflow's model: graph and weights (`pt2`), signature and input example.
+
+    Args: the folder, which is replaced as a whole; a torch.nn.Module without gradients; an input of it, float32 [n,
+    inputs] with n of 2 or more, so that any number may be given to what is written; what else it shall say of itself.
+    """
+    quiet()
+    import mlflow.pytorch
+    import torch
+    from mlflow.models import infer_signature
+
+    for left_behind in folder.parent.glob(f".{folder.name}.*.tmp"):
+        shutil.rmtree(left_behind, ignore_errors=True)
+    built = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch's and MLflow's own making
+            mlflow.pytorch.save_model(
+                module,
+                str(built),
+                input_example=example,
+                signature=infer_signature(example, module(torch.from_numpy(example)).numpy()),
+                serialization_format="pt2",
+                # Given, as MLflow would start a process and load the model there to find out.
+                pip_requirements=[f"mlflow=={mlflow.__version__}", f"torch=={torch.__version__.partition('+')[0]}"],
+                metadata=dict(metadata),
+            )
+        shutil.rmtree(folder, ignore_errors=True)
+        built.rename(folder)
+    finally:
+        shutil.rmtree(built, ignore_errors=True)
+
+
+def saved_champion(folder: Path) -> str:
+    """Digest of the champion that `save_model` wrote to a folder (CHAMPION_TAG of its metadata), or ""."""
+    quiet()
+    from mlflow.models import Model
+
+    with contextlib.suppress(Exception):  # not there, or not whole: it is written again
+        return str((Model.load(str(folder)).metadata or {}).get(CHAMPION_TAG, ""))
+    return ""
+
+
+# ------------------------------------------------------------------------------------------------ the store
+
+
+def _create_database(path: Path) -> None:
+    """Make a new MLflow database appear at `path` whole, if nobody else is first.
+
+    MLflow builds it by 60 migrations in a second. Killed in the middle of them it leaves a database that it can never
+    open again, and two runs that start together do the same to each other. So it is built elsewhere.
+    """
+    from mlflow.tracking import MlflowClient
+
+    whole = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            built = Path(folder, "mlflow.db")
+            MlflowClient(tracking_uri=f"sqlite:///{built}").search_experiments(max_results=1)
+            whole.unlink(missing_ok=True)
+            with (
+                contextlib.closing(connect(built, "ro")) as source,
+                contextlib.closing(connect(whole, "rwc")) as copy,
+            ):
+                source.backup(copy)
+        try:
+            os.link(whole, path)
+        except FileExistsError:
+            pass
+        except OSError:  # a file system without hard links
+            if not path.exists():
+                os.rename(whole, path)
+    finally:
+        whole.unlink(missing_ok=True)
+
+
+def _experiment_id(client: "MlflowClient", name: str, database: Path | None) -> str:
+    """The experiment of that name, created if need be with its artifacts beside the database."""
+    from mlflow.exceptions import MlflowException
+
+    http = client.tracking_uri.startswith("http")  # the server knows best where artifacts go
+    location = None if http else ((database.parent if database else Path.cwd()) / "mlartifacts").as_uri()
+    experiment = client.get_experiment_by_name(name)
+    if experiment is None:
+        try:
+            return client.create_experiment(name, artifact_location=location)
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_ALREADY_EXISTS":  # another run was first
+                raise
+            experiment = client.get_experiment_by_name(name)
+    if experiment is None or experiment.lifecycle_stage != "active":
+        raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
+    return experiment.experiment_id

@@ -1,0 +1,1 @@
+"""The training loops of evolution and of the DQN."""

@@ -1,0 +1,300 @@
+"""The learning loop of the DQN: the workers collect experience while the learner trains on what they brought before.
+
+Batch k is collected with the weights after update block k - 2, which is the newest there is when it is sent out: block
+k - 1 is trained meanwhile, on the batches up to k - 1. So nobody waits for the other's turn, and the network is the
+same for any number of workers. A step of the run is an evaluation: the network of that moment drives validation's
+first episodes beside whoever did well there the last time, exactly as champions of the genetic algorithm are found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from cluster.training.trainer import Learning, made_good, some_left, unmodified
+from cluster.runs.settings import DqnSettings
+from cluster.workers.worker import CollectTask
+from evolution.episodes.curriculum import success_rate
+from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
+from evolution.dqn.replay import PriorityConfig, Replay
+from evolution.episodes.rollout import Limits
+from gridsim.maps.scenarios import map_of
+
+COLUMNS = (
+    "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean", "network/success_rate",
+    "validation/success_rate", "reward/mean", "loss", "q/mean", "q/change", "exploration", "learning_rate", "episodes",
+    "updates", "car_steps", "wall_s", "car_steps_per_s",
+)  # fmt: skip
+"""Columns of history.csv after `evaluation`; the names that MLflow has them under.
+
+`mean` is of the training episodes since the evaluation before, `best` of the network on validation's first episodes.
+"""
+
+EPISODE_STEPS = 256  # of a training episode, at most: it is truncated then
+BATCH_STEPS = 32_768  # car-steps of a batch, about
+EPISODES = (64, 2048)  # of a batch, at least and at most
+WARM_UP = 20_000  # rows of replay before the first update
+SLICE = 8  # updates between two looks at the workers
+RANDOM_SHARE = 0.02  # of --anneal, in which exploration falls from random driving
+SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
+LAST_SHARE = 0.05  # of the learning rate that is left after --anneal
+PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are watched
+CALM = 3  # evaluations in a row in which they have to stand still
+
+
+@dataclass
+class Dqn(Learning):
+    """One run of the DQN."""
+
+    columns: ClassVar[tuple[str, ...]] = COLUMNS
+    step_name: ClassVar[str] = "evaluation"
+    verb: ClassVar[str] = "training"
+
+    settings: DqnSettings
+    batches: int = 0
+    episodes: int = 0
+    calm: int = 0  # evaluations in a row in which the Q values stood still
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        s = self.settings
+        config = DqnConfig(
+            batch=s.batch, learning_rate=s.learning_rate, final_learning_rate=LAST_SHARE,
+            learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1), target_period=s.target_period,
+            double=s.double, priorities=PriorityConfig() if s.prioritised else None,
+        )  # fmt: skip
+        self.learner = DqnLearner(self.spec, config, s.seed, s.device)
+        self.replay = Replay(self.spec, s.replay, s.n_step, s.discount, config.priorities)
+        if self.initial is not None:
+            self.learner.load_weights(self.initial)
+        self.probe = np.zeros((0, self.spec.inputs), dtype=np.float32)
+        self.probe_q = np.zeros((0, self.spec.outputs), dtype=np.float32)
+        self._owed = 0.0  # updates that the last batch asks for and that are not made yet
+        self._mean_steps = 32.0  # of the last batch's episodes
+
+    # ------------------------------------------------------------------------------------------------------ the loop
+
+    def step(self) -> dict[str, float]:
+        """Train until the next evaluation is due, and evaluate. Returns its row of the history (COLUMNS)."""
+        self.outcomes.clear()
+        self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
+        steps, distance, episodes, reward, speeds = 0, 0.0, 0, 0.0, 0.0
+        while steps < self.settings.evaluate_every and not (steps and self.out_of_time()):
+            results, rewards = self._collect()
+            n = int(results["steps"].sum())
+            steps += n
+            episodes += len(results)
+            distance += float(results["distance"].sum())
+            reward += rewards
+            speeds += made_good(results, self.sim.episode.control_period) * len(results)
+        row = {
+            "distance_m/mean": distance / episodes,
+            "speed_mps/mean": speeds / episodes,
+            "reward/mean": reward / steps,
+        }
+        row |= self._evaluate_network()
+        updates = sum(n for n, _, _ in self._losses)
+        row["loss"] = sum(n * loss for n, loss, _ in self._losses) / max(updates, 1)
+        row["q/mean"] = sum(n * q for n, _, q in self._losses) / max(updates, 1)
+        row["q/change"] = self._watch(updates)
+        row["exploration"] = float(self._epsilons(EPISODES[0]).mean())
+        row["learning_rate"] = self.learner.config.learning_rate_at(self.learner.updates)
+        row |= {"episodes": float(self.episodes), "updates": float(self.learner.updates)}
+        row["car_steps"] = float(self.car_steps)
+        self.history.append(row)
+        row["validation/success_rate"] = self.champion.success_rate if self.champion else 0.0
+        return row
+
+    def _collect(self) -> tuple[np.ndarray, float]:
+        """Have one batch collected, train meanwhile, and remember what was brought.
+
+        Returns: RESULT [episodes] and the sum of their rewards. An episode that kills its workers is left out of all.
+        """
+        s, k = self.settings, self.batches
+        n = int(np.clip(BATCH_STEPS / self._mean_steps, *EPISODES))
+        episodes = self.curriculum.starts(k, n)
+        self._build_ahead(self.curriculum.map_seeds[: k + 8])
+        keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
+        task = CollectTask(
+            policy=s.policy,
+            weights=_finite(self.learner.weights, self.learner.updates),
+            episodes=episodes.rows,
+            worlds=episodes.worlds,
+            maps=tuple((s.scenario, map_of(s.scenario, seed)) for seed in episodes.maps),
+            epsilons=self._epsilons(n),
+            keys=keys,
+            limits=Limits(self.curriculum.goal, EPISODE_STEPS),
+            config=self.sim,
+        )
+        progress = self.on_progress
+        tell = (lambda done, total: progress("collect", done, total)) if progress else None
+        brought = self.pool.collect(task, tell, self._train)
+        self._tell_of_lost("collect", brought)
+        some_left(brought.lost, "collect")
+        self.replay.add(brought.experience)
+        results = brought.results[~brought.lost]
+        steps = int(results["steps"].sum())
+        self._owed += steps * s.updates / 1000.0
+        self._mean_steps = steps / len(results)
+        self.car_steps += steps
+        self.episodes += len(results)
+        self.batches += 1
+        return results, float(brought.experience.rewards.sum())
+
+    def _epsilons(self, n: int) -> np.ndarray:
+        """Shares of random actions of a batch's episodes: float32 [n]."""
+        s = self.settings
+        come = min(self.car_steps / s.anneal, 1.0)
+        usual = s.epsilon ** (1.0 + SPREAD * np.arange(n) / max(n - 1, 1))
+        first = max(1.0 - come / RANDOM_SHARE, 0.0)
+        return (usual + (1.0 - usual) * first).astype(np.float32)
+
+    def _train(self) -> bool:
+        """Make some of the updates that are owed. Returns whether some are left."""
+        if self.meanwhile:
+            self.meanwhile()
+        if len(self.replay) < min(WARM_UP, self.replay.capacity):
+            self._owed = 0.0
+        n = min(int(self._owed), SLICE)
+        if n:
+            made = self.learner.train(self.replay, n)
+            self._losses.append((n, made.loss, made.q))
+            self._owed -= n
+        return self._owed >= 1.0
+
+    # ------------------------------------------------------------------------------------------------- the evaluation
+
+    def _evaluate_network(self) -> dict[str, float]:
+        """Try the averaged network on validation's first episodes, beside who is on trial. Returns its figures."""
+        network = _finite(self.learner.average, self.learner.updates)
+        self.elites.append(network)
+        # Also who was tried before, where nothing was learned since: its figures are the row's.
+        self.trials.first, self.trials.first_generation = network[None], self.steps
+        episodes, asked = self._trial()
+        driven = self._evaluate(
+            "validate", unmodified(np.concatenate([self.trials.first, self.trials.last])), episodes,
+            self.curriculum.goal_limits(), asked=asked, meanwhile=self._train,
+        )  # fmt: skip
+        some_left(driven.lost, "validate")
+        self._judge(driven.results, driven.lost)
+        first = driven.results[0, : self.curriculum.config.first_validation]
+        return {
+            "distance_m/best": float(first["distance"].mean()),
+            "speed_mps/best": made_good(first, self.sim.episode.control_period),
+            "network/success_rate": float(success_rate(first[None])[0]),
+        }
+
+    def _watch(self, updates: int) -> float:
+        """How far the Q values of fixed observations moved since the last evaluation, as a share of their spread.
+
+        Without updates in between they stand still and tell nothing. Raises: FloatingPointError as `_finite`: what
+        is not finite could not be taken up again.
+        """
+        if not len(self.probe):
+            key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
+            self.probe = self.replay.sample(key, PROBE[self.spec.observation]).observations
+        before, self.probe_q = self.probe_q, self.learner.q_values(self.probe)
+        _finite(self.learner.weights, self.learner.updates)
+        if not np.isfinite(self.probe_q).all():
+            raise diverged(self.learner.updates)
+        change = 1.0
+        if len(before):
+            q = self.probe_q.astype(np.float64)  # squares of large values are beyond float32
+            change = float(np.sqrt(np.mean((q - before) ** 2)) / max(float(q.std()), 1e-9))
+        self.calm = self.calm + 1 if updates and change < self.settings.converged else 0
+        return change
+
+    # ------------------------------------------------------------------------------------------------------- state
+
+    @property
+    def converged(self) -> bool:
+        """Whether the Q function stands still."""
+        return self.settings.converged > 0.0 and self.calm >= CALM
+
+    def counts(self) -> dict[str, int]:
+        return {
+            "evaluation": self.steps,
+            "car_steps": self.car_steps,
+            "episodes": self.episodes,
+            "updates": self.learner.updates,
+            "converged": int(self.converged),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        return {
+            "evaluations": self.steps,
+            "updates": self.learner.updates,
+            "episodes": self.episodes,
+            "converged": self.converged,
+        }
+
+    def way(self) -> tuple[float, float, str]:
+        s = self.settings
+        if s.episodes and not s.car_steps:
+            return self.episodes, s.episodes, "episode"
+        return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
+
+    def describe(self, row: dict[str, float]) -> str:
+        return (
+            f"distance {row['distance_m/best']:,.0f} m, {row['network/success_rate']:.0%} succeed  "
+            f"{row['speed_mps/best']:.1f} m/s  loss {row['loss']:.3f}  {row['updates'] / 1e3:.0f} k updates"
+        )
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        arrays, meta = super().state()
+        learner, replay = self.learner.state(), self.replay.state()
+        arrays |= {f"learner_{name}": array for name, array in learner[0].items()}
+        arrays |= {f"replay_{name}": array for name, array in replay[0].items()}
+        arrays |= {"probe": self.probe, "probe_q": self.probe_q}
+        meta |= {
+            "learner": learner[1],
+            "replay": replay[1],
+            "batches": self.batches,
+            "calm": self.calm,
+            "owed": self._owed,
+            "mean_steps": self._mean_steps,
+        }
+        return arrays, meta
+
+    def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        super()._restore(arrays, meta)
+        self.learner.restore(_named(arrays, "learner_"), meta["learner"])
+        if "replay" in meta:  # a run that has ended kept none; extended, it fills a new one before it learns on
+            self.replay.restore(_named(arrays, "replay_"), meta["replay"])
+        probe, probe_q = arrays["probe"], arrays["probe_q"]
+        if (
+            probe.ndim != 2
+            or probe.shape[1] != self.spec.inputs
+            or probe_q.shape != (len(probe), self.spec.outputs)
+            or any(array.dtype != np.float32 or not np.isfinite(array).all() for array in (probe, probe_q))
+        ):
+            raise ValueError("its parts do not fit each other")
+        self.probe, self.probe_q = probe, probe_q
+        self.batches, self.episodes, self.calm = (_count(meta, name) for name in ("batches", "episodes", "calm"))
+        self._owed, self._mean_steps = float(meta["owed"]), float(meta["mean_steps"])
+        if not 0.0 <= self._owed < 1e9 or not 0.0 < self._mean_steps <= EPISODE_STEPS:
+            raise ValueError("its numbers are out of range")
+        if (meta["evaluation"], meta["updates"]) != (self.steps, self.learner.updates):
+            raise ValueError("its parts do not fit each other")
+
+
+def _finite(weights: np.ndarray, updates: int) -> np.ndarray:
+    """Weights as they are. Raises: FloatingPointError with one line once they have diverged."""
+    if not np.isfinite(weights).all():
+        raise diverged(updates)
+    return weights
+
+
+def _named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin so, without it."""
+    return {name[len(prefix) :]: array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def _count(meta: dict[str, Any], name: str) -> int:
+    """A number of something. Raises: ValueError."""
+    value = meta[name]
+    if type(value) is not int or value < 0:
+        raise ValueError(f"{name} is no number of things")
+    return value

@@ -1,0 +1,458 @@
+"""What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
+
+A learner is a loop of steps between a pool and a run's files; `coordinator` has the genetic algorithm's, `dqn_loop` the
+DQN's. Everything it decides follows from the seed and from what the workers return; nothing follows from the clock or
+from who returned it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import threading
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from cluster.runs.checkpoint import CheckpointError
+from cluster.workers.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
+from cluster.runs.settings import RunSettings
+from cluster.workers.worker import Task
+from evolution.search.breeding import Kind, Mutation
+from evolution.episodes.curriculum import (
+    HELD_OUT_EPISODES,
+    HELD_OUT_SEEDS,
+    TRIED_KEPT,
+    VALIDATION_SEEDS,
+    Curriculum,
+    Trials,
+    spread_starts,
+    success_rate,
+)
+from evolution.episodes.starts import Episodes
+from evolution.networks.policy import PolicySpec
+from evolution.episodes.rollout import Limits
+from evolution.search.base import recipes
+from gridsim.config import SimConfig
+from gridsim.car.ego import End
+from gridsim.maps.scenarios import Scenario, build, map_of
+
+MAX_TRIED = 4  # members that are on validation's first stage at once
+MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
+MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
+
+
+class Maps:
+    """Builds maps, each once, and ahead of their use in a thread; keeps the latest."""
+
+    def __init__(self, scenario: str, config: SimConfig):
+        self._scenario, self._config = scenario, config
+        self._built: dict[int, Future[Scenario]] = {}
+        self._lock = threading.Lock()
+        self._soon, self._later = (ThreadPoolExecutor(1, thread_name_prefix=f"maps-{k}") for k in range(2))
+
+    def ahead(self, seeds: Sequence[int], later: bool = False) -> None:
+        """Begin to build maps that will be needed, in this order; `later` ones do not keep others waiting."""
+        thread = self._later if later else self._soon
+        with self._lock:
+            for seed in seeds:
+                if seed not in self._built:
+                    self._built[seed] = thread.submit(build, self._scenario, seed, self._config)
+
+    def get(self, seed: int) -> Scenario:
+        """The map of a seed."""
+        self.ahead([seed])
+        with self._lock:
+            future = self._built.pop(seed)
+            self._built[seed] = future  # the latest used is last
+            while len(self._built) > MAPS_KEPT:
+                del self._built[next(iter(self._built))]
+        return future.result()
+
+    def build(self, scenario: str, seed: int) -> Scenario:
+        """As pools ask for it."""
+        if scenario != self._scenario:
+            raise ValueError(f"a run on {self._scenario} has no map of {scenario}")
+        return self.get(seed)
+
+    def close(self) -> None:
+        """Forget what is not yet begun."""
+        for thread in (self._soon, self._later):
+            thread.shutdown(wait=False, cancel_futures=True)
+
+
+@dataclass
+class Champion:
+    """The best member found so far, by validation.
+
+    Attributes:
+        genome: float32 [genes].
+        score: of all validation episodes (`Curriculum.validation_score`).
+        success_rate: of the same.
+        distance_m: its mean distance there.
+        generation: the step in which it was found.
+    """
+
+    genome: np.ndarray
+    score: float = 0.0
+    success_rate: float = 0.0
+    distance_m: float = 0.0
+    generation: int = -1
+
+
+@dataclass
+class Learning(ABC):
+    """One run of a learner, between pool and files.
+
+    Attributes:
+        settings: what the run was asked to do.
+        pool: who evaluates.
+        maps: who builds maps.
+        initial: a genome to start from, float32 [genes].
+        history: a row of figures for each step (`columns`).
+        elites: the network of each step, float32 [genes].
+        validation_steps: car-steps of these that validation took.
+        lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
+        warn: told of each of these, in one line.
+    """
+
+    columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
+    step_name: ClassVar[str]  # what a step is called
+    verb: ClassVar[str]  # what is done to a network
+
+    settings: RunSettings
+    pool: WorkerPool
+    maps: Maps
+    initial: np.ndarray | None = None
+    champion: Champion | None = None
+    solved: bool = False
+    history: list[dict[str, float]] = field(default_factory=list)
+    elites: list[np.ndarray] = field(default_factory=list)
+    car_steps: int = 0
+    validation_steps: int = 0
+    lost_chunks: int = 0
+    wall_before_s: float = 0.0
+    warn: Callable[[str], None] = warnings.warn
+    on_progress: Callable[[str, int, int], None] | None = None
+    meanwhile: Callable[[], None] | None = None  # called in each step when the workers are busy
+    out_of_time: Callable[[], bool] = lambda: False  # whether a budget of wall time is spent: a long step ends early
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self.sim = SimConfig()
+        self.spec = PolicySpec.parse(s.policy)
+        episode = self.sim.episode
+        self.curriculum = Curriculum(
+            s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period, s.traffic
+        )
+        none = np.zeros((0, self.spec.size), dtype=np.float32)
+        self.trials = Trials(none, none)
+        self._for_validation = iter(VALIDATION_SEEDS)  # maps that are not begun
+        self.outcomes: list[Outcome] = []  # of the last step, for statistics
+
+    # ------------------------------------------------------------------------------------------------------ the loop
+
+    @abstractmethod
+    def step(self) -> dict[str, float]:
+        """One step. Returns its row of the history, without the wall clock's columns."""
+
+    @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """How far it has come: the settings' `counts`."""
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """What summary.json has of this learner alone."""
+
+    @abstractmethod
+    def way(self) -> tuple[float, float, str]:
+        """How far the run is, how far it goes at most (0: nobody knows), and in what unit."""
+
+    @abstractmethod
+    def describe(self, row: dict[str, float]) -> str:
+        """A row of the history in words."""
+
+    @property
+    def steps(self) -> int:
+        """Steps that are done."""
+        return len(self.history)
+
+    def done(self) -> bool:
+        """Whether there is nothing left to learn."""
+        return self.settings.ended({"solved": self.solved, **self.counts()})
+
+    def conclude(self) -> None:
+        """Find out about who is still on trial when a run ends, and then about the latest.
+
+        What a checkpoint holds is from before: a run that is extended goes on as if it had never ended.
+        """
+        self._settle_trials()
+        if self.champion is None:
+            raise PoolError("there is no champion: each network that was to be validated killed its workers")
+
+    def _settle_trials(self) -> None:
+        self._finish_trials()
+        if not self.solved:
+            self.trials.enter(self.latest(), self.steps - 1)
+            self._finish_trials()
+
+    def _finish_trials(self) -> None:
+        while len(self.trials) and not self.solved:
+            self._validate()
+
+    def _build_ahead(self, seeds: Sequence[int]) -> None:
+        """Begin to build maps that training needs soon, and some of validation's."""
+        self.maps.ahead(seeds)
+        self.maps.ahead(list(itertools.islice(self._for_validation, MAPS_A_STEP)), later=True)
+
+    def latest(self) -> np.ndarray:
+        """Networks of the last step that are tried if they were not, float32 [k, genes]."""
+        untried = [] if self.champion else self.elites[-1:]
+        return np.array(untried, dtype=np.float32).reshape(-1, self.spec.size)
+
+    # ------------------------------------------------------------------------------------------------- evaluating
+
+    def _evaluate(
+        self, stage: str, bred: Bred, episodes: Episodes, limits: Limits,
+        asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
+    ) -> Outcome:  # fmt: skip
+        task = Task(
+            policy=self.settings.policy,
+            parents=bred.parents,
+            key=bred.key,
+            mutation=bred.mutation,
+            episodes=episodes.rows,
+            worlds=episodes.worlds,
+            maps=tuple((self.settings.scenario, map_of(self.settings.scenario, seed)) for seed in episodes.maps),
+            limits=limits,
+            config=self.sim,
+        )
+        progress = self.on_progress
+        tell = (lambda k, n: progress(stage, k, n)) if progress else None
+        outcome = self.pool.evaluate(task, bred.recipes, tell, asked, meanwhile)
+        self.outcomes.append(outcome)
+        self.car_steps += int(outcome.results["steps"].sum())
+        self._tell_of_lost(stage, outcome)
+        return outcome
+
+    def _tell_of_lost(self, stage: str, brought: Outcome | Collected) -> None:
+        self.lost_chunks += len(brought.warnings)
+        for text in brought.warnings:
+            self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
+
+    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits) -> Outcome:
+        """Results [n, e] of given genomes [n, genes]: recipes that are plain copies."""
+        return self._evaluate(stage, unmodified(genomes), episodes, limits)
+
+    def _trial(self) -> tuple[Episodes, list[Chunk]]:
+        """Validation's episodes, and who of `trials` drives which of them."""
+        episodes = self.curriculum.validation().within(self.curriculum.goal_limits())
+        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
+        parts = [
+            Chunk(slice(k, len(self.trials)), slice(stage, len(episodes.rows))),
+            Chunk(slice(0, k), slice(0, stage)),
+        ]
+        return episodes, [part for part in parts if part.rows.stop > part.rows.start]
+
+    def _validate(self) -> None:
+        """Go on with the trials, with nothing beside them."""
+        episodes, asked = self._trial()
+        bred = unmodified(np.concatenate([self.trials.first, self.trials.last]))
+        tried = self._evaluate("validate", bred, episodes, self.curriculum.goal_limits(), asked=asked)
+        self._judge(tried.results, tried.lost)
+
+    def _judge(self, results: np.ndarray, lost: np.ndarray) -> None:
+        """Find out whether `trials.last` beats the champion, and who of `trials.first` is tried next.
+
+        Args: RESULT [members, validation], zero where a member's stage has no such episode; and bool [members], who
+            was lost: it is neither.
+        """
+        trials, score = self.trials, self.curriculum.validation_score
+        self.validation_steps += int(results["steps"].sum())
+        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
+        if len(trials.last) and not lost[k]:
+            whole = results[k:, stage:]
+            total, distance = float(score(whole)[0]), float(whole["distance"].mean())
+            if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
+                rate = float(success_rate(whole)[0])
+                self.champion = Champion(trials.last[0].copy(), total, rate, distance, trials.last_generation)
+            self.solved = self.champion.score >= self.settings.until
+        trials.last = trials.first[:0]
+        if not lost[:k].all():
+            first = results[:k, :stage]
+            scores = np.where(lost[:k], -1.0, score(first))
+            best = int(np.lexsort((first["distance"].mean(axis=1), scores))[-1])
+            if self.champion is None or scores[best] >= self.champion.score - 0.02:
+                trials.last, trials.last_generation = trials.first[best : best + 1], trials.first_generation
+        trials.first = trials.first[:0]
+
+    def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
+        """Add the wall clock's columns to a row."""
+        row["wall_s"] = wall_s
+        steps, seconds = row["car_steps"], wall_s
+        if previous is not None:
+            steps, seconds = steps - previous["car_steps"], wall_s - previous["wall_s"]
+        row["car_steps_per_s"] = steps / max(seconds, 1e-9)
+
+    def held_out(self) -> dict[str, float]:
+        """The champion on roads nobody was trained or chosen on: the same 64 episodes for every run of a scenario."""
+        assert self.champion is not None
+        before = self.car_steps
+        episodes = held_out_episodes(self.maps, self.settings.traffic)
+        driven = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
+        some_left(driven.lost, "held out")
+        self.car_steps = before  # not part of learning
+        return summarise(driven.results[0], self.sim.episode.control_period)
+
+    # ------------------------------------------------------------------------------------------------------- state
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All that an exact resume needs: arrays and plain numbers."""
+        rows = [[row[name] for name in self.columns] for row in self.history]
+        champion = self.champion
+        arrays: dict[str, np.ndarray] = {
+            "history": np.array(rows, dtype=np.float64).reshape(-1, len(self.columns)),
+            "elites": np.array(self.elites, dtype=np.float32).reshape(-1, self.spec.size),
+            "trials_first": self.trials.first,
+            "trials_last": self.trials.last,
+            "trials_tried": self.trials.tried,
+            "champion": genes_of(champion),
+        }
+        meta: dict[str, Any] = {
+            "solved": self.solved,
+            "lost_chunks": self.lost_chunks,
+            "validation_steps": self.validation_steps,
+            **self.counts(),
+            "columns": list(self.columns),
+            "trials": [self.trials.first_generation, self.trials.last_generation],
+            "champion": told(champion),
+        }
+        return arrays, meta
+
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        """Take up a state. Raises CheckpointError with one line where it does not fit this run."""
+        try:
+            self._restore(arrays, meta)
+            if self.solved and self.champion is None:
+                raise ValueError("it is solved, and has no champion")
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
+
+    def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        """`restore`; what does not fit raises any of the errors that it names."""
+        genes = self.spec.size
+        history, elites = arrays["history"], arrays["elites"]
+        first, last, tried = arrays["trials_first"], arrays["trials_last"], arrays["trials_tried"]
+        fits = (
+            meta["columns"] == list(self.columns)
+            and history.shape == (len(elites), len(self.columns))
+            and elites.shape == (len(elites), genes)
+            and elites.dtype == np.float32
+            and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
+            and len(first) <= MAX_TRIED
+            and len(last) <= 1
+            and tried.ndim == 1
+            and len(tried) <= TRIED_KEPT
+            and tried.dtype == np.uint64
+        )
+        if not fits or not np.isfinite(history).all():
+            raise ValueError("its parts do not fit each other")
+        self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
+        self.lost_chunks, self.validation_steps = int(meta["lost_chunks"]), int(meta["validation_steps"])
+        self.history = [dict(zip(self.columns, row.tolist(), strict=True)) for row in history]
+        self.elites = list(elites)
+        first_generation, last_generation = (int(k) for k in meta["trials"])
+        self.trials = Trials(first, last, first_generation, last_generation, tried)
+        self.champion = champion_of(arrays["champion"], meta["champion"], genes)
+        self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
+
+    def history_csv(self) -> bytes:
+        """history.csv: a row a step."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([self.step_name, *self.columns])
+        for k, row in enumerate(self.history):
+            writer.writerow([k, *(repr(row[name]) for name in self.columns)])
+        return text.getvalue().encode()
+
+
+def genes_of(champion: Champion | None) -> np.ndarray:
+    """A champion's genome, float32 [genes], or [0] of none."""
+    return champion.genome if champion else np.zeros(0, dtype=np.float32)
+
+
+def told(champion: Champion | None) -> list[float]:
+    """What a checkpoint tells of a champion beside its genome."""
+    return [champion.score, champion.success_rate, champion.distance_m, champion.generation] if champion else []
+
+
+def champion_of(genome: np.ndarray, figures: list[float], genes: int) -> Champion | None:
+    """The champion that was `told` of, if any. Raises: ValueError where it cannot have been."""
+    if genome.shape != (genes if figures else 0,) or genome.dtype != np.float32 or not np.isfinite(figures).all():
+        raise ValueError("its parts do not fit each other")
+    if not figures:
+        return None
+    score, rate, distance, found = figures
+    return Champion(genome, float(score), float(rate), float(distance), int(found))
+
+
+class Bred(NamedTuple):
+    """Members to be driven: their recipes and the genomes that these refer to."""
+
+    parents: np.ndarray  # float32 [p, genes]
+    recipes: np.ndarray  # RECIPE [n]
+    key: int = 0
+    mutation: Mutation = Mutation()
+
+    def and_copies(self, genomes: np.ndarray) -> Bred:
+        """These, and then plain copies of genomes float32 [k, genes]."""
+        copies = recipes(len(genomes))
+        copies["kind"], copies["a"] = Kind.COPY, np.arange(len(self.parents), len(self.parents) + len(genomes))
+        return self._replace(
+            parents=np.concatenate([self.parents, genomes]), recipes=np.concatenate([self.recipes, copies])
+        )
+
+
+def unmodified(genomes: np.ndarray) -> Bred:
+    """Plain copies of genomes float32 [n, genes]."""
+    return Bred(genomes[:0], recipes(0)).and_copies(genomes)
+
+
+def some_left(lost: np.ndarray, stage: str) -> None:
+    """Raises: PoolError where all of lost, bool [n], are: there is nothing to go on with."""
+    if lost.all():
+        raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")
+
+
+def held_out_episodes(maps: Maps, traffic: int) -> Episodes:
+    """The 64 episodes that are reported on and never chosen on."""
+    return spread_starts(maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, traffic)
+
+
+def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
+    """Means over the episodes of one member: RESULT [e]."""
+    return {
+        "episodes": len(results),
+        "success_rate": float((results["end"] == End.SUCCESS).mean()),
+        "distance_m": float(results["distance"].mean()),
+        "speed_mps": made_good(results, period_s),
+        "collision_rate": float((results["end"] == End.COLLISION).mean()),
+    }
+
+
+def made_good(results: np.ndarray, period_s: float) -> float:
+    """Mean over episodes of the speed made good: new ground over time, in m/s."""
+    seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
+    return float((results["distance"] / seconds).mean())
+
+
+def now() -> float:
+    """The clock that durations are taken with; nothing is decided by it."""
+    return time.perf_counter()

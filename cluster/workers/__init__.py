@@ -1,0 +1,1 @@
+"""Where members are evaluated: tasks, workers, pools and the dispatch of chunks."""

@@ -1,0 +1,191 @@
+"""Compiling the kernels before they are needed: once for all processes, and on more than one core.
+
+Numba compiles one function at a time in a process. So processes of their own compile what a run needs while this one
+starts Ray, and all others then load it from the cache on disk (`gridsim.jit`).
+
+Run as `python -m cluster.workers.kernels kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it prints a line
+when what a run needs first is there, and goes on with what is needed at the run's end. `python -m cluster.workers.kernels
+everything` compiles what the learners need by default on all roads, for an image that is to be started often.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import get_args
+
+import llvmlite.binding
+import numpy as np
+
+from cluster.workers.pool import answer
+from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.workers.worker import CollectTask, Task, Worker
+from evolution.search.breeding import Kind, Mutation
+from evolution.networks.policy import Observation, PolicySpec
+from evolution.episodes.rollout import EPISODE, Limits, trajectory
+from evolution.search.base import recipes
+from gridsim.config import SimConfig
+from gridsim.car.ego import FIELDS
+from gridsim.jit import CACHE_FOLDER, CONFIG
+from gridsim.maps.scenarios import REGISTRY, blank, build, default_traffic, is_map_file, sample_starts
+from gridsim.envs.simulator import views
+from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.traffic.world import LANE, spawn
+
+STEPS = 1  # of the episodes that are driven to compile what drives them
+
+
+@dataclass
+class Warming:
+    """Processes that compile, and the file that says that it is done."""
+
+    done: Path
+    processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    def wait(self) -> None:
+        """Wait for what a run needs first. What such a process could not do, this one does when it comes to it."""
+        ready = [process.stdout is not None and process.stdout.readline() for process in self.processes]
+        if all(ready):
+            with contextlib.suppress(OSError):
+                self.done.touch()
+
+    def stop(self) -> None:
+        """End what still runs."""
+        for process in self.processes:
+            process.kill()
+            process.wait()
+            if process.stdout is not None:
+                process.stdout.close()
+        self.processes.clear()
+
+
+def begin(settings: RunSettings) -> Warming:
+    """Begin to compile what such a run needs, if it is not in the cache."""
+    kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
+    road = "file" if is_map_file(settings.scenario) else settings.scenario
+    traffic = "traffic" if settings.traffic else "alone"
+    # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
+    cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()
+    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}")
+    if warming.done.exists():
+        return warming
+    what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
+    # Neither the folder it is started from (-P) nor Ctrl-C is its own: it is stopped by `stop`.
+    for part in ("kernels", "roads"):
+        with contextlib.suppress(OSError):
+            warming.processes.append(
+                subprocess.Popen(
+                    [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.DEVNULL,
+                    start_new_session=True,
+                )
+            )
+    return warming
+
+
+def _absent(traffic: int) -> np.ndarray:
+    """Worlds float32 [1, traffic, fields] of cars that are not there."""
+    worlds = np.zeros((1, traffic, TRAFFIC_FIELDS), dtype=np.float32)
+    worlds[:, :, LANE] = -1.0
+    return worlds
+
+
+def compile_kernels(policy: str, traffic: int, command: str) -> None:
+    """Compile, or load from the cache, what evaluates members, and for the DQN also what collects experience."""
+    made = recipes(2)
+    made["kind"] = Kind.NEW
+    config = SimConfig()
+    task = Task(
+        policy=policy,
+        parents=np.zeros((1, PolicySpec.parse(policy).size), dtype=np.float32),
+        key=1,
+        mutation=Mutation(),
+        episodes=np.zeros(1, dtype=EPISODE),
+        worlds=_absent(traffic),
+        maps=(),
+        limits=Limits(1.0, STEPS),
+        config=config,
+    )
+    answer(Worker(), task, [blank(config)], made.tobytes(), 0, 1)
+    if command == DqnSettings.command:
+        Worker().collect(
+            CollectTask(
+                policy=policy,
+                weights=task.parents[0].copy(),
+                episodes=task.episodes,
+                worlds=task.worlds,
+                maps=(),
+                epsilons=np.zeros(1, dtype=np.float32),
+                keys=np.zeros(1, dtype=np.uint64),
+                limits=task.limits,
+                config=config,
+            ),
+            [blank(config)], 0, 1,
+        )  # fmt: skip
+
+
+def compile_film(policy: str, traffic: int) -> None:
+    """The same for pictures and films of a drive."""
+    from gridsim.view.render import Renderer
+
+    config, spec = SimConfig(), PolicySpec.parse(policy)
+    road, genome, world = blank(config), np.zeros(spec.size, dtype=np.float32), _absent(traffic)
+    start = np.zeros(5, dtype=np.float32)
+    _, cars, worlds = trajectory(spec, genome, road, start, Limits(1.0, STEPS), config, world[0])
+    ranges = views(road, cars, worlds, config)
+    Renderer(road, (64, 64)).draw(np.zeros(FIELDS, dtype=np.float32), ranges=ranges[0], path=cars[:, :2], text="0")
+
+
+def compile_roads(scenario: str, traffic: int) -> None:
+    """The same for building a scenario's maps."""
+    road = build(scenario, 0)
+    starts = sample_starts(road, 1, np.random.default_rng(0))
+    spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig().traffic)
+
+
+def everything_by_default() -> list[RunSettings]:
+    """Settings that need, between them, all that the learners compile on the roads by default."""
+    return [
+        kind(scenario=scenario, traffic=traffic, observation=observation)
+        for scenario in REGISTRY
+        for traffic in sorted({0, default_traffic(scenario)})
+        for kind in (EvolveSettings, DqnSettings)
+        for observation in get_args(Observation)
+    ]
+
+
+def compile_everything() -> None:
+    """Compile all that; a process that fails ends it. Raises: CalledProcessError."""
+    for settings in everything_by_default():
+        warming = begin(settings)
+        warming.wait()
+        for process in warming.processes:
+            process.communicate()
+            if process.returncode:
+                raise subprocess.CalledProcessError(process.returncode, process.args)
+        print(warming.done.name, flush=True)
+
+
+def main(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
+    """What the process does."""
+    if part == "kernels":
+        compile_kernels(policy, traffic, command)
+        print("ready", flush=True)
+    else:
+        compile_roads(scenario, traffic)
+        print("ready", flush=True)
+        os.nice(10)
+        compile_film(policy, traffic)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:] == ["everything"]:
+        compile_everything()
+        sys.exit()
+    main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]), sys.argv[5])

@@ -1,0 +1,1 @@
+"""The DQN learner, its replay buffer and its experience."""

@@ -1,0 +1,189 @@
+"""Experience: what episodes bring to a learner, as arrays, and the fixed point in which observations are kept.
+
+Episodes follow one another. An episode of T steps has T + 1 rows. Row t < T holds the observation before step t, its
+action, the reward of that step, and in `ends` 0, but for row T - 1, where it is the `gridsim.car.ego.End` that the step led
+to. Row T holds the observation after the last step, the action NO_ACTION, reward 0 and 0 in `ends`. COLLISION, IDLE and
+SUCCESS terminate: nothing comes after them. TIME truncates: what would have come is estimated from row T.
+
+An observation is what the network sees, small enough to keep a million of them:
+
+* rays: int16 [inputs], what `policy.encode` makes, in units of 1/4096 and clipped to [-8, 8);
+* grid: uint8 [1602], one frame, and then the speed input as little-endian int16 in the same units. A cell takes two
+  bits, 0, 1 and 2 for unknown, free and occupied: cell k is bits 2 (k mod 4) and the next of byte k // 4. The frames
+  of a stack are those of the rows before; those that would be before the episode's first row are that row's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from evolution.networks.policy import SPEED_SCALE, CnnSpec, PolicySpec
+from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
+from gridsim.jit import leaf, njit
+from gridsim.maps.roads import freeze
+
+_F = np.float32
+
+NO_ACTION = 255  # of an episode's last row
+UNITS = _F(4096.0)  # of the fixed point, to 1
+OLDEST = 255  # an age that stands for all greater ones
+_AREA = CELLS * CELLS
+_FRAME = _AREA // 4  # bytes
+_LEAST, _GREATEST = _F(-32768.0), _F(32767.0)
+# What a network sees of a byte's four cells, and of what would be a fourth code: float32 [256, 4].
+_SEEN = np.array([UNKNOWN, FREE, OCCUPIED, OCCUPIED]).astype(np.float32) * _F(1.0 / 255.0)
+_CELLS_OF = freeze(_SEEN[np.arange(256)[:, None] >> np.arange(0, 8, 2) & 3])
+
+
+class Experience(NamedTuple):
+    """Episodes, one after the other, as arrays with a row a step and one more for each episode; see above."""
+
+    observations: np.ndarray  # int16 [rows, inputs] of rays, uint8 [rows, 1602] of grids
+    actions: np.ndarray  # uint8 [rows]
+    rewards: np.ndarray  # float32 [rows]
+    ends: np.ndarray  # uint8 [rows], End
+
+
+def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
+    """What a row of `Experience.observations` is for such a policy."""
+    if isinstance(spec, CnnSpec):
+        return np.dtype(np.uint8), _FRAME + 2
+    return np.dtype(np.int16), spec.inputs
+
+
+def empty(spec: PolicySpec, rows: int) -> Experience:
+    """Room for so many rows; what is in it is not defined."""
+    dtype, width = observation_dtype_and_width(spec)
+    return Experience(
+        np.empty((rows, width), dtype=dtype),
+        np.empty(rows, dtype=np.uint8),
+        np.empty(rows, dtype=np.float32),
+        np.empty(rows, dtype=np.uint8),
+    )
+
+
+def join(spec: PolicySpec, parts: Sequence[Experience]) -> Experience:
+    """The episodes of all parts, in that order."""
+    if not parts:
+        return empty(spec, 0)
+    return Experience(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def to_bytes(experience: Experience) -> bytes:
+    """Experience as bytes for `from_bytes`: rewards, observations, actions, ends (aligned if the bytes are)."""
+    observations, actions, rewards, ends = (np.ascontiguousarray(array) for array in experience)
+    return b"".join([rewards.data, observations.data, actions.data, ends.data]) if len(rewards) else b""
+
+
+def from_bytes(spec: PolicySpec, raw: bytes | memoryview) -> Experience:
+    """What `to_bytes` made of the experience of such a policy; read-only and without a copy.
+
+    Raises: ValueError where the bytes are not whole rows.
+    """
+    dtype, width = observation_dtype_and_width(spec)
+    row = 4 + dtype.itemsize * width + 1 + 1
+    rows, rest = divmod(len(raw), row)
+    if rest:
+        raise ValueError(f"experience of {spec} has {row} bytes a row; {len(raw)} bytes are not whole rows")
+    rewards = np.frombuffer(raw, np.float32, rows)
+    observations = np.frombuffer(raw, dtype, rows * width, 4 * rows).reshape(rows, width)
+    actions = np.frombuffer(raw, np.uint8, rows, (row - 2) * rows)
+    ends = np.frombuffer(raw, np.uint8, rows, (row - 1) * rows)
+    return Experience(observations, actions, rewards, ends)
+
+
+def ages(experience: Experience) -> np.ndarray:
+    """How many rows of its episode come before each row, at most OLDEST: uint8 [rows]."""
+    row = np.arange(len(experience.actions))
+    begins = np.zeros(len(row), dtype=np.intp)
+    begins[1:] = np.where(experience.actions[:-1] == NO_ACTION, row[1:], 0)
+    return np.minimum(row - np.maximum.accumulate(begins), OLDEST).astype(np.uint8)
+
+
+@leaf
+def fixed(value):
+    """A network's input in fixed point: the nearest int16, clipped."""
+    return np.int16(min(max(math.floor(value * UNITS + _F(0.5)), _LEAST), _GREATEST))
+
+
+@leaf
+def keep_rays(inputs, row):
+    """Keep the inputs float32 [inputs or more] of a network on rays as row int16 [inputs]."""
+    for i in range(row.shape[0]):
+        row[i] = fixed(inputs[i])
+
+
+@leaf
+def keep_grid(grid, speed, row):
+    """Keep a grid uint8 [6400] and a speed (m/s) as row uint8 [1602]."""
+    for i in range(_FRAME):
+        byte = 0
+        for j in range(4):  # the codes 0, 127 and 255 become 0, 1 and 2
+            byte |= (int(grid[4 * i + j]) + 1 >> 7) << 2 * j
+        row[i] = byte
+    bits = int(fixed(speed / SPEED_SCALE - _F(1.0))) & 0xFFFF
+    row[_FRAME], row[_FRAME + 1] = bits & 0xFF, bits >> 8
+
+
+@njit(nogil=True)
+def _unpack_rays(observations, rows, inputs):
+    scale = _F(1.0) / UNITS
+    for n in range(rows.shape[0]):
+        row = observations[rows[n]]
+        for i in range(inputs.shape[1]):
+            inputs[n, i] = row[i] * scale
+
+
+@njit(nogil=True)
+def _unpack_grids(observations, rows, ages, cells, frames, inputs):
+    for n in range(rows.shape[0]):
+        for k in range(frames):
+            row = observations[(rows[n] - min(frames - 1 - k, ages[n])) % observations.shape[0]]
+            at = k * _AREA
+            for i in range(_FRAME):
+                seen = cells[row[i]]
+                for j in range(4):
+                    inputs[n, at + 4 * i + j] = seen[j]
+        row = observations[rows[n]]
+        bits = int(row[_FRAME]) | int(row[_FRAME + 1]) << 8
+        inputs[n, frames * _AREA] = _F((bits ^ 0x8000) - 0x8000) / UNITS
+
+
+def unpack(
+    spec: PolicySpec,
+    observations: np.ndarray,
+    rows: np.ndarray,
+    ages: np.ndarray | None = None,
+    out: np.ndarray | None = None,
+) -> np.ndarray:
+    """What a network sees at some rows: float32 [n, spec.inputs]; of grids the frames, the newest last, then the speed.
+
+    Args:
+        observations: as in `Experience`, or a ring of them, in which row 0 follows the last one.
+        rows: int64 [n].
+        ages: [n], as `ages` gives them, of these rows; needed for grids. Where a ring has lost the beginning of an
+            episode, the age is the number of its rows that are left before this one.
+        out: float32 [n, spec.inputs], where it is to be written; None is a new array.
+    Raises: ValueError with one line where shapes or types do not fit. Rows are not checked.
+    """
+    dtype, width = observation_dtype_and_width(spec)
+    if observations.dtype != dtype or observations.ndim != 2 or observations.shape[1] != width:
+        kept = f"{observations.dtype} {observations.shape}"
+        raise ValueError(f"observations of {spec} are kept as {dtype} [rows, {width}], not {kept}")
+    rows = np.ascontiguousarray(rows, dtype=np.int64)
+    if out is None:
+        out = np.empty((len(rows), spec.inputs), dtype=np.float32)
+    if out.shape != (len(rows), spec.inputs) or out.dtype != np.float32:
+        wanted = f"float32 [{len(rows)}, {spec.inputs}]"
+        raise ValueError(f"the inputs of {spec} are written to {wanted}, not {out.dtype} {out.shape}")
+    if isinstance(spec, CnnSpec):
+        if ages is None or len(ages) != len(rows):
+            raise ValueError("frames are stacked by the rows' ages; give as many as rows")
+        _unpack_grids(observations, rows, np.ascontiguousarray(ages, dtype=np.int64), _CELLS_OF, spec.frames, out)
+    else:
+        _unpack_rays(observations, rows, out)
+    return out

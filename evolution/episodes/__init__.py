@@ -1,0 +1,1 @@
+"""Which episodes are driven, and driving them."""

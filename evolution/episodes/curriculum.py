@@ -1,0 +1,257 @@
+"""How the task grows: which episodes a generation meets, and who becomes champion.
+
+Distance and speed alone are deceptive under limited grip: the best member is flat out into the first bend. So episodes
+begin short and double in length as the leader (the best genome known before a generation) succeeds. Half of them start
+just before a crash of a recent leader, where there is most to learn. A generation's members are in groups that meet
+different episodes, so that selection sees many, though each member drives few. The champion is chosen on validation
+maps that nobody is trained on.
+
+State is arrays and numbers only; all randomness comes from (seed, generation).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from evolution.episodes.starts import Episodes, lane_starts
+from evolution.episodes.rollout import EPISODE, Limits
+from gridsim.car.ego import End
+from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, Scenario
+from gridsim.traffic.world import FIELDS, LANE, check_worlds
+
+HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
+HELD_OUT_EPISODES = 64
+VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
+TRIED_KEPT = 256  # members that are not validated again
+
+
+class CrashError(ValueError):
+    """A remembered crash, from a checkpoint, that cannot be started from; the message is one line."""
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    """The curriculum's parameters."""
+
+    maps: int = 16  # training maps
+    first_maps: int = 4  # of these, how many the first generation meets ...
+    map_generations: int = 4  # ... and after how many there is one more, so that none needs to be waited for
+    groups: int = 8  # of members, each with episodes of its own
+    starts: int = 1  # new episodes of a group and generation
+    crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
+    crash_target: float = 120.0  # m, their length
+    crash_memory: int = 64  # crashes that are remembered
+    crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
+    rewind: int = 64  # control steps before the crash
+    leader_episodes: int = 16  # that the leader drives in each generation
+    leader_stretch: float = 2.5  # their length, in targets
+    first_target: float = 150.0  # m, length of the first episodes
+    last_target: float = 400.0  # m; what is learned further on is learned as well from another start
+    growth: float = 0.6  # share of its episodes in which the leader must reach the target before it doubles
+    pace: float = 7.0  # m/s that the time limit of a training episode allows for; this and champion_pace: seamless
+    slack: float = 3.0  # s, added to it
+    promising: float = 0.5  # share of its episodes that a leader must finish before it is validated ...
+    latest: int = 4  # ... in so many generations together
+    validation_share: float = 0.25  # of all car-steps, above which validation waits
+    first_validation: int = 48  # episodes of validation's first stage
+    validation: int = 256  # ... and in all
+    champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
+
+
+def spread_starts(build: Callable[[int], Scenario], seeds: range, episodes: int, traffic: int = 0) -> Episodes:
+    """Episodes over the maps of `seeds` in turn; the same for every run of a scenario with as much traffic."""
+    rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
+    used = np.arange(episodes) % len(seeds)
+    return Episodes(list(seeds), *lane_starts([build(seed) for seed in seeds], used, rng, traffic))
+
+
+class Curriculum:
+    """Episodes and champions of one run."""
+
+    def __init__(
+        self,
+        config: CurriculumConfig,
+        seed: int,
+        build: Callable[[int], Scenario],
+        target_m: float,
+        time_s: float,
+        period_s: float,
+        traffic: int = 0,
+    ):
+        self.config, self.seed, self.build = config, seed, build
+        self.traffic, self.crowd = traffic, round(config.crowd * traffic)
+        self.goal, self.period = target_m, period_s
+        self.goal_steps = round(time_s / period_s)
+        self.target = min(config.first_target, target_m)
+        self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
+        self._validation: Episodes | None = None
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
+        self.map_seeds = [
+            int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
+        ]
+
+    def _rng(self, generation: int, purpose: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
+
+    def maps_in_use(self, generation: int) -> int:
+        """Training maps in use: they come in one by one."""
+        return min(self.config.maps, self.config.first_maps + generation // self.config.map_generations)
+
+    def limits(self) -> Limits:
+        """Of training episodes."""
+        return Limits(self.target, self._steps(self.target))
+
+    def leader_limits(self) -> Limits:
+        """Of the leader's episodes: longer, so that it meets what members do not."""
+        target = min(self.config.leader_stretch * self.target, self.goal)
+        return Limits(target, self._steps(target))
+
+    def _steps(self, target: float) -> int:
+        """Control steps that a training episode of so many m is given."""
+        return math.ceil((target / self.config.pace + self.config.slack) / self.period)
+
+    def goal_limits(self) -> Limits:
+        """Of a full episode, as those of validation and the held-out ones are."""
+        return Limits(self.goal, self.goal_steps)
+
+    def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Training maps [count], by their place among `map_seeds`; different ones if there are as many."""
+        n = self.maps_in_use(generation)
+        return rng.choice(n, count, replace=count > n)
+
+    def _new_starts(self, maps: np.ndarray, rng: np.random.Generator) -> Episodes:
+        """New episodes on training maps [e]."""
+        used, local = np.unique(maps, return_inverse=True)
+        seeds = [self.map_seeds[m] for m in used]
+        return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
+
+    def episodes(self, generation: int) -> Episodes:
+        """What a generation meets, group by group: new episodes, then some that start before crashes.
+
+        Each group has as many of either.
+        Raises: CrashError if the traffic of such a start does not fit its map.
+        """
+        config, rng = self.config, self._rng(generation, 0)
+        maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
+        fresh = self._new_starts(np.concatenate(maps), rng)
+        if not len(self.crashes) or not config.crash_starts:
+            return fresh
+        chosen = self._rng(generation, 1).integers(len(self.crashes), size=config.groups * config.crash_starts)
+        crashes, worlds = self.crashes[chosen].copy(), self.crash_worlds[chosen]
+        self._check(crashes["map"], worlds)
+        target = min(config.crash_target, self.target)
+        crashes["target"], crashes["steps"] = target, self._steps(target)
+        seeds = [self.map_seeds[m] for m in crashes["map"]]
+        used = sorted({*fresh.maps, *seeds})
+        fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
+        crashes["map"] = np.searchsorted(used, seeds)
+        return Episodes(used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, worlds))
+
+    def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
+        """Each group's share of each kind [e, ...], the groups one after another."""
+        n = self.config.groups
+        parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
+        return np.concatenate(np.concatenate(parts, axis=1))
+
+    def starts(self, batch: int, count: int) -> Episodes:
+        """So many new episodes on the training maps, for a learner that takes them in batches."""
+        return self._drawn(batch, count, 3)
+
+    def _drawn(self, generation: int, count: int, purpose: int) -> Episodes:
+        rng = self._rng(generation, purpose)
+        return self._new_starts(self._some_maps(generation, count, rng), rng)
+
+    def _check(self, maps: np.ndarray, worlds: np.ndarray) -> None:
+        """Refuse traffic [n, cars, fields] that is not on its map [n]; only here are the maps at hand for nothing."""
+        if worlds.shape[1]:
+            for m in np.unique(maps):
+                seed = self.map_seeds[m]
+                try:
+                    check_worlds(worlds[maps == m], self.build(seed).network)
+                except ValueError as error:
+                    raise CrashError(f"a crash in the checkpoint does not fit map {seed}: {error}") from error
+
+    def leader_episodes(self, generation: int) -> Episodes:
+        """What the leader drives beside a generation; the states before its crashes are wanted back."""
+        episodes = self._drawn(generation, self.config.leader_episodes, 2).within(self.leader_limits())
+        episodes.rows["rewind"] = self.config.rewind
+        return episodes
+
+    def followed(self, episodes: Episodes, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray) -> None:
+        """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
+
+        Args: `leader_episodes`; RESULT [e]; the states some steps before each end, float32 [e, 5], and the traffic of
+        then, float32 [e, cars, world.FIELDS].
+        """
+        crashed = np.isin(results["end"], (End.COLLISION, End.IDLE)) & (results["steps"] > 10)
+        if crashed.any():
+            new = np.zeros(np.count_nonzero(crashed), dtype=EPISODE)
+            seeds = np.array(episodes.maps)[episodes.rows["map"][crashed]]
+            new["map"] = [self.map_seeds.index(seed) for seed in seeds]
+            new["start"] = rewound[crashed]
+            kept = self.config.crash_memory
+            self.crashes = np.concatenate([self.crashes, new])[-kept:]
+            self.crash_worlds = np.concatenate([self.crash_worlds, worlds[crashed]])[-kept:]
+        if (results["distance"] >= self.target).mean() >= self.config.growth:
+            self.target = min(2.0 * self.target, self.config.last_target, self.goal)
+
+    def validation(self) -> Episodes:
+        """What champions are chosen on, the same for every run of the scenario: the traffic that is asked for.
+
+        It is driven beside a generation's episodes, so that as many cars belong to it; the others are not there.
+        """
+        if self._validation is None:
+            maps, rows, worlds = spread_starts(self.build, VALIDATION_SEEDS, self.config.validation, self.traffic)
+            absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
+            absent[:, :, LANE] = -1.0
+            self._validation = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
+        return self._validation
+
+    def validation_score(self, results: np.ndarray) -> np.ndarray:
+        """How good members are, in [0, 1], by results [n, e] of validation: success, worth less below the pace."""
+        metres = results["distance"].astype(np.float64).sum(axis=1)
+        speed = metres / np.maximum(results["steps"].sum(axis=1) * self.period, 1e-9)
+        return success_rate(results) * np.minimum(speed / self.config.champion_pace, 1.0)
+
+
+@dataclass
+class Trials:
+    """Members that are being validated, beside the evaluation of the generation that comes next.
+
+    Those of `first` are on validation's first stage; the best of them is then `last`, and is judged by the episodes of
+    the second stage alone, since it was chosen on the first.
+
+    Attributes:
+        first: genomes float32 [k, genes].
+        first_generation: the one that they come from.
+        last: genomes float32 [0 or 1, genes].
+        last_generation: the one that it comes from.
+        tried: uint64 [n], digests of whom the first stage has seen lately.
+    """
+
+    first: np.ndarray
+    last: np.ndarray
+    first_generation: int = -1
+    last_generation: int = -1
+    tried: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
+
+    def __len__(self) -> int:
+        return len(self.first) + len(self.last)
+
+    def enter(self, genomes: np.ndarray, generation: int) -> None:
+        """Let those of [k, genes] try who did not lately."""
+        digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
+        new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]
+        self.first, self.first_generation = genomes[new], generation
+        entered = np.array([digests[k] for k in new], dtype=np.uint64)
+        self.tried = np.concatenate([self.tried, entered])[-TRIED_KEPT:]
+
+
+def success_rate(results: np.ndarray) -> np.ndarray:
+    """Share of episodes [n] that reached their target, from results [n, e]."""
+    return (results["end"] == End.SUCCESS).mean(axis=1)

@@ -1,0 +1,393 @@
+"""Episodes of whole populations: the fused loop sense -> network -> act -> advance, until done.
+
+With `collecting`, which shares the parts of that loop, the only user of the simulator within `evolution`. Pure
+functions: what is returned depends on the arguments alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from evolution.networks import convnet
+from evolution.networks.policy import (
+    RAYS,
+    CnnSpec,
+    MlpSpec,
+    PolicySpec,
+    decide,
+    encode,
+    pack,
+    packed_size,
+    scratch_size,
+)
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.car.ego import (
+    COS,
+    DISTANCE,
+    FIELDS,
+    PACED,
+    SIN,
+    SPEED,
+    STEERING,
+    STEPS,
+    X,
+    Y,
+    drive,
+    look,
+    place,
+)
+from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
+from gridsim.jit import leaf, njit
+from gridsim.maps.network import Network
+from gridsim.maps.roads import VISIT_CELL, Road, freeze
+from gridsim.maps.scenarios import Scenario
+from gridsim.sensing.rays import LANES, fan
+from gridsim.traffic.behaviour import Drivers, drivers, flow
+from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
+
+_F = np.float32
+
+#: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
+#: its own target (m) and limit (control steps), where these are not 0; control steps before its end whose state is
+#: wanted back, 0 for none.
+EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
+
+#: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
+RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
+
+
+MAX_STEPS = 65_535
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Where an episode ends if nothing happens: m of new ground, and control steps."""
+
+    target: float
+    steps: int
+
+
+class Eye(NamedTuple):
+    """What a policy on the occupancy grid needs beside its genome."""
+
+    table: GridTable
+    room: convnet.Scratch
+    grid: np.ndarray  # uint8 [cells]
+
+
+def eye_of(spec: PolicySpec, config: SimConfig) -> Eye | None:
+    """None for a policy on rays. Raises: ValueError if it sees another number of them."""
+    if isinstance(spec, CnnSpec):
+        return Eye(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
+    if config.sensors.rays != RAYS:
+        raise ValueError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
+    return None
+
+
+def closing_of(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
+    """Room for the motion that a policy sees, if it sees any."""
+    sees = isinstance(spec, MlpSpec) and spec.motion
+    return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
+
+
+class Setting(NamedTuple):
+    """What the episodes on a map have in common, as the kernels read it."""
+
+    road: Road
+    network: Network
+    constants: Constants
+    drivers: Drivers
+    fan: np.ndarray
+    rays: int
+
+
+def settings_on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
+    """The settings of episodes on these maps."""
+    k, others = constants(config), drivers(config)
+    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    return [Setting(s.road, s.network, k, others, rays, config.sensors.rays) for s in scenarios]
+
+
+class Bounds(NamedTuple):
+    """Where an episode begins and where it ends if nothing happens."""
+
+    start: np.ndarray  # float32 [5]
+    target: np.float32  # m
+    steps: int
+
+
+class Room(NamedTuple):
+    """What an episode is driven in; it is used again for the next."""
+
+    car: np.ndarray  # float32 [FIELDS]
+    visits: np.ndarray  # float32 [cells]
+    beams: np.ndarray  # float32 [3, LANES]
+    ranges: np.ndarray  # float32 [rays]
+    scratch: np.ndarray  # float32, of the network
+    ring: np.ndarray  # float32 [n, FIELDS], left with the last n states: that of step k in row k % n
+    world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
+
+
+@leaf
+def _copy(state, kept):
+    """Copy a car's state [fields]. By numbers: to compile an assignment of slices takes a second longer."""
+    for i in range(state.shape[0]):
+        kept[i] = state[i]
+
+
+@leaf
+def _copy_world(world, kept):
+    """Copy a world [cars, fields]."""
+    for j in range(world.shape[0]):
+        for i in range(world.shape[1]):
+            kept[j, i] = world[j, i]
+
+
+@njit
+def make_room(setting, layers, rows, cars):
+    """Room that keeps the last `rows` states of a car and of so many others."""
+    road = setting.road
+    return Room(
+        np.empty(FIELDS, dtype=np.float32),
+        np.empty(int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL), dtype=np.float32),
+        np.empty((3, LANES), dtype=np.float32),
+        np.empty(setting.rays, dtype=np.float32),
+        np.zeros(scratch_size(layers), dtype=np.float32),
+        np.zeros((rows, FIELDS), dtype=np.float32),
+        np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
+    )
+
+
+@njit
+def packed_genome(genome, layers, eye):
+    """A genome as its network reads it."""
+    if eye is not None:
+        return genome
+    packed = np.empty(packed_size(layers), dtype=np.float32)
+    pack(genome, layers, packed)
+    return packed
+
+
+@leaf
+def see(setting, car, world, room, closing, eye):
+    """What a car senses: its ranges, and then the network's inputs in `room.scratch`, or the grid in an Eye."""
+    look(setting.road, setting.constants, setting.fan, car, world, room.beams, room.ranges, closing)
+    if eye is None:
+        encode(room.ranges, closing, car[SPEED], car[STEERING], room.scratch)
+    else:
+        fill_grid(eye.table, room.ranges, eye.grid)
+
+
+@leaf
+def choose(packed, layers, car, room, eye, begun):
+    """Index of the action for what was seen, which is overwritten; -1 where the network gives no number."""
+    if eye is None:
+        return decide(packed, layers, room.scratch)
+    convnet.push(eye.grid, begun, eye.room)
+    return convnet.decide(packed, layers, car[SPEED], eye.room)
+
+
+@leaf
+def advance(setting, bounds, car, visits, world, action, steps):
+    """One control period of the car and its world, the episode's steps-th from 0. Returns: End as a number."""
+    if world is not None:
+        flow(setting.network, setting.drivers, world, car)
+    end = drive(setting.road, setting.constants, car, visits, world, action)
+    if end == 0:
+        if car[DISTANCE] >= bounds.target:
+            return 3
+        if steps + 1 >= bounds.steps:
+            return 4
+    return end
+
+
+@njit
+def _run(setting, packed, layers, bounds, room, world, closing, eye):
+    """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there is an Eye.
+
+    What may be None is an argument of its own: Numba leaves out the branches that it rules out for those alone.
+
+    Returns: End as a number.
+    """
+    car = room.car
+    place(setting.road, bounds.start, car, room.visits)
+    keep = room.ring.shape[0]
+    end = 0
+    steps = 0
+    while end == 0:
+        see(setting, car, world, room, closing, eye)
+        action = choose(packed, layers, car, room, eye, steps == 0)
+        if action < 0:  # not a number: the genome loses what is left
+            end = 2
+            break
+        if keep > 0:
+            _copy(car, room.ring[steps % keep])
+            if world is not None:
+                _copy_world(world, room.world_ring[steps % keep])
+        end = advance(setting, bounds, car, room.visits, world, action, steps)
+        steps += 1
+    return end
+
+
+@leaf
+def note(car, end, row):
+    """Fill a RESULT."""
+    row["distance"] = car[DISTANCE]
+    row["paced"] = car[PACED]
+    row["steps"] = car[STEPS]
+    row["end"] = end
+
+
+@njit(nogil=True)
+def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, results, rewound, rewound_worlds):
+    """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results [n].
+
+    If rewind > 0 also rewound [n, 5] and rewound_worlds [n, cars, fields].
+    """
+    room = make_room(setting, layers, rewind, 0 if traffic is None else traffic.shape[0])
+    car = room.car
+    for i in range(genomes.shape[0]):
+        packed = packed_genome(genomes[i], layers, eye)
+        world = None if traffic is None else traffic.copy()
+        end = _run(setting, packed, layers, bounds, room, world, closing, eye)
+        note(car, end, results[i])
+        if rewind > 0:
+            row_back = max(int(car[STEPS]) - rewind, 0) % rewind
+            back = room.ring[row_back]
+            if traffic is not None:
+                _copy_world(room.world_ring[row_back], rewound_worlds[i])
+            rewound[i, 0] = back[X]
+            rewound[i, 1] = back[Y]
+            rewound[i, 2] = math.atan2(back[SIN], back[COS])
+            rewound[i, 3] = back[SPEED]
+            rewound[i, 4] = back[STEERING]
+
+
+def bounds_of(episode: np.void, limits: Limits) -> Bounds:
+    """Where an EPISODE begins and ends."""
+    target, steps = episode["target"] or limits.target, episode["steps"] or limits.steps
+    return Bounds(freeze(episode["start"].copy()), _F(target), int(steps))
+
+
+def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
+    """Target of each episode in m: float64 [e]."""
+    return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
+
+
+def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | None) -> np.ndarray:
+    """The traffic float32 [e, cars, world.FIELDS] of episodes, nobody for None.
+
+    Raises: ValueError where its shape does not fit or an episode's limit makes no sense.
+    """
+    if not 0 < limits.steps <= MAX_STEPS:
+        raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
+    if worlds is None:
+        worlds = no_traffic(len(episodes))
+    if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
+        raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
+    return worlds
+
+
+def world_of(worlds: np.ndarray, k: int) -> np.ndarray | None:
+    """The k-th of worlds as kernels take it."""
+    return freeze(worlds[k].copy()) if worlds.shape[1] else None
+
+
+def evaluate(
+    spec: PolicySpec,
+    genomes: np.ndarray,
+    scenarios: Sequence[Scenario],
+    episodes: np.ndarray,
+    limits: Limits,
+    config: SimConfig,
+    worlds: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drive every genome through every episode.
+
+    Args:
+        genomes: float32 [n, spec.size].
+        scenarios: the maps that the episodes index.
+        episodes: EPISODE [e].
+        worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
+
+    Returns: (RESULT [n, e]; of the k episodes with a `rewind`, the states so many steps before their ends, or at the
+    starts of shorter ones, as starts float32 [n, k, 5]; and the traffic of then, float32 [n, k, cars, world.FIELDS]).
+    Raises: ValueError where shapes do not fit.
+    """
+    if genomes.ndim != 2 or genomes.shape[1] != spec.size:
+        raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
+    eye, worlds = eye_of(spec, config), checked_worlds(episodes, limits, worlds)
+    genomes = freeze(genomes.astype(np.float32, copy=False))
+    # By columns: the kernel fills one at a time.
+    results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
+    kept = np.cumsum(episodes["rewind"] > 0) - 1
+    k = int(kept[-1]) + 1 if len(kept) else 0
+    rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
+    rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
+    settings = settings_on(scenarios, config)
+    for column, episode in enumerate(episodes):
+        _rollout(
+            settings[episode["map"]],
+            genomes,
+            spec.layers,
+            bounds_of(episode, limits),
+            world_of(worlds, column),
+            closing_of(spec, config),
+            eye,
+            int(episode["rewind"]),
+            results[column],
+            rewound[kept[column]],
+            rewound_worlds[kept[column]],
+        )
+    return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
+
+
+def no_traffic(episodes: int) -> np.ndarray:
+    """Worlds float32 [episodes, 0, fields] with nobody in them."""
+    return np.zeros((episodes, 0, TRAFFIC_FIELDS), dtype=np.float32)
+
+
+def trajectory(
+    spec: PolicySpec,
+    genome: np.ndarray,
+    scenario: Scenario,
+    start: np.ndarray,
+    limits: Limits,
+    config: SimConfig,
+    world: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drive one genome through one episode and keep its path.
+
+    Args: as `evaluate`'s; start float32 [5], world float32 [cars, world.FIELDS].
+    Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
+    `gridsim.car.ego`, and the traffic then, float32 [steps + 1, cars, world.FIELDS]).
+    """
+    result, states, worlds = _trajectory(
+        settings_on([scenario], config)[0],
+        freeze(genome),
+        spec.layers,
+        Bounds(freeze(start), _F(limits.target), limits.steps),
+        None if world is None or not len(world) else freeze(world.copy()),
+        closing_of(spec, config),
+        eye_of(spec, config),
+    )
+    row = np.zeros((), dtype=RESULT)
+    row["distance"], row["paced"], row["steps"], row["end"] = result
+    return row, states[: int(row["steps"]) + 1], worlds[: int(row["steps"]) + 1]
+
+
+@njit(nogil=True)
+def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
+    room = make_room(setting, layers, bounds.steps + 1, 0 if traffic is None else traffic.shape[0])
+    car = room.car
+    world = None if traffic is None else traffic.copy()
+    end = _run(setting, packed_genome(genome, layers, eye), layers, bounds, room, world, closing, eye)
+    _copy(car, room.ring[int(car[STEPS])])
+    if traffic is not None:
+        _copy_world(world, room.world_ring[int(car[STEPS])])
+    return (car[DISTANCE], car[PACED], car[STEPS], end), room.ring, room.world_ring

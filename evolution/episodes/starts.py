@@ -1,0 +1,64 @@
+"""Which episodes are driven: starts on lanes and the traffic around them, from a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from evolution.episodes.rollout import EPISODE, Limits, no_traffic
+from gridsim.config import TrafficConfig
+from gridsim.maps.scenarios import Scenario, sample_starts
+from gridsim.traffic.world import FIELDS, spawn
+
+
+class Episodes(NamedTuple):
+    """Episodes that every member of a group meets."""
+
+    maps: list[int]  # seeds of the maps
+    rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
+    worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
+
+    def within(self, limits: Limits) -> Episodes:
+        """The same, each with its own target and limit: these where it had none."""
+        rows = self.rows.copy()
+        rows["target"] = np.where(rows["target"] > 0, rows["target"], limits.target)
+        rows["steps"] = np.where(rows["steps"] > 0, rows["steps"], limits.steps)
+        return Episodes(self.maps, rows, self.worlds)
+
+    def and_then(self, others: Episodes) -> Episodes:
+        """These and others after them, which have as many cars around."""
+        rows = others.rows.copy()
+        rows["map"] += len(self.maps)
+        return Episodes(
+            self.maps + others.maps,
+            np.concatenate([self.rows, rows]),
+            np.concatenate([self.worlds, others.worlds]),
+        )
+
+
+def lane_starts(
+    scenarios: Sequence[Scenario],
+    maps: np.ndarray,
+    rng: np.random.Generator,
+    traffic: int = 0,
+    config: TrafficConfig | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Episodes that start uniformly over the lanes of `scenarios[maps[k]]`, at rest, with so many other cars.
+
+    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
+    """
+    episodes, worlds = np.zeros(len(maps), dtype=EPISODE), no_traffic(len(maps))
+    episodes["map"] = maps
+    for m in np.unique(maps):
+        of = np.flatnonzero(episodes["map"] == m)
+        episodes["start"][of] = sample_starts(scenarios[m], len(of), rng)
+    if traffic:
+        worlds = np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
+        keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
+        for m in np.unique(maps):
+            of = np.flatnonzero(episodes["map"] == m)
+            starts = episodes["start"][of]
+            worlds[of] = spawn(scenarios[m].network, starts, traffic, keys[of], config or TrafficConfig())
+    return episodes, worlds

@@ -1,0 +1,1 @@
+"""Networks: what a policy's text means, flat genomes, forward passes, export to PyTorch."""

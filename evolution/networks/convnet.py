@@ -1,0 +1,170 @@
+"""The forward pass of `cnn` policies, by kernels of our own: one car after the other, each sum in a fixed order.
+
+What a car does so depends on its genome and observations alone, never on the members and episodes that share a chunk
+with it. Compiled, a car-step of `cnn:8,16,32@1` takes 11 us on one core, against 27 us in PyTorch with the 12 episodes
+of a member in one batch (and only as long as all of them last); workers need not load PyTorch, 200 MB and seconds each.
+The tests hold it against PyTorch's convolutions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evolution.networks.policy import (
+    KERNEL_1,
+    KERNEL_2,
+    LANES,
+    SIDE_1,
+    SIDE_2,
+    SPEED_SCALE,
+    STRIDE_1,
+    STRIDE_2,
+    CnnSpec,
+)
+from evolution.networks.dense import tile
+from gridsim.sensing.grid import CELLS
+from gridsim.jit import leaf, njit
+from gridsim.maps.roads import freeze
+
+_F = np.float32
+_CODE = _F(1.0 / 255.0)
+_AREA = CELLS * CELLS
+_HALF_ROW = (SIDE_1 + 1) // 2  # two tiles make a row of 19; they share its middle
+_WIDE, _WIDEST = 2 * LANES, 4 * LANES
+
+_convolve_1, _convolve_1_wide = tile(_HALF_ROW, LANES, True), tile(_HALF_ROW, _WIDE, True)
+_convolve_2, _convolve_2_wide = tile(SIDE_2, LANES, True), tile(SIDE_2, _WIDE, True)
+_dense, _dense_wide = tile(1, LANES, True), tile(1, _WIDEST, True)
+_linear = tile(1, LANES, False)
+
+
+class Scratch(NamedTuple):
+    """What a forward pass writes: float32, of one car."""
+
+    frames: np.ndarray  # [frames * 6400] cells of the frames, the newest last, in [0, 1]
+    first: np.ndarray  # [19 * 19 * channels]
+    second: np.ndarray  # [8 * 8 * channels + 1], the last is the speed
+    dense: np.ndarray  # [units]
+    outputs: np.ndarray  # [actions]
+
+
+def scratch(spec: CnnSpec) -> Scratch:
+    """Room for a forward pass."""
+    first, second, dense = spec.hidden
+    sizes = (spec.frames * _AREA, SIDE_1 * SIDE_1 * first, SIDE_2 * SIDE_2 * second + 1, dense, spec.outputs)
+    return Scratch(*(np.zeros(n, dtype=np.float32) for n in sizes))
+
+
+@leaf
+def push(grid, begun, room):
+    """Make grid uint8 [6400] the newest frame; where an episode has just `begun` it is all of them."""
+    frames = room.frames
+    older = frames.shape[0] - _AREA
+    for i in range(older):
+        frames[i] = frames[i + _AREA]
+    for i in range(_AREA):
+        frames[older + i] = _F(grid[i]) * _CODE
+    if begun:
+        for i in range(older):
+            frames[i] = frames[older + i % _AREA]
+
+
+@leaf
+def forward(genome, layers, speed, room):
+    """Outputs of the network for the frames in `room` and a speed in m/s; left in `room.outputs`.
+
+    Args: genome float32 [genes]; layers of `CnnSpec.layers`. Any not-a-number stays one and reaches the outputs.
+    """
+    frames, one, two, units = int(layers[0]), int(layers[1]), int(layers[2]), int(layers[3])
+    bias = frames * KERNEL_1 * KERNEL_1 * one
+    for y in range(SIDE_1):
+        for x in (0, SIDE_1 - _HALF_ROW):
+            at, to = STRIDE_1 * (y * CELLS + x), (y * SIDE_1 + x) * one
+            if one % _WIDE == 0:
+                for c in range(0, one, _WIDE):
+                    _convolve_1_wide(
+                        room.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
+                        genome, c, one, bias + c, room.first, to + c, one,
+                    )  # fmt: skip
+            else:
+                for c in range(0, one, LANES):
+                    _convolve_1(
+                        room.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
+                        genome, c, one, bias + c, room.first, to + c, one,
+                    )  # fmt: skip
+    start = bias + one
+    bias = start + KERNEL_2 * KERNEL_2 * one * two
+    for y in range(SIDE_2):
+        at, to = STRIDE_2 * y * SIDE_1 * one, y * SIDE_2 * two
+        if two % _WIDE == 0:
+            for c in range(0, two, _WIDE):
+                _convolve_2_wide(
+                    room.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
+                    genome, start + c, two, bias + c, room.second, to + c, two,
+                )  # fmt: skip
+        else:
+            for c in range(0, two, LANES):
+                _convolve_2(
+                    room.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
+                    genome, start + c, two, bias + c, room.second, to + c, two,
+                )  # fmt: skip
+    start = bias + two
+    inputs = SIDE_2 * SIDE_2 * two + 1
+    room.second[inputs - 1] = speed / SPEED_SCALE - _F(1.0)
+    bias = start + inputs * units
+    if units % _WIDEST == 0:
+        for c in range(0, units, _WIDEST):
+            _dense_wide(room.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, room.dense, c, 0)
+    else:
+        for c in range(0, units, LANES):
+            _dense(room.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, room.dense, c, 0)
+    start = bias + units
+    _linear(room.dense, 0, 0, 1, 0, 1, 0, units, genome, start, LANES, start + units * LANES, room.outputs, 0, 0)
+
+
+@leaf
+def decide(genome, layers, speed, room):
+    """Index of the greatest output, the first of equals; -1 where an output is not a number."""
+    forward(genome, layers, speed, room)
+    outputs = room.outputs
+    best, action = outputs[0], 0
+    number = best == best
+    for k in range(1, outputs.shape[0]):
+        value = outputs[k]
+        number &= value == value
+        if value > best:
+            best, action = value, k
+    return action if number else -1
+
+
+@njit
+def _act_on(genome, layers, frames, speeds, room, actions):
+    for n in range(frames.shape[0]):
+        for k in range(frames.shape[1]):
+            push(frames[n, k], False, room)
+        actions[n] = decide(genome, layers, speeds[n], room)
+
+
+def act_on(
+    spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: float | np.ndarray
+) -> int | np.ndarray:  # fmt: skip
+    """Actions of a genome for grids.
+
+    Args: observation uint8 [80, 80] for a network of one frame, [frames, 80, 80] for one of several, newest last, or
+    either with a leading axis [n, ...]; speed m/s, a number or [n].
+    Returns: an action, or int64 [n]; -1 where the network gives no number.
+    Raises: ValueError with one line for an observation of another shape or type.
+    """
+    grids = np.asarray(observation)
+    frame = (CELLS, CELLS) if spec.frames == 1 else (spec.frames, CELLS, CELLS)
+    many = grids.ndim == len(frame) + 1
+    if grids.shape[many:] != frame or grids.dtype != np.uint8:
+        shape = ", ".join(map(str, frame))
+        raise ValueError(f"{spec} sees grids uint8 [{shape}] or [n, {shape}], not {grids.dtype} {grids.shape}")
+    grids = np.ascontiguousarray(grids).reshape(-1, spec.frames, CELLS * CELLS)
+    speeds = np.ascontiguousarray(np.broadcast_to(np.asarray(speed, dtype=np.float32), len(grids)))
+    actions = np.empty(len(grids), dtype=np.int64)
+    _act_on(freeze(np.ascontiguousarray(genome)), spec.layers, grids, speeds, scratch(spec), actions)
+    return actions if many else int(actions[0])

@@ -1,0 +1,366 @@
+"""Networks: what a policy's text means, how a flat genome is laid out, and the forward pass.
+
+This is the one file that knows layer shapes. A genome is a flat float32 vector: for each layer the weights, input-major
+[inputs, outputs], then the biases [outputs]. The forward pass here is the perceptron's; `convnet` has the other one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from evolution.networks.dense import dense
+from gridsim.sensing.grid import CELLS
+from gridsim.jit import leaf, njit
+from gridsim.maps.roads import freeze
+
+RAYS = 31
+INPUTS = RAYS + 1  # and the speed
+ACTIONS = 8
+MAX_GENES = 1_000_000
+_F, _U = np.float32, np.uint64
+RAY_HALF = _F(8.0)  # m, the range whose input is 0
+SPEED_SCALE = _F(10.0)  # m/s, the speed whose input is 0
+STEERING_SCALE = _F(0.5)  # rad, the steering angle whose input is 1
+
+
+Observation = Literal["rays", "grid"]
+
+
+@dataclass(frozen=True)
+class PolicySpec(ABC):
+    """A network's shape. Two kinds: `MlpSpec` on the rays, `CnnSpec` on the occupancy grid.
+
+    Attributes:
+        hidden: units, or channels, of the hidden layers.
+        outputs: one for each action; the greatest acts.
+    """
+
+    observation: ClassVar[Observation]
+
+    hidden: tuple[int, ...]
+    outputs: int = ACTIONS
+
+    @staticmethod
+    def parse(text: str) -> PolicySpec:
+        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises ValueError with one line otherwise."""
+        if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", text):
+            sizes = tuple(int(n) for n in match[1].split(","))
+            spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]))
+            if min(spec.hidden) < 1 or spec.size > MAX_GENES:
+                raise ValueError(
+                    f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
+                )
+            return spec
+        if match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
+            hidden = tuple(int(n) for n in match.groups()[:3]) if match[1] else CnnSpec.hidden
+            spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
+            if any(n < LANES or n % LANES for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
+                raise ValueError(
+                    f"policy {text!r}: layers of a cnn have {LANES} units or a multiple of it, "
+                    f"and it sees 1 to {MAX_FRAMES} frames"
+                )
+            if spec.size > MAX_GENES:
+                raise ValueError(f"policy {text!r} has {spec.size:,} genes; {MAX_GENES:,} are the most")
+            return spec
+        raise ValueError(
+            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "
+            "mlp:6,7+steering, or cnn for the grid, as in cnn:8,16,32@1"
+        )
+
+    @property
+    @abstractmethod
+    def inputs(self) -> int:
+        """Numbers that the network sees."""
+
+    @property
+    @abstractmethod
+    def layers(self) -> np.ndarray:
+        """Sizes as the kernels read them, int32."""
+
+    @abstractmethod
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        """(inputs of a unit, units) of each layer, the output's included."""
+
+    @property
+    def size(self) -> int:
+        """Genes of a genome."""
+        return sum((n + 1) * m for n, m in self.shapes())
+
+
+@dataclass(frozen=True)
+class MlpSpec(PolicySpec):
+    """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts.
+
+    With `motion` it also sees how fast the cars that rays meet come closer (`boxes.cast_boxes`), with `steering` how
+    its own wheels stand, which a driver without memory cannot know otherwise: they take half a second to turn.
+    """
+
+    observation = "rays"
+
+    hidden: tuple[int, ...] = (6, 7)
+    motion: bool = False
+    steering: bool = False
+
+    def __str__(self) -> str:
+        more = ("+motion" if self.motion else "") + ("+steering" if self.steering else "")
+        return "mlp:" + ",".join(map(str, self.hidden)) + more
+
+    @property
+    def inputs(self) -> int:
+        """The rays, what they meet's motion if it is seen, the speed, and the steering angle if it is seen."""
+        return INPUTS + (RAYS if self.motion else 0) + self.steering
+
+    @property
+    def layers(self) -> np.ndarray:
+        """Units of each layer, inputs and outputs included: int32 [layers + 1]."""
+        return freeze(np.array([self.inputs, *self.hidden, self.outputs], dtype=np.int32))
+
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        units = (self.inputs, *self.hidden, self.outputs)
+        return tuple(itertools.pairwise(units))
+
+
+# The convolutions of Mnih et al. (2015), which the paper's authors took over for their grid: kernels and strides.
+KERNEL_1, STRIDE_1 = 8, 4
+KERNEL_2, STRIDE_2 = 4, 2
+SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
+SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
+LANES = 8  # channels and units come in multiples of it, so that layers are whole vectors
+MAX_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class CnnSpec(PolicySpec):
+    """A convolutional network on the occupancy grid and the speed: ReLU hidden layers, the greatest output acts.
+
+    Two convolutions (8 x 8 with stride 4, 4 x 4 with stride 2), a dense layer that sees the speed beside the second
+    one's output, and the outputs. `cnn:16,32,256@4` names the channels of the convolutions, the units of the dense
+    layer, and the frames: grids of so many control steps in a row, the newest last. `cnn` alone is that network, which
+    but for the speed is the one of the paper's authors; without `@` there are 4 frames.
+
+    A unit's inputs are ordered (frame, row, column) in the first layer, (row, column, channel) in the others; the
+    speed is the dense layer's last.
+    """
+
+    observation = "grid"
+
+    hidden: tuple[int, ...] = (16, 32, 256)
+    frames: int = 4
+
+    def __str__(self) -> str:
+        return f"cnn:{','.join(map(str, self.hidden))}@{self.frames}"
+
+    @property
+    def inputs(self) -> int:
+        """The cells of all frames, and the speed."""
+        return self.frames * CELLS * CELLS + 1
+
+    @property
+    def layers(self) -> np.ndarray:
+        """Frames, channels, channels, units, outputs: int32 [5]."""
+        return freeze(np.array([self.frames, *self.hidden, self.outputs], dtype=np.int32))
+
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        first, second, dense = self.hidden
+        return (
+            (self.frames * KERNEL_1 * KERNEL_1, first),
+            (KERNEL_2 * KERNEL_2 * first, second),
+            (SIDE_2 * SIDE_2 * second + 1, dense),
+            (dense, self.outputs),
+        )
+
+
+@cache
+def gene_scales(spec: PolicySpec) -> np.ndarray:
+    """The size float32 [genes] that genes have by nature: of a new genome's spread and of a mutation's step.
+
+    1 for a perceptron, whose few inputs are alike. In a convolutional network the standard deviation of He et al.
+    (2015), sqrt(2 / inputs of the unit), so that a step means as much in a layer of 64 inputs as in one of 2,000; half
+    the variance in the linear output layer. The speed's weights are of size 1: it is one input beside a thousand, and
+    would go unheard.
+    """
+    if spec.observation == "rays":
+        return freeze(np.ones(spec.size, dtype=np.float32))
+    shapes = spec.shapes()
+    parts = []
+    for k, (n, m) in enumerate(shapes):
+        beside = 1 if k == len(shapes) - 2 else 0  # the speed
+        size = np.sqrt((2.0 if k < len(shapes) - 1 else 1.0) / (n - beside))
+        parts += [np.full((n - beside) * m, size), np.ones(beside * m), np.full(m, size)]
+    return freeze(np.concatenate(parts).astype(np.float32))
+
+
+@leaf
+def encode(ranges, closing, speed, steering, inputs):
+    """What the network sees: float32 [rays + 2], or [2 * rays + 2] where closing is not None.
+
+    Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out; then how fast what they meet comes closer, the
+    speed, and the steering angle (rad), which is the last, so that who does not see it passes it over.
+    """
+    rays = ranges.shape[0]
+    for i in range(rays):
+        inputs[i] = _F(2.0) * ranges[i] / (ranges[i] + RAY_HALF) - _F(1.0)
+    last = rays
+    if closing is not None:
+        for i in range(rays):
+            inputs[rays + i] = closing[i] / SPEED_SCALE
+        last = 2 * rays
+    inputs[last] = speed / SPEED_SCALE - _F(1.0)
+    inputs[last + 1] = steering / STEERING_SCALE
+
+
+@leaf
+def squash(x):
+    """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere."""
+    x = _F(4.97) if x > _F(4.97) else x  # so written, not a number stays one
+    x = _F(-4.97) if x < _F(-4.97) else x
+    s = x * x
+    return (
+        x
+        * (_F(135135.0) + s * (_F(17325.0) + s * (_F(378.0) + s)))
+        / (_F(135135.0) + s * (_F(62370.0) + s * (_F(3150.0) + s * _F(28.0))))
+    )
+
+
+BLOCK = 8  # a layer's outputs are padded to whole blocks
+_dense_64, _dense_16, _dense_8 = dense(64, 1), dense(16, 2), dense(8, 4)
+
+
+@njit
+def packed_size(layers):
+    """Length of a genome laid out by `pack`."""
+    size = 0
+    for k in range(layers.shape[0] - 1):
+        size += (layers[k] + 1) * ((layers[k + 1] + BLOCK - 1) // BLOCK * BLOCK)
+    return size
+
+
+@njit
+def scratch_size(layers):
+    """Numbers that `forward` needs room for: two layers of the widest."""
+    widest = 0
+    for k in range(layers.shape[0]):
+        widest = max(widest, layers[k])
+    return 2 * (widest + BLOCK)
+
+
+@njit
+def pack(genome, layers, packed):
+    """Lay a genome out for `forward`: of each layer the biases, then a row of weights for each input.
+
+    A row is as long as whole blocks of units are; missing units have weight 0.
+    """
+    packed[:] = _F(0.0)
+    at, to = 0, 0
+    for k in range(layers.shape[0] - 1):
+        n, m = layers[k], layers[k + 1]
+        width = (m + BLOCK - 1) // BLOCK * BLOCK
+        for j in range(m):
+            packed[to + j] = genome[at + n * m + j]
+        for i in range(n):
+            for j in range(m):
+                packed[to + (i + 1) * width + j] = genome[at + i * m + j]
+        at += (n + 1) * m
+        to += (n + 1) * width
+
+
+@leaf
+def forward(packed, layers, scratch):
+    """Outputs of the network in scratch[return value: + outputs].
+
+    Args: genome laid out by `pack`; scratch float32 [2 * (widest layer + 8)], the inputs at its beginning.
+    Any not-a-number stays one and reaches the outputs.
+    """
+    half = scratch.shape[0] // 2
+    source, at = 0, 0
+    last = layers.shape[0] - 2
+    for k in range(last + 1):
+        n, m = layers[k], layers[k + 1]
+        width = (m + BLOCK - 1) // BLOCK * BLOCK
+        target = half - source
+        unit = 0
+        while width - unit >= 64:
+            _dense_64(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            unit += 64
+        while width - unit >= 16:
+            _dense_16(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            unit += 16
+        if width - unit >= 8:
+            _dense_8(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+        if k < last:
+            for j in range(width):
+                scratch[target + j] = squash(scratch[target + j])
+        at += (n + 1) * width
+        source = target
+    return source
+
+
+@leaf
+def decide(packed, layers, scratch):
+    """Index of the greatest output, the first of equals; -1 where an output is not a number."""
+    at = forward(packed, layers, scratch)
+    best, action = scratch[at], 0
+    number = best == best
+    for k in range(1, layers[layers.shape[0] - 1]):
+        value = scratch[at + k]
+        number &= value == value
+        if value > best:
+            best, action = value, k
+    return action if number else -1
+
+
+@njit
+def _act_on(packed, layers, observations, motion, steers, reach, speed_limit, steering_limit, actions):
+    scratch = np.zeros(scratch_size(layers), dtype=np.float32)
+    rays = layers[0] - 2 if steers else layers[0] - 1
+    rays = rays // 2 if motion else rays
+    last = 2 * rays if motion else rays
+    ranges, closing = np.empty(rays, dtype=np.float32), np.empty(rays, dtype=np.float32)
+    for n in range(observations.shape[0]):
+        for i in range(rays):
+            ranges[i] = observations[n, i] * reach
+        speed = observations[n, last] * speed_limit
+        steering = observations[n, last + 1] * steering_limit if steers else _F(0.0)
+        if motion:
+            for i in range(rays):
+                closing[i] = observations[n, rays + i] * speed_limit
+            encode(ranges, closing, speed, steering, scratch)
+        else:
+            encode(ranges, None, speed, steering, scratch)
+        actions[n] = decide(packed, layers, scratch)
+
+
+def act_on(
+    spec: PolicySpec,
+    genome: np.ndarray,
+    observation: np.ndarray,
+    reach: float,
+    speed_limit: float,
+    steering_limit: float,
+) -> int | np.ndarray:
+    """Actions of a genome for the environment's observations.
+
+    Args: observation float32 [32] or [n, 32]: ranges / reach, then speed / speed_limit; with motion [63] or [n, 63],
+    closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit; reach m;
+    speed limit m/s; steering limit rad.
+    Returns: an action, or int64 [n]; -1 where the network gives no number.
+    """
+    many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
+    if many.ndim != 2 or many.shape[1] != spec.inputs:
+        raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
+    packed = np.empty(packed_size(spec.layers), dtype=np.float32)
+    pack(np.ascontiguousarray(genome), spec.layers, packed)
+    actions = np.empty(len(many), dtype=np.int64)
+    motion, steers = (spec.motion, spec.steering) if isinstance(spec, MlpSpec) else (False, False)
+    _act_on(
+        packed, spec.layers, np.ascontiguousarray(many), motion, steers,
+        _F(reach), _F(speed_limit), _F(steering_limit), actions,
+    )  # fmt: skip
+    return int(actions[0]) if np.ndim(observation) == 1 else actions

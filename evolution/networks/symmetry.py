@@ -1,0 +1,89 @@
+"""Left-right symmetry: which genes are free, and which are bound to them.
+
+Cars and roads look the same in a mirror. In a mirrored world a network should therefore take the mirrored action. It
+does so if each gene equals the gene of its mirror image, so random numbers are drawn for the free half of a genome, and
+the bound half copies them. The search then has half as many dimensions, and what is learned in a bend to the left also
+serves in a bend to the right.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from evolution.networks.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec
+from gridsim.maps.roads import freeze
+from gridsim.car.vehicle import Action
+
+#: The mirror image of each action.
+MIRRORED_ACTIONS = np.array(
+    [
+        Action.ACCELERATE, Action.RIGHT, Action.LEFT, Action.BRAKE, Action.NONE, Action.ACCELERATE_RIGHT,
+        Action.ACCELERATE_LEFT, Action.REVERSE,
+    ]
+)  # fmt: skip
+
+
+class Symmetry(NamedTuple):
+    """How the genes of a symmetric network depend on each other: gene[bound] = factor * gene[source]."""
+
+    free: np.ndarray  # int32 [f], genes with random numbers of their own
+    bound: np.ndarray  # int32 [genes - f], all other genes
+    source: np.ndarray  # int32 [genes - f], the mirror image of each bound gene: a free gene, unless the factor is 0
+    factor: np.ndarray  # float32 [genes - f]: 1; -1 for weights of the steering angle, 0 for that of a middle unit
+
+
+@cache
+def symmetry(spec: PolicySpec) -> Symmetry:
+    """The symmetry of a network in which hidden unit k of a layer mirrors unit k from its end.
+
+    The middle unit of an odd number mirrors itself. If a layer had no other unit, left and right would be
+    indistinguishable, so all genes of such a network are free. A `cnn` is only approximately symmetric, because its
+    second convolution leaves out the last of 19 columns.
+    """
+    images, signs, at = [], [], 0
+    shapes = spec.shapes()
+    for k, (inputs, (n, m)) in enumerate(zip(_inputs(spec), shapes, strict=True)):
+        units = np.arange(m)[::-1] if k < len(shapes) - 1 else MIRRORED_ACTIONS
+        sign = np.ones((n + 1, m))
+        if k == 0 and isinstance(spec, MlpSpec) and spec.steering:
+            sign[n - 1] = -1.0
+        images += [(at + inputs[:, None] * m + units).ravel(), at + n * m + units]
+        signs.append(sign.ravel())
+        at += (n + 1) * m
+    image, factor = np.concatenate(images), np.concatenate(signs)
+    gene = np.arange(spec.size)
+    opposite = (image == gene) & (factor < 0)
+    is_free = (gene <= image) & ~opposite | (1 in spec.hidden)
+    bound = np.flatnonzero(~is_free)
+    return Symmetry(
+        freeze(np.flatnonzero(is_free).astype(np.int32)),
+        freeze(bound.astype(np.int32)),
+        freeze(image[bound].astype(np.int32)),
+        freeze(np.where(opposite, 0.0, factor)[bound].astype(np.float32)),
+    )
+
+
+def _inputs(spec: PolicySpec) -> list[np.ndarray]:
+    """For each layer, the index of the mirror image of each input."""
+    if isinstance(spec, CnnSpec):
+        first, second, dense = spec.hidden
+        return [
+            _columns_reversed(spec.frames * KERNEL_1, KERNEL_1, 1),
+            _columns_reversed(KERNEL_2, KERNEL_2, first),
+            np.append(_columns_reversed(SIDE_2, SIDE_2, second), SIDE_2 * SIDE_2 * second),  # the speed is last
+            np.arange(dense)[::-1],
+        ]
+    assert isinstance(spec, MlpSpec)
+    rays = np.arange(RAYS)[::-1]
+    seen = [rays, rays + RAYS] if spec.motion else [rays]
+    others = np.arange(len(seen) * RAYS, spec.inputs)
+    return [np.concatenate([*seen, others]), *(np.arange(m)[::-1] for m in spec.hidden)]
+
+
+def _columns_reversed(rows: int, columns: int, channels: int) -> np.ndarray:
+    """Indices [rows * columns * channels] of an image's values in the order of its mirror image."""
+    index = np.arange(rows * columns * channels).reshape(rows, columns, channels)
+    return index[:, ::-1, ::-1].ravel()

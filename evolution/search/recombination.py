@@ -1,0 +1,126 @@
+"""The default search: the tournaments' winners are recombined into one centre, around which the next members lie.
+
+A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
+adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Noise is
+left-right symmetric (`symmetry`). Children come in mirrored pairs (Brockhoff et al. 2010), the centre plus and minus
+the same noise, that meet the same episodes. The centre and the champion (before there is one, the average of centres)
+are the elites: they are driven unmodified, and may win like all others.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evolution.search.breeding import Kind, Mutation, moments
+from evolution.networks.policy import PolicySpec, gene_scales
+from evolution.search.base import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournament_weights
+from evolution.networks.symmetry import symmetry
+
+_CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
+_ELITES = 2  # the centre, and the champion: before there is one, the average
+_KEPT = 0.9  # of the average of centres, in each generation
+# The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so that without a
+# bound weights and step size grow for ever.
+_MAX_GROWTH = 2.0
+
+
+class Recombination(Search):
+    """Children are centre + sigma * scales * sqrt(variances) * N(0, 1); the first generation is random.
+
+    Attributes:
+        centre: float64 [genes], or [0] before the first generation.
+        path: float64 [free genes], the evolution path: N(0, 1) in each under random selection, as at the beginning.
+        variances: float64 [genes], diagonal of the covariance, 1 at the beginning.
+        sigma: step size over all genes.
+        average: float64 [genes], of the latest centres, each of which weighs 0.9 times the next one.
+        champion: float32 [genes], of the run; None before there is one.
+    """
+
+    def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
+        super().__init__(spec, config, seed)
+        self.centre = np.zeros(0)
+        self._free = symmetry(spec).free
+        # Not 0: the step size would shrink until the path has grown to its expected length.
+        self.path = self._rng(1).standard_normal(len(self._free))
+        self.variances = np.ones(spec.size)
+        self.average = np.zeros(0)
+        self.sigma = config.sigma
+        self.champion: np.ndarray | None = None
+
+    def begin_with(self, genome: np.ndarray) -> None:
+        self.centre = self.average = genome.astype(np.float64)
+
+    def carry(self, champion: np.ndarray) -> None:
+        self.champion = champion
+
+    def leader(self) -> np.ndarray | None:
+        return self.centre.astype(np.float32) if len(self.centre) else None
+
+    def candidates(self) -> np.ndarray:
+        return self.average[None].astype(np.float32)
+
+    def steps(self) -> np.ndarray:
+        """Standard deviation of each gene, float64 [genes]."""
+        return self.sigma * gene_scales(self.spec) * np.sqrt(self.variances)
+
+    def _ask(self, key: int) -> Asked:
+        n = self.config.population
+        made = recipes(n)
+        if not len(self.centre):
+            made["kind"] = Kind.NEW
+            none = np.zeros((0, self.spec.size), dtype=np.float32)
+            return Asked(none, made, key, Mutation(), split(n, self.config.groups))
+        other = self.average if self.champion is None else self.champion
+        rows = np.stack([self.centre, self.steps(), other]).astype(np.float32)
+        made["kind"], made["seed"] = Kind.COPY, 0
+        made["a"][:_ELITES] = _CENTRE, _OTHER
+        child = np.arange(n - _ELITES)
+        made["kind"][_ELITES:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
+        made["a"][_ELITES:], made["b"][_ELITES:] = _CENTRE, _STEPS
+        made["seed"][_ELITES:] = child // 2
+        return Asked(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
+
+    def _tell(self, asked: Asked, scores: np.ndarray) -> None:
+        if not len(self.centre):  # begin with the best score, although groups met different episodes
+            self.begin_with(self.genomes(np.array([scores.argmax()]))[0])
+            return
+        weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
+        effective = 1.0 / float((weights**2).sum())  # mu_eff
+        pairs = (len(weights) - _ELITES) // 2  # an odd last member has no mirror image and is left out
+        plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
+        genes, shift = len(self._free), plus - minus
+        first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, self.spec)
+        self.centre = self.centre + self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
+        self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
+        # Under random selection, first / norm is N(0, 1) in each gene, whatever the weights of a pair are.
+        norm = math.sqrt(float((shift**2).sum()))
+        if norm > 0.0:
+            rate = (effective + 2.0) / (genes + effective + 5.0)
+            damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
+            expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
+            self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first[self._free]
+            self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
+            self.sigma = min(self.sigma, _MAX_GROWTH * self.config.sigma)
+        share = float((plus + minus).sum())
+        if share > 0.0:
+            rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
+            rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
+            # A gene without noise (factor 0 in `symmetry`) keeps its variance, which would shrink to 0.
+            self.variances = self.variances * np.where(second > 0.0, 1.0 - rate + rate * second / share, 1.0)
+
+    def state(self) -> tuple[Arrays, dict[str, float]]:
+        names = ("centre", "average", "path", "variances")
+        return {name: getattr(self, name) for name in names}, {"sigma": self.sigma}
+
+    def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
+        genes, sigma = (self.spec.size,), float(numbers["sigma"])
+        centre = arrays["centre"]
+        path = checked(arrays["path"], self.path.shape, np.float64)
+        variances = checked(arrays["variances"], genes, np.float64)
+        if not 0.0 < sigma <= _MAX_GROWTH * self.config.sigma or (variances <= 0.0).any():
+            raise ValueError("its step sizes are out of range")
+        shape = genes if centre.size else (0,)
+        self.centre, self.average = checked(centre, shape, np.float64), checked(arrays["average"], shape, np.float64)
+        self.path, self.variances, self.sigma = path, variances, sigma

@@ -1,0 +1,65 @@
+"""The classic genetic algorithm: tournaments, elitism, uniform crossover of two parents, Gaussian mutation.
+
+And random search, the baseline that every search must beat: elites alone go on, all others are new.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evolution.search.breeding import Kind, Mutation
+from evolution.networks.policy import PolicySpec
+from evolution.search.base import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournaments
+
+PARENTS = 64  # size of the mating pool, which bounds what is broadcast
+
+
+class TwoParents(Search):
+    """Elites go on unmodified; two parents of each other member are drawn from the winners of tournaments."""
+
+    def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int, random: bool = False):
+        super().__init__(spec, config, seed)
+        self.random = random
+        self.parents = np.zeros((0, spec.size), dtype=np.float32)  # the best first; elites, then the mating pool
+        self.elites = 0  # rows of `parents` that are elites
+
+    def begin_with(self, genome: np.ndarray) -> None:
+        self.elites = min(1, self.config.elites)
+        self.parents = np.stack([genome] * (self.elites + 1)).astype(np.float32)
+
+    def leader(self) -> np.ndarray | None:
+        return self.parents[0] if len(self.parents) else None
+
+    def candidates(self) -> np.ndarray:
+        return self.parents[:1]
+
+    def _ask(self, key: int) -> Asked:
+        config, rng = self.config, self._rng(1)
+        n, pool = config.population, np.arange(self.elites, len(self.parents))
+        made = recipes(n)
+        if self.random or not len(pool):
+            made["kind"] = Kind.NEW
+        else:
+            made["kind"] = Kind.CROSS
+            made["a"], made["b"] = rng.choice(pool, n), rng.choice(pool, n)
+        for name, values in (("kind", Kind.COPY), ("a", np.arange(self.elites)), ("b", 0)):
+            made[name][: self.elites] = values
+        groups = split(n, config.groups)
+        return Asked(self.parents, made, key, Mutation(config.mutation_rate, config.sigma), groups)
+
+    def _tell(self, asked: Asked, scores: np.ndarray) -> None:
+        standing = np.where(np.isneginf(scores), -1.0, ranks(scores, asked.groups))
+        best = np.argsort(-standing, kind="stable")[: self.config.elites]
+        winners = tournaments(standing, self.config.tournament, PARENTS, self._rng(2))
+        self.parents = self.genomes(np.concatenate([best, winners]))
+        self.elites = len(best)
+
+    def state(self) -> tuple[Arrays, dict[str, float]]:
+        return {"parents": self.parents}, {"elites": self.elites}
+
+    def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
+        elites, parents = int(numbers["elites"]), arrays["parents"]
+        most = self.config.elites + PARENTS
+        if not 0 <= elites <= min(self.config.elites, max(len(parents) - 1, 0)) or len(parents) > most:
+            raise ValueError("its parents are not those of this search")
+        self.parents, self.elites = checked(parents, (len(parents), self.spec.size), np.float32), elites

@@ -1,0 +1,1 @@
+"""What drives: the kinematic bicycle, the control period and its ends, the reward."""

@@ -1,0 +1,212 @@
+"""The ego car: its state, and the one order of events in its control period.
+
+`drive` is one control period of one car: act, advance in sub-steps with collision checks, count new ground, end. The
+batched `simulator` and the fused rollout of `evolution` are loops over it. State is float32 [FIELDS]; fields below.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numpy as np
+
+from gridsim.sensing.boxes import cast_boxes, hits_box, nearest_box, stands_ahead
+from gridsim.jit import leaf
+from gridsim.maps.roads import VISIT_CELL, clearance
+from gridsim.sensing.rays import sense
+from gridsim.car.vehicle import act, advance, path_curvature
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+# Fields of a car's state.
+X, Y = 0, 1  # m, centre of mass
+COS, SIN = 2, 3  # heading
+SPEED = 4  # m/s, negative backwards
+STEERING = 5  # rad, left positive
+DISTANCE = 6  # m of new ground
+PACED = 7  # m of new ground at a speed within the scenario's interval
+ODOMETER = 8  # m driven, either way
+DEBT = 9  # m reversed and not yet made good
+IDLE = 10  # control steps in a row without progress
+STEPS = 11  # control steps
+CELL = 12  # index of the visit cell the car is in
+FRESH = 13  # 1 where this cell's ground is new
+FIELDS = 14
+
+SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
+_REENTRY = _F(12.0)  # m: coming back to a cell so soon is the same visit, not a second one
+_VISIT_SCALE = _F(1.0 / VISIT_CELL)
+
+
+class End(IntEnum):
+    """How an episode ended."""
+
+    RUNNING = 0
+    COLLISION = 1  # off the road or into a car
+    IDLE = 2  # too many steps without progress
+    SUCCESS = 3  # the target distance is reached
+    TIME = 4  # the time limit (truncation)
+
+
+# Points on the outline that are checked against the edge, as shares of half length and half width: corners first.
+_OUTLINE = np.array(
+    [[1, 1], [1, -1], [-1, 1], [-1, -1], [0.5, 1], [0.5, -1], [0, 1], [0, -1], [-0.5, 1], [-0.5, -1], [1, 0], [-1, 0]],
+    dtype=np.float32,
+)
+_OUTLINE.setflags(write=False)
+
+
+@leaf
+def collides(road, constants, x, y, cosine, sine):
+    """Whether any part of the car's outline is off the road."""
+    length, width = constants.half_length, constants.half_width
+    # Two circles cover each half of the car: free if both are clear of the edge, without a look at the outline.
+    half = _HALF * length
+    radius = math.sqrt(half * half + width * width)
+    front = clearance(road, x + half * cosine, y + half * sine)
+    rear = clearance(road, x - half * cosine, y - half * sine)
+    if min(front, rear) > radius + _F(0.02):
+        return False
+    if min(front, rear) < _ZERO:
+        return True
+    for k in range(_OUTLINE.shape[0]):
+        along, across = _OUTLINE[k, 0] * length, _OUTLINE[k, 1] * width
+        if clearance(road, x + along * cosine - across * sine, y + along * sine + across * cosine) < _ZERO:
+            return True
+    return False
+
+
+@leaf
+def visit_cell(road, x, y):
+    """Index of the visit cell that holds a point of the torus."""
+    columns = _I(road.width * _VISIT_SCALE)
+    rows = _I(road.height * _VISIT_SCALE)
+    column = min(max(_I(x * _VISIT_SCALE), _I(0)), columns - _I(1))
+    row = min(max(_I(y * _VISIT_SCALE), _I(0)), rows - _I(1))
+    return row * columns + column
+
+
+@leaf
+def place(road, start, car, visits):
+    """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
+    car[:] = _ZERO
+    car[X] = start[0] - math.floor(start[0] / road.width) * road.width
+    car[Y] = start[1] - math.floor(start[1] / road.height) * road.height
+    car[COS], car[SIN] = math.cos(start[2]), math.sin(start[2])
+    car[SPEED], car[STEERING] = start[3], start[4]
+    visits[:] = _F(-1e6)
+    cell = visit_cell(road, car[X], car[Y])
+    car[CELL], car[FRESH] = _F(cell), _ONE
+    visits[cell] = _ZERO
+
+
+@leaf
+def look(road, constants, fan, car, world, beams, ranges, closing):
+    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
+
+    Here and below a world of None is no traffic, and what traffic needs is not even compiled. closing as in
+    `boxes.cast_boxes`; without traffic it is left as it is.
+    """
+    x = car[X] + constants.front_axle * car[COS]
+    y = car[Y] + constants.front_axle * car[SIN]
+    sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
+    if world is not None:
+        speed = car[SPEED]
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], speed, world, ranges, closing)
+
+
+@leaf
+def drive(road, constants, car, visits, world, action):
+    """One control period of one car under one of the eight actions. Returns RUNNING, COLLISION or IDLE.
+
+    Its world's traffic has moved already.
+    """
+    acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
+    car[STEERING] = steering
+    return move(road, constants, car, visits, world, acceleration)
+
+
+@leaf
+def move(road, constants, car, visits, world, acceleration):
+    """One control period with the car's present steering and an acceleration in m/s2."""
+    x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
+    curvature = path_curvature(constants, speed, car[STEERING])
+    fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
+    near = False
+    if world is not None:
+        nearest, closing = nearest_box(world, road.width, road.height, x, y)
+        near = nearest < _F(20.0)
+        if near:
+            fastest += closing
+    parts = _I(1) + _I(fastest * constants.dt / SUBSTEP)
+    dt = constants.dt / _F(parts)
+    moved = _ZERO
+    crashed = False
+    for part in range(parts):
+        x, y, cosine, sine, speed, length = advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
+        moved += length
+        if collides(road, constants, x, y, cosine, sine):
+            crashed = True
+            break
+        if world is not None and near:
+            back = _ONE - _F(part + 1) / _F(parts)
+            if hits_box(constants, world, back, constants.dt, road.width, road.height, x, y, cosine, sine):
+                crashed = True
+                break
+    if x < _ZERO:
+        x += road.width
+    elif x >= road.width:
+        x -= road.width
+    if y < _ZERO:
+        y += road.height
+    elif y >= road.height:
+        y -= road.height
+    car[X], car[Y], car[COS], car[SIN], car[SPEED] = x, y, cosine, sine, speed
+    car[STEPS] += _ONE
+    odometer = car[ODOMETER] + abs(moved)
+    car[ODOMETER] = odometer
+    cell = visit_cell(road, x, y)
+    if _F(cell) != car[CELL]:
+        gap = odometer - visits[cell]
+        car[CELL] = _F(cell)
+        if gap > _REENTRY:
+            car[FRESH] = _ONE if gap > constants.revisit else _ZERO
+    visits[cell] = odometer
+    gained = _ZERO
+    if moved < _ZERO:
+        car[DEBT] -= moved
+    else:
+        paid = min(car[DEBT], moved)
+        car[DEBT] -= paid
+        gained = (moved - paid) * car[FRESH]
+    car[DISTANCE] += gained
+    if road.speed_low <= speed and speed <= road.speed_high:
+        car[PACED] += gained
+    if gained < constants.progress:
+        # Who stands behind a standing car waits as it has to.
+        waits = False
+        if world is not None and near:
+            waits = stands_ahead(constants, world, road.width, road.height, car[X], car[Y], cosine, sine)
+        if not waits:
+            car[IDLE] += _ONE
+    else:
+        car[IDLE] = _ZERO
+    if crashed:
+        return 1
+    if car[IDLE] >= _F(constants.patience):
+        return 2
+    return 0
+
+
+@leaf
+def control(road, constants, car, visits, world, acceleration, target, max_steps):
+    """`move`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
+    end = move(road, constants, car, visits, world, acceleration)
+    if end == 0:
+        if car[DISTANCE] >= target:
+            return 3
+        if car[STEPS] >= max_steps:
+            return 4
+    return end

@@ -1,0 +1,1 @@
+"""Batches of cars, and the Gymnasium environments."""

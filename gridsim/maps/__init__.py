@@ -1,0 +1,1 @@
+"""What is driven on: roads, lanes and their network, clearance fields, and maps from files."""

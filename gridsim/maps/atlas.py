@@ -1,0 +1,99 @@
+"""Several maps as one set of arrays, so that cars on different maps are one call of a kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.jit import njit
+from gridsim.maps.network import Network
+from gridsim.maps.roads import Road, freeze
+
+LANE_ARRAYS = (
+    "points", "speeds", "offsets", "steps", "successors", "left", "right", "crossing_offsets", "crossings", "clear",
+    "room", "boxes",
+)  # fmt: skip
+
+
+class Atlas(NamedTuple):
+    """Roads one after another; all arrays read-only and C-contiguous."""
+
+    field: np.ndarray  # as `Road.field`, of all maps
+    start_row: np.ndarray  # as `Road.start_row`
+    start: np.ndarray  # as `Road.start`
+    bounds: np.ndarray  # int64 [maps + 1, 3], where each map's part of these three begins
+    sides: np.ndarray  # uint32 [maps, 3], columns, rows and `Road.thin`
+    sizes: np.ndarray  # float32 [maps, 4], width and height (m), lower and upper speed (m/s)
+    lanes: Network  # arrays of all maps' networks
+    lane_bounds: np.ndarray  # int64 [maps + 1, 3], where each map's points, lanes and crossings begin
+
+
+def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
+    """Lay maps one after another: a copy, unless there is one alone."""
+    lanes = networks[0]
+    if len(networks) > 1:
+        most = max(network.successors.shape[1] for network in networks)
+        columns = {name: [getattr(network, name) for network in networks] for name in LANE_ARRAYS}
+        columns["successors"] = [
+            np.pad(array, ((0, 0), (0, most - array.shape[1])), constant_values=-1) for array in columns["successors"]
+        ]
+        together = {name: freeze(np.concatenate(arrays)) for name, arrays in columns.items()}
+        lanes = Network(**together, width=lanes.width, height=lanes.height)
+    sizes = [(len(network.points), len(network.steps), len(network.crossings)) for network in networks]
+    parts = [(road.field, road.start_row, road.start) for road in roads]
+    lengths = np.array([[len(array) for array in part] for part in parts], dtype=np.int64)
+    arrays = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
+    field, start_row, start = (freeze(array) for array in arrays)
+    return Atlas(
+        field=field,
+        start_row=start_row,
+        start=start,
+        bounds=freeze(np.concatenate([np.zeros((1, 3), dtype=np.int64), np.cumsum(lengths, axis=0)])),
+        sides=freeze(np.array([[r.columns, r.rows, r.thin] for r in roads], dtype=np.uint32)),
+        sizes=freeze(np.array([[r.width, r.height, r.speed_low, r.speed_high] for r in roads], dtype=np.float32)),
+        lanes=lanes,
+        lane_bounds=freeze(np.concatenate([[[0, 0, 0]], np.cumsum(np.array(sizes, dtype=np.int64), axis=0)])),
+    )
+
+
+@njit
+def road_of(atlas: Atlas, m: int) -> Road:
+    """Map m of an atlas."""
+    here, there = atlas.bounds[m], atlas.bounds[m + 1]
+    return Road(
+        atlas.field[here[0] : there[0]],
+        atlas.start_row[here[1] : there[1]],
+        atlas.start[here[2] : there[2]],
+        atlas.sides[m, 0],
+        atlas.sides[m, 1],
+        atlas.sizes[m, 0],
+        atlas.sizes[m, 1],
+        atlas.sizes[m, 2],
+        atlas.sizes[m, 3],
+        atlas.sides[m, 2],
+    )
+
+
+@njit
+def network_of(atlas: Atlas, m: int) -> Network:
+    """The lanes of map m of an atlas."""
+    here, there = atlas.lane_bounds[m], atlas.lane_bounds[m + 1]
+    lanes = atlas.lanes
+    return Network(
+        lanes.points[here[0] : there[0]],
+        lanes.speeds[here[0] : there[0]],
+        lanes.offsets[here[1] + m : there[1] + m + 1],
+        lanes.steps[here[1] : there[1]],
+        lanes.successors[here[1] : there[1]],
+        lanes.left[here[1] : there[1]],
+        lanes.right[here[1] : there[1]],
+        lanes.crossing_offsets[here[1] + m : there[1] + m + 1],
+        lanes.crossings[here[2] : there[2]],
+        lanes.clear[here[2] : there[2]],
+        lanes.room[here[0] : there[0]],
+        lanes.boxes[here[1] : there[1]],
+        atlas.sizes[m, 0],
+        atlas.sizes[m, 1],
+    )

@@ -1,0 +1,393 @@
+"""Maps from files: a picture in which bright is road, or the YAML form of ROS's map_server with a picture.
+
+A picture is thresholded at its own resolution; its signed distance to the edge between road and wall, sampled at the
+nodes of the clearance field, is what cars and rays meet. Unknown is wall, and so is all that lies outside of the
+picture, unless it is a torus. The world's point (0, 0) is the picture's lower left corner; a file's own coordinates
+are that plus its `origin`.
+
+A file is one map, whatever the seed. It has no lanes: episodes begin at `Scenario.starts`, poses on the ridge of the
+free space, headed along it either way, or those that the file names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import os
+import reprlib
+import stat
+import warnings
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from PIL import Image
+
+from gridsim.config import SimConfig, VehicleConfig
+from gridsim.maps.network import make_network
+from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
+from gridsim.maps.roads import (
+    CELLS_PER_M,
+    FIELD_FLOOR,
+    FIELD_UNITS,
+    HEADING_BINS,
+    HEADING_WRAP,
+    MEMORY_LIMIT_CELLS,
+    START_CELLS_PER_M,
+    Lanes,
+    Strips,
+    freeze,
+    make_road,
+    power_of_two,
+)
+from gridsim.maps.scenarios import FILE_SPEEDS, START_SPEED, Scenario, label
+
+PIXELS_PER_M = 16.0  # of a picture without a scale of its own
+PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
+YAMLS = (".yaml", ".yml")
+KEYS = (
+    "image", "resolution", "scale", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "torus",
+    "speed",
+)  # fmt: skip
+
+MAX_YAML = 1 << 16  # bytes
+MAX_IMAGE = 1 << 27  # bytes
+MAX_PIXELS = 1 << 26
+MAX_TABLE = 1 << 28  # bytes of the table of start ranges
+RESOLUTION = (0.01, 1.0)  # m a pixel, from, to
+SHORTEST_SIDE = 16  # m
+
+
+@dataclass(frozen=True)
+class MapFile:
+    """What a map's file says.
+
+    Attributes:
+        image: the picture's path.
+        resolution: m a pixel.
+        origin: x, y (m) of the picture's lower left corner in the file's own coordinates.
+        negate: whether dark is road.
+        free_thresh: darkness, 0 to 1, below which a pixel is road.
+        starts: rows of x, y (m, the file's coordinates), heading (rad, NaN: along the road); empty: to be found.
+        torus: whether leaving on one side means entering on the other.
+        speed: m/s, the interval within which speed counts.
+    """
+
+    image: Path
+    resolution: float = 1.0 / PIXELS_PER_M
+    origin: tuple[float, float] = (0.0, 0.0)
+    negate: bool = False
+    free_thresh: float = 0.5
+    starts: tuple[tuple[float, float, float], ...] = ()
+    torus: bool = False
+    speed: tuple[float, float] = FILE_SPEEDS
+
+
+def load_map(name: str, config: SimConfig | None = None) -> Scenario:
+    """The map of a file; the same object as long as the file stays as it is.
+
+    Raises: ValueError with one line that says what is wrong with the file.
+    """
+    path = Path(os.path.abspath(name))
+    return _load(str(path), *(_stamp(file) for file in _files(path)), config=config or SimConfig())
+
+
+def short_lap(name: str, config: SimConfig) -> str:
+    """A line to warn with where a file's road is too short for a lap that counts twice, else ""."""
+    road, revisit = load_map(name, config).road, config.episode.revisit
+    nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
+    length = road_length(nodes)
+    if length > 1.05 * revisit:  # it is an estimate
+        return ""
+    return (
+        f"{label(name)} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts nothing: "
+        "cars end idle in their second lap. Make the road longer, or its resolution larger"
+    )
+
+
+def map_digest(name: str) -> str:
+    """SHA-256 of the bytes that a map is made of. Raises: ValueError with one line if they cannot be read."""
+    path = Path(os.path.abspath(name))
+    limits = (MAX_YAML, MAX_IMAGE) if path.suffix.lower() in YAMLS else (MAX_IMAGE,)
+    digests = [hashlib.sha256(_bytes(f, limit)).digest() for f, limit in zip(_files(path), limits, strict=True)]
+    return hashlib.sha256(b"".join(digests)).hexdigest()
+
+
+def read_map_file(path: Path) -> MapFile:
+    """Read and check a map's YAML, or take a picture as it is. The picture is not opened.
+
+    Raises: ValueError with one line.
+    """
+    suffix = path.suffix.lower()
+    if suffix in PICTURES:
+        return MapFile(path)
+    if suffix not in YAMLS:
+        raise ValueError(f"{path}: a map is a .yaml file of map_server's form or a picture ({', '.join(PICTURES)})")
+    text = _bytes(path, MAX_YAML)
+    try:
+        values = yaml.safe_load(text)
+    except Exception as error:  # PyYAML raises a dozen kinds of them on input that is no YAML
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{path}: no plain YAML{where}: {getattr(error, 'problem', None) or _shown(error)}") from None
+    try:
+        return _checked(path, values)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+# ------------------------------------------------------------------------------------------------------- the file
+
+
+def _shown(value: object) -> str:
+    """A value in a few characters of one line, however large or nested it is."""
+    try:
+        text = " ".join(reprlib.repr(value).split())
+    except ValueError:  # a number of more digits than Python prints
+        return "what it is"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    """What changes when a file does. Raises: ValueError unless it is a file that can be read."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror or error}") from None
+    except ValueError:
+        raise ValueError(f"{_shown(str(path))} is no path of a file") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"{path}: not a file")
+    return str(path), status.st_mtime_ns, status.st_size
+
+
+def _bytes(path: Path, limit: int) -> bytes:
+    size = _stamp(path)[2]
+    if size > limit:
+        raise ValueError(f"{path}: {size:,} bytes are too many; at most {limit:,}")
+    try:
+        with path.open("rb") as file:
+            return file.read(limit)
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror or error}") from None
+
+
+def _files(path: Path) -> list[Path]:
+    """The files that a map is made of."""
+    image = read_map_file(path).image
+    return [image] if image == path else [path, image]
+
+
+def _number(value: Any, what: str, low: float, high: float) -> float:
+    """A number within limits. (YAML 1.1 takes 5e-2 for a word; ROS does not.)"""
+    number = value
+    if isinstance(value, str):
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+    if isinstance(number, bool) or not isinstance(number, int | float) or not low <= number <= high:
+        raise ValueError(f"{what} must be a number from {low:g} to {high:g}, not {_shown(value)}")
+    return float(number)
+
+
+def _flag(value: Any, what: str) -> bool:
+    if not isinstance(value, bool | int) or value not in (0, 1):
+        raise ValueError(f"{what} must be true or false, not {_shown(value)}")
+    return bool(value)
+
+
+def _list(value: Any, what: str, lengths: tuple[int, ...]) -> list[Any]:
+    if not isinstance(value, list) or len(value) not in lengths:
+        wanted = " or ".join(map(str, lengths))
+        raise ValueError(f"{what} must be a list of {wanted} numbers, not {_shown(value)}")
+    return value
+
+
+def _checked(path: Path, values: Any) -> MapFile:
+    """What a YAML's values mean. Raises: ValueError with one line, without the file's name."""
+    if not isinstance(values, dict):
+        raise ValueError(f"a map's YAML is a mapping with image and resolution, not {_shown(values)}")
+    unknown = [key for key in values if key not in KEYS]
+    if unknown:
+        raise ValueError(f"unknown key {_shown(unknown[0])}; there are: {', '.join(KEYS)}")
+    if "image" not in values or ("resolution" in values) == ("scale" in values):
+        raise ValueError("it needs an image, and either its resolution (m a pixel) or its scale (pixels a metre)")
+    if "scale" in values:
+        resolution = 1.0 / _number(values["scale"], "scale (pixels a metre)", 1.0 / RESOLUTION[1], 1.0 / RESOLUTION[0])
+    else:
+        resolution = _number(values["resolution"], "resolution (m a pixel)", *RESOLUTION)
+    mode = values.get("mode", "trinary")
+    if mode not in ("trinary", "scale"):
+        raise ValueError(f"mode must be trinary or scale (which mean the same here), not {_shown(mode)}")
+    origin = _list(values.get("origin", [0.0, 0.0, 0.0]), "origin", (3,))
+    x, y, yaw = (_number(value, "origin's x, y (m) and yaw (rad)", -1e7, 1e7) for value in origin)
+    if abs(yaw) > 1e-6:
+        raise ValueError(f"origin's yaw must be 0, not {yaw:g}; turn the picture instead")
+    free = _number(values.get("free_thresh", 0.196), "free_thresh", 0.0, 1.0)
+    occupied = _number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
+    if not 0.0 < free <= occupied:
+        raise ValueError(f"free_thresh must be above 0 and not above occupied_thresh, not {free:g} with {occupied:g}")
+    low, high = (
+        _number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit)
+        for value in _list(values.get("speed", list(FILE_SPEEDS)), "speed", (2,))
+    )
+    if not low < high:
+        raise ValueError(f"speed must be an interval from low to high, not {low:g} to {high:g}")
+    return MapFile(
+        image=_image_path(path, values["image"]),
+        resolution=resolution,
+        origin=(x, y),
+        negate=_flag(values.get("negate", 0), "negate"),
+        free_thresh=free,
+        starts=_given_starts(values.get("starts", [])),
+        torus=_flag(values.get("torus", False), "torus"),
+        speed=(low, high),
+    )
+
+
+def _given_starts(values: Any) -> tuple[tuple[float, float, float], ...]:
+    if not isinstance(values, list):
+        raise ValueError(f"starts must be a list of [x, y] or [x, y, heading], not {_shown(values)}")
+    starts = []
+    for value in values:
+        x, y, *heading = _list(value, "a start", (2, 3))
+        starts.append(
+            (
+                _number(x, "a start's x (m)", -1e8, 1e8),
+                _number(y, "a start's y (m)", -1e8, 1e8),
+                _number(heading[0], "a start's heading (rad)", -2 * math.pi, 2 * math.pi) if heading else math.nan,
+            )
+        )
+    return tuple(starts)
+
+
+def _image_path(path: Path, image: Any) -> Path:
+    """The path of a YAML's picture, which lies in the YAML's folder or below."""
+    if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
+        raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {_shown(image)}")
+    folder = path.parent
+    try:
+        inside = not Path(image).is_absolute() and (folder / image).resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError):  # a null character, a link to itself
+        raise ValueError(f"image: {_shown(image)} is no path of a file") from None
+    if not inside:
+        raise ValueError(f"image: {_shown(image)} must lie in the YAML's own folder or below it")
+    return folder / image
+
+
+# ---------------------------------------------------------------------------------------------------- the picture
+
+
+def read_free(file: MapFile) -> np.ndarray:
+    """Which pixels are road: bool [rows, columns], the lowest row first.
+
+    Raises: ValueError with one line for what is no picture, too large a one, or all road or all wall.
+    """
+    data = _bytes(file.image, MAX_IMAGE)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limit is lower
+            picture = Image.open(io.BytesIO(data), formats=tuple(dict.fromkeys(PICTURES.values())))
+        width, height = picture.size
+    except Image.DecompressionBombError:
+        raise ValueError(f"{file.image}: more than {MAX_PIXELS:,} pixels; make the picture smaller") from None
+    except Exception:
+        raise ValueError(f"{file.image}: no picture that can be read ({', '.join(PICTURES)})") from None
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"{file.image}: {width:,} x {height:,} pixels are more than {MAX_PIXELS:,}; make it smaller")
+    try:
+        free = _free(picture, file)
+    except Exception as error:  # decoders raise a dozen kinds of them
+        raise ValueError(f"{file.image}: truncated or damaged: {_shown(str(error))}") from None
+    if not free.any():
+        raise ValueError(f"{file.image}: all wall; road is what is {'darker' if file.negate else 'brighter'}")
+    if free.all():
+        raise ValueError(f"{file.image}: all road; wall is what is {'brighter' if file.negate else 'darker'}")
+    return free[::-1]
+
+
+def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
+    """Road bool [rows, columns] of a picture, decoded here: its darkness is below the threshold, and it is opaque."""
+    if picture.mode == "F":
+        raise ValueError("its pixels are real numbers; save it with 8 or 16 bits")
+    if picture.mode.startswith("I"):
+        light, full = np.asarray(picture).astype(np.uint16), 65_535
+        opaque = None
+    else:
+        opaque = None
+        if picture.has_transparency_data:
+            picture = picture.convert("RGBA")
+            opaque = np.asarray(picture.getchannel("A")) >= 128
+        if picture.mode != "L":
+            # The mean of the channels, as in map_server, not how bright the eye finds them.
+            picture = picture.convert("RGB").convert("L", (1 / 3, 1 / 3, 1 / 3, 0))
+        light, full = np.asarray(picture), 255
+    values = np.arange(full + 1) / full
+    free = ((values if file.negate else 1.0 - values) < file.free_thresh)[light]
+    return free if opaque is None else free & opaque
+
+
+def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
+    """Columns and rows of the field, in nodes: powers of two."""
+    sides = []
+    for axis in (0, 1):
+        pixels = free.shape[1 - axis]
+        if file.torus:
+            nodes = pixels * file.resolution * CELLS_PER_M
+            side = 1 << max(round(math.log2(nodes)), 0)
+            if abs(nodes / side - 1.0) > 1e-3 or side < SHORTEST_SIDE * CELLS_PER_M:
+                raise ValueError(
+                    f"a torus' sides must be {SHORTEST_SIDE}, 32, 64 ... m, not {pixels} pixels of "
+                    f"{file.resolution:g} m; scale the picture, or set its resolution"
+                )
+        else:
+            used = np.flatnonzero(free.any(axis=axis))
+            first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
+            side = power_of_two(max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE) * CELLS_PER_M)
+        sides.append(side)
+    columns, rows = sides
+    width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
+    if columns * rows > MEMORY_LIMIT_CELLS:
+        raise ValueError(
+            f"a world of {width:,.0f} m x {height:,.0f} m (its sides are powers of two) is too large: "
+            f"at most {MEMORY_LIMIT_CELLS / CELLS_PER_M**2:,.0f} square metres; check the resolution, or crop it"
+        )
+    return columns, rows
+
+
+@lru_cache(maxsize=4)
+def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Scenario:
+    """Build a map. `stamps` tell a file that has changed."""
+    path = Path(name)
+    file = read_map_file(path)
+    free = read_free(file)
+    try:
+        columns, rows = _sides(free, file)
+        nodes = signed_clearance(free, file.resolution, columns, rows, file.torus)
+        area = np.count_nonzero(nodes > 0.0) / CELLS_PER_M**2
+        if area * START_CELLS_PER_M**2 * (HEADING_BINS + HEADING_WRAP) > MAX_TABLE:
+            raise ValueError(f"{area:,.0f} square metres of road are too much; check the resolution, or crop it")
+        if file.starts:
+            poses = complete_starts(nodes, np.array(file.starts) - [*file.origin, 0.0], config.vehicle)
+        else:
+            poses = find_starts(nodes, config.vehicle)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    starts = np.zeros((len(poses), 5), dtype=np.float32)
+    starts[:, :3], starts[:, 3] = poses, START_SPEED
+    lanes = Lanes.none()
+    return Scenario(
+        name=name,
+        seed=0,
+        road=make_road(nodes, file.speed, config.sensors.range),
+        lanes=lanes,
+        strips=Strips(freeze(np.zeros((0, 5))), freeze(np.zeros((0, 6))), freeze(np.zeros((0, 5)))),
+        network=make_network(lanes, columns / CELLS_PER_M, rows / CELLS_PER_M, 0.0, config.traffic),
+        torus=file.torus,
+        starts=freeze(starts),
+    )

@@ -1,0 +1,1 @@
+"""A builder a scenario: each makes a map from a seed."""

@@ -1,0 +1,138 @@
+"""The city: narrow irregular blocks on a torus, plain crossings with tight corners, parked cars in bays at the kerb.
+
+Streets run along the axes at irregular distances; some pieces of them are missing, so that there are Ts and bends
+beside crossings. A bay widens the road on one side of a street; the cars in it are blocks that stay off the lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from gridsim.maps.lanes import Path, lay_lanes, through_square
+from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.generators.seamless import DIRECTIONS, square_strips, turned
+
+SIDE = 256.0  # m, of the torus
+LANE_WIDTH = 3.0  # m
+HALF_ROAD = (3.4, 3.6)  # m, centre line to the kerb, drawn for each map
+CORNER = (8.0, 10.0)  # m, radius of the roads' centre lines round a corner, drawn for each crossing
+# Streets along one axis and the other, each with the least distance between those along that axis (m). The lane round
+# the smallest block, corners cut, is longer than the 200 m within which ground driven again counts nothing.
+GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
+MISSING = 0.2  # of the pieces of streets between crossings, at most
+BAY_SHARE = 0.6  # of the sides of streets
+BAY_DEPTH = 2.0  # m
+BAY_LENGTH = 12.0  # m, at least, without its slanting ends
+BAY_AWAY = 5.5  # m from the crossing, at least
+CAR = (2.0, 0.9)  # m, half length and half width of a parked car
+CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
+CAR_SHARE = 0.7  # of the places
+CAR_SKEW = 0.05  # rad either way
+CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
+
+
+def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray:
+    """Where on the torus the streets across one axis are, in m: `least` apart."""
+    gaps = least + (SIDE - count * least) * rng.dirichlet(np.full(count, 2.0))
+    return rng.uniform(0.0, SIDE) + np.concatenate([[0.0], np.cumsum(gaps[:-1])])
+
+
+def street_graph(rng: np.random.Generator, columns: int, rows: int) -> np.ndarray:
+    """Open edges bool [rows, columns, 4] (east, north, west, south): connected, two or more at every crossing."""
+    edges = np.ones((rows, columns, 4), dtype=bool)
+    pairs = [(j, i, d) for j in range(rows) for i in range(columns) for d in (0, 1)]
+    left = int(MISSING * len(pairs))
+    for k in rng.permutation(len(pairs)):
+        j, i, d = pairs[k]
+        dx, dy = DIRECTIONS[d]
+        other = ((j + dy) % rows, (i + dx) % columns)
+        if left and edges[j, i].sum() > 2 and edges[other].sum() > 2:
+            edges[j, i, d] = edges[other][d + 2] = False
+            if _connected(edges):
+                left -= 1
+            else:
+                edges[j, i, d] = edges[other][d + 2] = True
+    return edges
+
+
+def _connected(edges: np.ndarray) -> bool:
+    rows, columns, _ = edges.shape
+    seen, stack = {(0, 0)}, [(0, 0)]
+    while stack:
+        j, i = stack.pop()
+        for d in np.flatnonzero(edges[j, i]):
+            place = ((j + DIRECTIONS[d][1]) % rows, (i + DIRECTIONS[d][0]) % columns)
+            if place not in seen:
+                seen.add(place)
+                stack.append(place)
+    return len(seen) == rows * columns
+
+
+def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tuple[float, float, float]]:
+    """Parked cars of a bay: m along the street, m from the middle of the bay towards the lane, rad askew."""
+    along = first + CAR[0] + rng.uniform(0.0, 1.0)
+    while along + CAR[0] <= last:
+        if rng.random() < CAR_SHARE:
+            yield along, rng.uniform(0.0, CAR_OUT), rng.uniform(-CAR_SKEW, CAR_SKEW)
+        along += rng.uniform(*CAR_PITCH)
+
+
+def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
+    """Lay a city: (strips, lanes, width m, height m)."""
+    (columns, apart_x), (rows, apart_y) = GRIDS[rng.integers(len(GRIDS))]
+    xs, ys = _positions(rng, columns, apart_x), _positions(rng, rows, apart_y)
+    edges = street_graph(rng, columns, rows)
+    corner = rng.uniform(*CORNER, (rows, columns))
+    half_road = rng.uniform(*HALF_ROAD)
+    bay_half = half_road + BAY_DEPTH / 2  # a bay is a strip as wide as the road and itself
+    lines: list[list[float]] = []
+    arcs: list[list[float]] = []
+    blocks: list[list[float]] = []
+    paths: list[Path] = []
+
+    def street(x: float, y: float, d: int, length: float) -> None:
+        """A piece of street from (x, y), with its lanes, bays and parked cars."""
+        (ux, uy), heading = DIRECTIONS[d], d * math.pi / 2
+
+        def place(along: float, left: float) -> tuple[float, float]:
+            return x + along * ux - left * uy, y + along * uy + left * ux
+
+        lines.append([*place(0.0, 0.0), *place(length, 0.0), half_road])
+        right, left = place(0.0, -LANE_WIDTH / 2), place(length, LANE_WIDTH / 2)
+        paths.append(Path(*right, heading, ((length, 0.0),)))
+        paths.append(Path(*left, heading + math.pi, ((length, 0.0),)))
+        for side in (1.0, -1.0):
+            spare = length - 2 * BAY_AWAY - BAY_LENGTH
+            if rng.random() >= BAY_SHARE or spare < 0.0:
+                continue
+            before, after = np.sort(rng.uniform(0.0, spare, 2))
+            first, last = BAY_AWAY + before, length - BAY_AWAY - (spare - after)
+            shift = side * BAY_DEPTH / 2
+            lines.append([*place(first, shift), *place(last, shift), bay_half])
+            for along, out, skew in _parked(rng, first, last):
+                blocks.append([*place(along, side * (bay_half - out)), heading + skew, *CAR])
+
+    for j in range(rows):
+        for i in range(columns):
+            x, y, half = float(xs[i]), float(ys[j]), float(corner[j, i])
+            arms = [int(d) for d in np.flatnonzero(edges[j, i])]
+            here_lines, here_arcs = square_strips(arms, half, half_road)
+            lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in here_lines]
+            arcs += [[a + x, b + y, *rest] for a, b, *rest in here_arcs]
+            for entry in arms:
+                edge_x, edge_y = turned(np.array([half, LANE_WIDTH / 2]), entry)
+                for exit in arms:
+                    if exit != entry:
+                        pieces = through_square((exit - entry) % 4, half, LANE_WIDTH / 2)
+                        paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, pieces))
+            if edges[j, i, 0]:
+                gap = (xs[(i + 1) % columns] - x) % SIDE
+                street(x + half, y, 0, gap - half - corner[j, (i + 1) % columns])
+            if edges[j, i, 1]:
+                gap = (ys[(j + 1) % rows] - y) % SIDE
+                street(x, y + half, 1, gap - half - corner[(j + 1) % rows, i])
+    strips = Strips(np.array(lines), np.array(arcs).reshape(-1, 6), np.array(blocks).reshape(-1, 5))
+    return strips, lay_lanes(paths, SIDE, SIDE), SIDE, SIDE

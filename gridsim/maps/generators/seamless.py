@@ -1,0 +1,192 @@
+"""The seamless road network: square tiles on a torus, laid from a random graph, so that the road never ends.
+
+Every tile is read off the edges its node has in the graph: two opposite ones make a straight, two others a curve, three
+a T, four a crossing; now and then a T or crossing is built as a roundabout. No node has one edge alone, so every open
+edge meets an open edge and every lane has a successor. No block of the network has fewer than ten tiles around it:
+round one it is more than the 200 m within which a stretch that is driven again counts nothing, corners cut and all.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.maps.lanes import Path, lay_lanes, through_square
+from gridsim.maps.roads import Lanes, Strips
+
+TILE = 32.0  # m, side of a tile
+TILES = 8  # along each side of the torus
+LANE_WIDTH = 3.5  # m
+SHOULDER = 0.5  # m of paved road outside the outer lane
+HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
+ROUNDABOUT_RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
+ROUNDABOUT_HALF = 4.5  # m, half width of the ring, which is wide enough for a lorry to turn
+ROUNDABOUT_FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
+FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those: their outer edge runs on into the arm's
+ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles of the seamless road
+FEWEST_ROUNDABOUTS = 6  # of a map of the roundabout scenario
+EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
+SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
+
+# Edges of a tile in counter-clockwise order: east, north, west, south.
+DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+
+def _closes_short_block(edges: np.ndarray, tile: int, direction: int) -> bool:
+    """Whether an edge [n, 4] from a tile would close a block of fewer than SHORTEST_BLOCK tiles.
+
+    Searched on the plane that the torus is rolled from: a way round the whole torus is no block.
+    """
+    x0, y0 = tile % TILES, tile // TILES
+    goal = DIRECTIONS[direction]
+    frontier, seen = {(0, 0)}, {(0, 0)}
+    for _ in range(SHORTEST_BLOCK - 2):
+        frontier = {
+            (x + DIRECTIONS[d][0], y + DIRECTIONS[d][1])
+            for x, y in frontier
+            for d in range(4)
+            if edges[(y0 + y) % TILES * TILES + (x0 + x) % TILES, d]
+        } - seen
+        seen |= frontier
+        if goal in frontier:
+            return True
+    return False
+
+
+def _neighbour(tile: int, direction: int) -> int:
+    dx, dy = DIRECTIONS[direction]
+    return (tile // TILES + dy) % TILES * TILES + (tile % TILES + dx) % TILES
+
+
+def tile_graph(rng: np.random.Generator) -> np.ndarray:
+    """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends."""
+    while True:
+        edges = np.zeros((TILES * TILES, 4), dtype=bool)
+        pairs = [(tile, d) for tile in range(TILES * TILES) for d in (0, 1)]
+        for k in rng.permutation(len(pairs))[: round(EDGE_SHARE * len(pairs))]:
+            tile, d = pairs[k]
+            other = _neighbour(tile, d)
+            if not _closes_short_block(edges, tile, d):
+                edges[tile, d] = edges[other, (d + 2) % 4] = True
+        while (ends := np.flatnonzero(edges.sum(axis=1) == 1)).size:
+            for tile in ends:
+                for d in np.flatnonzero(edges[tile]):
+                    edges[tile, d] = edges[_neighbour(int(tile), int(d)), (d + 2) % 4] = False
+        largest = _largest_component(edges)
+        edges[~largest] = False
+        if largest.sum() >= TILES * TILES // 2:
+            return edges
+
+
+def _largest_component(edges: np.ndarray) -> np.ndarray:
+    """Mask [tiles] of the largest connected part."""
+    label = np.full(len(edges), -1)
+    for tile in range(len(edges)):
+        stack = [tile] if label[tile] < 0 and edges[tile].any() else []
+        while stack:
+            here = stack.pop()
+            if label[here] < 0:
+                label[here] = tile
+                stack += [_neighbour(here, d) for d in range(4) if edges[here, d]]
+    used = label[label >= 0]
+    return label == np.bincount(used).argmax() if used.size else label >= 0
+
+
+def _flare() -> tuple[float, float, float]:
+    """The arc by which an arm's lane joins the ring: (x, y of its centre for the eastern arm, ring angle in rad).
+
+    It touches the lane's centre line from the right and the ring's from outside.
+    """
+    y = LANE_WIDTH / 2 + ROUNDABOUT_FLARE
+    x = math.sqrt((ROUNDABOUT_RADIUS + ROUNDABOUT_FLARE) ** 2 - y**2)
+    return x, y, math.atan2(y, x)
+
+
+def turned(points: np.ndarray, quarters: int) -> np.ndarray:
+    """Points [n, 2] turned counter-clockwise by so many quarters."""
+    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
+    return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
+
+
+def _around(turn: int) -> tuple[tuple[float, float], ...]:
+    """Pieces of the lane through a roundabout: in on the right, counter-clockwise round the ring, out on the right."""
+    x, _, angle = _flare()
+    straight = (TILE / 2 - x, 0.0)
+    flare = ((math.pi / 2 - angle) * ROUNDABOUT_FLARE, -1.0 / ROUNDABOUT_FLARE)
+    ring = ((turn * math.pi / 2 - 2 * angle) * ROUNDABOUT_RADIUS, 1.0 / ROUNDABOUT_RADIUS)
+    return (straight, flare, ring, flare, straight)
+
+
+def _ring_strips(arms: list[int]) -> tuple[list[list[float]], list[list[float]]]:
+    """Lines and arcs of a roundabout centred on the origin."""
+    half = TILE / 2
+    x, y, angle = _flare()
+    lines: list[list[float]] = []
+    arcs = [[0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF]]
+    for arm in arms:
+        dx, dy = DIRECTIONS[arm]
+        inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
+        lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
+        for side in (1.0, -1.0):  # way in, way out
+            (cx, cy), first = turned(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
+            arcs.append([cx, cy, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
+    return lines, arcs
+
+
+def square_strips(arms: list[int], half: float, half_road: float) -> tuple[list[list[float]], list[list[float]]]:
+    """Lines and arcs that join the middles of those sides of a square (of side 2 * half, centred on the origin)."""
+    lines: list[list[float]] = []
+    arcs: list[list[float]] = []
+    if len(arms) == 3:
+        # Paved already; but where the edges of the other three strips meet, none of them knows how wide the road is.
+        dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
+        lines.append([dx * half, dy * half, 0.0, 0.0, half_road])
+    for k, a in enumerate(arms):
+        for b in arms[k + 1 :]:
+            ax, ay = DIRECTIONS[a]
+            bx, by = DIRECTIONS[b]
+            if (b - a) % 4 == 2:
+                lines.append([ax * half, ay * half, bx * half, by * half, half_road])
+            else:
+                first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
+                sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
+                arcs.append([half * (ax + bx), half * (ay + by), half, first, sweep, half_road])
+    return lines, arcs
+
+
+def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
+    """Lay a network: (strips, lanes, width m, height m)."""
+    return _layout(rng, tile_graph(rng), ROUNDABOUT_SHARE)
+
+
+def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
+    """Lay a network in which every T and crossing is a roundabout: (strips, lanes, width m, height m)."""
+    while True:
+        edges = tile_graph(rng)
+        if (edges.sum(axis=1) > 2).sum() >= FEWEST_ROUNDABOUTS:
+            return _layout(rng, edges, 1.0)
+
+
+def _layout(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[Strips, Lanes, float, float]:
+    """Tiles and lanes along a graph's edges; this share of the T and crossing tiles are roundabouts."""
+    lines: list[list[float]] = []
+    arcs: list[list[float]] = []
+    paths: list[Path] = []
+    for tile in range(len(edges)):
+        arms = [int(d) for d in np.flatnonzero(edges[tile])]
+        roundabout = rng.random() < share and len(arms) > 2
+        x, y = (tile % TILES + 0.5) * TILE, (tile // TILES + 0.5) * TILE
+        tile_lines, tile_arcs = _ring_strips(arms) if roundabout else square_strips(arms, TILE / 2, HALF_ROAD)
+        lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in tile_lines]
+        arcs += [[a + x, b + y, *rest] for a, b, *rest in tile_arcs]
+        for entry in arms:
+            edge_x, edge_y = turned(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
+            for exit in arms:
+                if exit != entry:
+                    turn = (exit - entry) % 4
+                    pieces = _around(turn) if roundabout else through_square(turn, TILE / 2, LANE_WIDTH / 2)
+                    paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, pieces))
+    lanes = lay_lanes(paths, TILE * TILES, TILE * TILES)
+    strips = Strips(np.array(lines, dtype=np.float64).reshape(-1, 5), np.array(arcs, dtype=np.float64).reshape(-1, 6))
+    return strips, lanes, TILE * TILES, TILE * TILES

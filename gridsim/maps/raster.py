@@ -1,0 +1,255 @@
+"""From pixels to a map: the signed clearance of what is road in a picture, and where on it a car can start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gridsim.config import VehicleConfig
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
+
+OUTSIDE = -FIELD_FLOOR  # m of wall around what is road, at least: it must not show through the sides of the field
+_FINE = 0.25  # m, largest pixels that distances are measured on; larger ones are cut up
+_WALL = 0.4  # m, half of what walls are thickened to: above 0.36 m, no speck lies unseen between four nodes
+_TIP = 0.25  # m that a corner may stick out of where a disc of that radius fits, and is no thin wall
+_DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m of clearance, beyond which all is the same
+_HALO = _DEEPEST + 2.0  # m around a tile that may matter to it
+_TILE = 128  # nodes
+
+_MARGIN = 0.3  # m around a car at a start that was found
+_TOUCH = 0.05  # m around a car at a start that was given
+_AHEAD = 6.0  # m that a car at a start can go straight on
+_EXTENT = 30.0  # m that a road extends, at least, for a car to be put on it
+_SMOOTH = 3.0  # m, standard deviation of the window in which a road's direction is taken
+_COHERENCE = 0.5  # of directions in there, from 0 (a plaza, a crossing) to 1 (a straight road)
+_STARTS = 512
+_NODE = 1.0 / CELLS_PER_M  # m
+_BACK = np.array([0.0, 0.0, math.pi])
+
+
+def _thickened(free: np.ndarray, depth: np.ndarray, pixel: float) -> np.ndarray | None:
+    """Road without what thin walls are thickened by, so that the nodes of the field cannot miss them.
+
+    A wall is thin where no disc of _WALL fits into it; every point of its middle line becomes such a disc. `depth` is
+    the distance (m) of a wall's pixels to the road. None if there is no thin wall.
+    """
+    middle = ~free & (depth < _WALL) & (depth >= ndimage.maximum_filter(depth, size=3))
+    if not middle.any():
+        return None
+    thick = depth >= _WALL
+    if thick.any():
+        middle &= ndimage.distance_transform_edt(~thick) * pixel > _WALL + _TIP
+        if not middle.any():
+            return None
+    return free & (ndimage.distance_transform_edt(~middle) * pixel > _WALL)
+
+
+def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
+    """Distance (m) of pixels' centres to the edge between road and wall, positive on the road."""
+
+    def outside(free: np.ndarray) -> np.ndarray:
+        return np.maximum(ndimage.distance_transform_edt(~free) - 0.5, 0.0) * pixel
+
+    depth = outside(free)
+    thickened = _thickened(free, depth, pixel)
+    if thickened is not None:
+        free, depth = thickened, outside(thickened)
+    # From a pixel's centre to the nearest one of the other kind, less half a pixel: the edge runs between the two.
+    inside = np.maximum(ndimage.distance_transform_edt(free) - 0.5, 0.0) * pixel
+    return np.where(free, inside, -depth).astype(np.float32)
+
+
+def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: int, torus: bool) -> np.ndarray:
+    """Signed clearance float32 [rows, columns] at the nodes of the field, in m, of road bool [pixels y, pixels x].
+
+    Exact to a fifth of a pixel up to the deepest clearance that the field holds. Tile by tile, so that the memory it
+    takes does not grow with the picture.
+    """
+    halo = math.ceil(_HALO / resolution) + 1
+    cut = max(math.ceil(resolution / _FINE - 1e-9), 1)
+    padded = np.pad(free, halo, mode="wrap") if torus else np.pad(free, halo)
+    # Road that begins at the picture's edge has its wall behind the far end: the last nodes are those before 0.
+    used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
+    first = [0 if torus else min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
+    per_node = [n / side if torus else _NODE / resolution for n, side in zip(free.shape, (rows, columns), strict=True)]
+    nodes = np.full((rows, columns), FIELD_FLOOR, dtype=np.float32)
+    for j in range(0, rows, _TILE):
+        for i in range(0, columns, _TILE):
+            index, window, at = [], [], []
+            for k, (start, side) in enumerate(((j, rows), (i, columns))):
+                node = first[k] + np.arange(start, min(start + _TILE, side))
+                pixel = node * per_node[k]  # from the picture's lower left corner
+                low = min(max(math.floor(pixel[0]), 0), padded.shape[k])
+                high = min(max(math.ceil(pixel[-1]) + 2 * halo, 0), padded.shape[k])
+                index.append(node % side)
+                window.append(slice(low, high))
+                at.append((pixel + halo - low) * cut - 0.5)
+            part = padded[window[0], window[1]]
+            if not part.any():
+                continue
+            if part.all():
+                nodes[np.ix_(*index)] = _DEEPEST
+                continue
+            part = part.repeat(cut, axis=0).repeat(cut, axis=1)
+            grid = np.meshgrid(*at, indexing="ij")
+            distance = ndimage.map_coordinates(_signed(part, resolution / cut), grid, order=1, mode="nearest")
+            nodes[np.ix_(*index)] = np.clip(distance, FIELD_FLOOR, _DEEPEST)
+    return nodes
+
+
+# ----------------------------------------------------------------------------------------------------- the starts
+
+
+def _at(nodes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Clearance (m) at points, as kernels read it."""
+    grid = [np.asarray(y) * CELLS_PER_M, np.asarray(x) * CELLS_PER_M]
+    return ndimage.map_coordinates(nodes, grid, order=1, mode="grid-wrap")
+
+
+def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: float) -> np.ndarray:
+    """Whether a car with a margin (m) around it is all on the road, at poses [n, 3]: bool [n]."""
+    half = np.array([vehicle.length, vehicle.width]) / 2 + margin
+    along, across = (np.linspace(-h, h, math.ceil(2 * h / _NODE) + 1) for h in half)
+    u, v = (points.ravel() for points in np.meshgrid(along, across))
+    x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
+    c, s = np.cos(heading), np.sin(heading)
+    return np.all(_at(nodes, x + u * c - v * s, y + u * s + v * c) >= 0.0, axis=1)
+
+
+def _straight(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, reach: float) -> np.ndarray:
+    """How far (m, `reach` at most) a car could go straight on from poses [n, 3]: float64 [n]."""
+    steps = np.arange(1, round(reach / _NODE) + 1) * _NODE
+    x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
+    free = _at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading)) >= vehicle.width / 2
+    return np.where(free.all(axis=1), reach, np.argmin(free, axis=1) * _NODE)
+
+
+def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Along which axis the road runs at each node: angle (rad) float [rows, columns], and the coherence, 0 to 1.
+
+    The structure tensor of the clearance (Bigun and Granlund 1987): near a road's middle gradients point across it
+    from both sides.
+    """
+    gx = np.roll(nodes, -1, axis=1) - np.roll(nodes, 1, axis=1)
+    gy = np.roll(nodes, -1, axis=0) - np.roll(nodes, 1, axis=0)
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        return ndimage.gaussian_filter(values, _SMOOTH * CELLS_PER_M, mode="wrap", truncate=2.5)
+
+    xx, yy, xy = smooth(gx * gx), smooth(gy * gy), smooth(gx * gy)
+    across = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    return across + math.pi / 2, np.hypot(xx - yy, 2.0 * xy) / np.maximum(xx + yy, 1e-6)
+
+
+def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """Where no direction stands out, at points [n, 2]: the axis (rad) with the longest way to both its ends."""
+    angles = np.arange(36) * math.pi / 36
+    ways = np.empty((len(points), len(angles)))
+    for k, angle in enumerate(angles):
+        there, back = (np.column_stack([points, np.full(len(points), angle + turn)]) for turn in (0.0, math.pi))
+        ways[:, k] = np.minimum(_straight(nodes, there, vehicle, 50.0), _straight(nodes, back, vehicle, 50.0))
+    return angles[np.argmax(ways, axis=1)]
+
+
+def _longest(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
+    """The heading (rad) with the longest way straight on from a pose's point, amid those that are like it."""
+    headings = np.arange(72) * math.pi / 36
+    ways = _straight(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
+    best = int(np.argmax(ways))
+    sector = best + np.arange(-6, 7)
+    return float((sector * math.pi / 36)[ways[sector % 72] >= 0.9 * ways[best]].mean())
+
+
+def _parts(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Connected parts: labels of nodes, 0 is none, and the part of each label; over the sides of the field as well."""
+    labels, count = ndimage.label(wide)
+    seams = np.concatenate([np.stack([labels[0], labels[-1]]), np.stack([labels[:, 0], labels[:, -1]])], axis=1)
+    seams = seams[:, (seams > 0).all(axis=0)]
+    joined = coo_array((np.ones(seams.shape[1]), (seams[0], seams[1])), shape=(count + 1, count + 1))
+    return labels, connected_components(joined, directed=False)[1]
+
+
+def road_length(nodes: np.ndarray) -> float:
+    """About how many m of road hang together: the largest part's area over its width. Within 10 % for a ring."""
+    road = nodes > 0.0
+    labels, group = _parts(road)
+    middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
+    area = np.bincount(group[labels[road]]) * _NODE**2
+    part = group[labels[middle]]
+    width = 2.0 * np.bincount(part, nodes[middle]) / np.maximum(np.bincount(part), 1)
+    return float((area / np.maximum(width, _NODE)).max())
+
+
+def _large(wide: np.ndarray) -> np.ndarray:
+    """Which nodes belong to a connected part that extends some tens of metres; over the sides of the field as well."""
+    labels, group = _parts(wide)
+    boxes = ndimage.find_objects(labels)
+    size = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
+    extent = np.bincount(group, weights=size)
+    return wide & (extent[group] >= _EXTENT)[labels]
+
+
+def _evenly(items: np.ndarray, count: int) -> np.ndarray:
+    """So many of the items at most, evenly over their order."""
+    return items[np.linspace(0, len(items) - 1, count).round().astype(int)] if len(items) > count else items
+
+
+def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """Poses float64 [n, 3] (x, y, heading) on free space: along the road, both ways, a margin around the car.
+
+    Raises: ValueError with one line if there is no room for a car.
+    """
+    wide = nodes >= vehicle.width / 2 + _MARGIN
+    large = _large(wide)
+    if not large.any():
+        raise ValueError(
+            f"no room for a car: nowhere is the road {vehicle.width + 2 * _MARGIN:g} m wide over {_EXTENT:g} m; "
+            f"check the resolution and what is bright"
+        )
+    ridge = large & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.25)
+    angle, coherence = _directions(nodes)
+    row, column = np.nonzero(ridge & (coherence >= _COHERENCE))
+    along = np.column_stack([column * _NODE, row * _NODE, angle[row, column]])
+    row, column = np.nonzero(ridge)
+    points = _evenly(np.column_stack([column, row]) * _NODE, _STARTS)
+    choices: tuple[Callable[[], np.ndarray], ...] = (
+        lambda: _evenly(along, 4 * _STARTS),
+        lambda: np.column_stack([points, _open_headings(nodes, points, vehicle)]),
+    )
+    for choice in choices:
+        ahead = choice()
+        poses = np.concatenate([ahead, ahead + _BACK])
+        poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & (_straight(nodes, poses, vehicle, _AHEAD) >= _AHEAD)]
+        if len(poses):
+            return _evenly(poses, _STARTS)
+    raise ValueError(
+        f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
+        f"check the resolution and what is bright"
+    )
+
+
+def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """Poses [n, 3] (x, y, heading) float64, their headings set along the road where they are NaN.
+
+    Raises: ValueError with one line where a car would be off the road.
+    """
+    complete = np.array(poses, dtype=np.float64)
+    size = np.array(nodes.shape[::-1]) * _NODE
+    angle, coherence = _directions(nodes)
+    for pose in complete:
+        inside = bool((pose[:2] >= 0.0).all() and (pose[:2] < size).all())
+        if inside and math.isnan(pose[2]):
+            column, row = (pose[:2] * CELLS_PER_M).round().astype(int) % nodes.shape[::-1]
+            pose[2] = angle[row, column] if coherence[row, column] >= _COHERENCE else _longest(nodes, pose, vehicle)
+            ways = np.array([pose, pose + _BACK])
+            pose[:] = ways[np.argmax(_straight(nodes, ways, vehicle, 50.0))]
+        if not inside or not _fits(nodes, pose[None], vehicle, _TOUCH)[0]:
+            raise ValueError(
+                f"starts: at {pose[0]:g} m, {pose[1]:g} m from the lower left corner a car is not all on the road"
+            )
+    return complete

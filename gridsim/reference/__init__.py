@@ -1,0 +1,1 @@
+"""The reference driver, and how far a drive is from it."""

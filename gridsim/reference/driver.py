@@ -1,0 +1,488 @@
+"""The reference driver: pure pursuit along a route of lanes, as fast as its bends and the traffic allow.
+
+It is no learner: it reads the map and the other cars' state. What it may do is what any driver may: one of the eight
+actions each control period. Steering is pure pursuit (Coulter 1992) of the centre of mass, slip included; speed is a
+profile limited by curvature, held behind others by IDM (Treiber et al. 2000); lanes are changed by MOBIL (Kesting et
+al. 2007). Its wish is continuous, the actions are not: the heading that an action owes the wish is given by later ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.car.ego import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
+from gridsim.jit import leaf, njit
+from gridsim.maps.network import lane_length, turned, wrapped
+from gridsim.maps.roads import VISIT_CELL, freeze
+from gridsim.reference.routes import ReferenceConfig, Route, plan
+from gridsim.maps.scenarios import Scenario
+from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, follow, idm
+from gridsim.car.vehicle import act, path_curvature
+from gridsim.traffic.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF, _ONE, _TWO = _F(0.0), _F(0.5), _F(1.0), _F(2.0)
+
+# What the driver keeps in mind of a drive, float64.
+POINT = 0  # index of the route's point behind the car
+OWED = 1  # rad of heading that its actions have not yet given
+RAIL = 2  # which of the lanes abreast it is on
+BLEND = 3  # m to the left of that rail it still aims at, while it changes lanes
+LEFT_RAIL = 4  # the rail it comes from
+FIELDS_KEPT = 5
+
+_CAUTION = 0.3  # m, on every side of a car that waits
+_KEEP = _F(2.5)  # m before where paths meet at which it waits
+_NUDGE = _F(2.0)  # m of these that it then uses, bit by bit
+_BORED = _F(8.0)  # control steps of standing after which it moves up a bit, so as not to be idle
+_LEAD_TIME = _F(1.0)  # s that it must be first there to go first
+_USUAL = _F(4.0)  # m/s that another car may soon go
+_SLOW = _F(0.2)  # m/s below which another car waits
+_FIRM = _F(5.0)  # m/s2 of braking that it counts on
+_ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
+
+
+class Conflicts(NamedTuple):
+    """Where paths meet, for each of `Network.crossings`: float32 [c]."""
+
+    enter: np.ndarray  # m along the lane to where its car is in the other's way
+    meet: np.ndarray  # m along the other lane to where its car is in this one's way
+    free: np.ndarray  # m along the other lane from which on its car has gone, or goes ahead on the same ground
+
+
+class Tuning(NamedTuple):
+    """`ReferenceConfig` as the kernels read it."""
+
+    nearest: np.float32  # m
+    preview: np.float32  # s
+    bend_share: np.float32
+
+
+@dataclass(frozen=True)
+class Drive:
+    """An episode of the reference driver: its states before each of n control periods, and how it ended.
+
+    Attributes:
+        time: float64 [n], s.
+        pose: float32 [n, 3]: x, y (m), heading (rad).
+        speed: float32 [n], m/s.
+        steering: float32 [n], rad.
+        action: int64 [n].
+        arc: float64 [n], m along the route.
+        rail: int64 [n], which of the route's rails it was on.
+        car: float32 [ego.FIELDS], the state at the end.
+        end: how it ended.
+        route: where it went.
+    """
+
+    time: np.ndarray
+    pose: np.ndarray
+    speed: np.ndarray
+    steering: np.ndarray
+    action: np.ndarray
+    arc: np.ndarray
+    rail: np.ndarray
+    car: np.ndarray
+    end: End
+    route: Route
+
+
+@njit
+def _find_conflicts(network, half_length, half_width, enter, free):
+    for lane in range(len(network.steps)):
+        first, last = network.offsets[lane], network.offsets[lane + 1] - 1
+        for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
+            other = network.crossings[c]
+            found = False
+            p = first
+            while p <= last and not found:
+                a, b = max(p - 1, first), min(p + 1, last)
+                ux, uy = network.points[b, 0] - network.points[a, 0], network.points[b, 1] - network.points[a, 1]
+                length = math.hypot(ux, uy)
+                ux, uy = ux / length, uy / length
+                for q in range(network.offsets[other], network.offsets[other + 1] - 1):
+                    dx = turned(network.points[q, 0] - network.points[p, 0], network.width)
+                    dy = turned(network.points[q, 1] - network.points[p, 1], network.height)
+                    if abs(dx * ux + dy * uy) < half_length and abs(dy * ux - dx * uy) < half_width:
+                        vx = network.points[q + 1, 0] - network.points[q, 0]
+                        vy = network.points[q + 1, 1] - network.points[q, 1]
+                        if ux * vx + uy * vy > 0.5 * network.steps[other]:
+                            # They join: who is on the common ground is followed.
+                            gone = _F(q - network.offsets[other]) * network.steps[other] + half_length
+                            free[c] = min(free[c], gone)
+                        found = True
+                        break
+                p += 1
+            enter[c] = _F(p - 1 - first) * network.steps[lane]
+
+
+@njit
+def _find_meetings(network, enter, meet):
+    for lane in range(len(network.steps)):
+        for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
+            other = network.crossings[c]
+            for back in range(network.crossing_offsets[other], network.crossing_offsets[other + 1]):
+                if network.crossings[back] == lane:
+                    meet[c] = enter[back]
+
+
+def conflicts(scenario: Scenario, sim: SimConfig) -> Conflicts:
+    """Where the lanes of a map meet."""
+    network, vehicle = scenario.network, sim.vehicle
+    enter, meet = np.zeros_like(network.clear), np.zeros_like(network.clear)
+    free = network.clear.copy()
+    # A car that stands further back leaves the others room for half their width, and for caution.
+    half_length = np.float32((vehicle.length + vehicle.width) / 2 + _CAUTION)
+    _find_conflicts(network, half_length, np.float32(vehicle.width + _CAUTION), enter, free)
+    _find_meetings(network, enter, meet)
+    return Conflicts(freeze(enter), freeze(meet), freeze(free))
+
+
+# --- Driving ---------------------------------------------------------------------------------------------------------
+
+
+@leaf
+def _at(route, rail, s, k):
+    """What is s m along a rail, looked for from point k on: (x m, y m, point before it, share to the next)."""
+    last = _I(route.arc.shape[1] - 2)
+    while k < last and route.arc[rail, k + 1] < s:
+        k += _I(1)
+    span = max(route.arc[rail, k + 1] - route.arc[rail, k], _F(1e-6))
+    part = (s - route.arc[rail, k]) / span
+    x0, y0 = route.points[rail, k, 0], route.points[rail, k, 1]
+    return (
+        x0 + part * (route.points[rail, k + 1, 0] - x0),
+        y0 + part * (route.points[rail, k + 1, 1] - y0),
+        k,
+        part,
+    )
+
+
+@leaf
+def _progress(network, route, rail, k, x, y):
+    """Where a car is along a rail, looked for from point k on: (point behind it, m along, m to the left of it)."""
+    last = _I(route.arc.shape[1] - 2)
+    while True:
+        ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
+        uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
+        length = max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+        dx = turned(x - route.points[rail, k, 0], network.width)
+        dy = turned(y - route.points[rail, k, 1], network.height)
+        along = (dx * ux + dy * uy) / length
+        if along <= length or k >= last:
+            return k, route.arc[rail, k] + along, (dy * ux - dx * uy) / length
+        k += _I(1)
+
+
+@leaf
+def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car):
+    """Curvature (1/m) of the circle that takes the centre of mass to a point of the route ahead, with its slip.
+
+    With a the angle from the heading to the point and d its distance: tan(slip) = sin(a) / (d / (2 l_r) + cos(a)).
+    """
+    speed = max(car[SPEED], _ZERO)
+    ahead = tuning.nearest + speed * (tuning.preview + tuning.bend_share * speed / constants.grip)
+    x, y, k, _ = _at(route, rail, s + ahead, k)
+    ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
+    uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
+    norm = blend / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+    dx = turned(x - norm * uy - car[X], network.width)
+    dy = turned(y + norm * ux - car[Y], network.height)
+    forward, left = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+    distance = max(math.sqrt(forward * forward + left * left), _F(0.1))
+    tangent = (left / distance) / max(distance / (_TWO * constants.rear_axle) + forward / distance, _F(0.1))
+    curvature = tangent / (math.sqrt(_ONE + tangent * tangent) * constants.rear_axle)
+    bound = constants.grip / max(car[SPEED] * car[SPEED], _F(1e-6))
+    return min(max(curvature, -bound), bound)
+
+
+@leaf
+def _choose_action(constants, car, curvature, acceleration, owed):
+    """The action whose effect comes nearest to a wanted curvature (1/m) and acceleration (m/s2).
+
+    Heading is looked at over two periods, since the wheels turn by fixed steps; returns (action, rad then owed).
+    """
+    speed, steering = max(car[SPEED], _ZERO), car[STEERING]
+    way = max(speed, _ONE) * constants.dt
+    quantum = path_curvature(constants, speed, constants.steering_step) * way
+    # Steering further than grip allows gains nothing, and has to be taken back step by step.
+    tangent = constants.grip * constants.rear_axle / max(speed * speed, _ONE)
+    furthest = max(math.atan(tangent / constants.rear_share), constants.steering_step)
+    weight = _ONE if acceleration > _F(-4.0) else _F(0.2)  # braking hard comes before keeping to the line
+    best, cost, left = _I(4), _F(1e9), _ZERO
+    for action in range(8):
+        if action == 7 and speed < _HALF:
+            continue
+        given, wheels = act(constants, action, speed, steering)
+        first = owed + (curvature - path_curvature(constants, speed, wheels)) * way
+        second = _F(1e9)
+        for then in range(1, 5):
+            _, later = act(constants, then, speed, wheels)
+            second = min(second, abs(first + (curvature - path_curvature(constants, speed, later)) * way))
+        total = weight * (abs(first) + second) / quantum + abs(acceleration - given) / constants.acceleration
+        total += _HALF * max(abs(wheels) - furthest, _ZERO) / constants.steering_step
+        if total < cost:
+            best, cost, left = _I(action), total, first
+    return best, min(max(left, -quantum), quantum)
+
+
+@leaf
+def _seat(network, route, rail, m, s, car, me):
+    """Write the ego car down as a traffic car on lane m of a rail, s m along it."""
+    last = _I(route.lanes.shape[1] - 1)
+    me[X], me[Y], me[COS], me[SIN], me[SPEED] = car[X], car[Y], car[COS], car[SIN], max(car[SPEED], _ZERO)
+    me[PAST], me[PERMIT] = -_ONE, -_ONE
+    me[LANE] = route.lanes[rail, m]
+    me[NEXT] = route.lanes[rail, min(m + _I(1), last)]
+    me[AFTER] = route.lanes[rail, min(m + _I(2), last)]
+    length = lane_length(network, _I(me[LANE]))
+    me[ALONG] = min(max(s - route.arc[rail, route.offsets[m]], _ZERO), length)
+
+
+@leaf
+def _give_way(network, conflicts, drivers, me, world):
+    """Meet nobody who is in a junction already, or may enter it: (greatest acceleration in m/s2, m to the meeting)."""
+    speed, allowed, least = me[SPEED], drivers.acceleration, _F(1e9)
+    ahead = -me[ALONG]  # m to the beginning of the lane
+    for turn in range(3):
+        lane = _I(me[LANE] if turn == 0 else (me[NEXT] if turn == 1 else me[AFTER]))
+        if ahead > me[HORIZON]:
+            break
+        for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
+            way = ahead + conflicts.enter[c] - _KEEP
+            if way < -_NUDGE or way > me[HORIZON]:
+                continue  # in the middle of it one goes on
+            other = network.crossings[c]
+            for j in range(world.shape[0]):
+                if world[j, LANE] < _ZERO:
+                    continue
+                if _I(world[j, LANE]) == other:
+                    at = world[j, ALONG]
+                elif _I(world[j, PERMIT]) == other:
+                    at = world[j, ALONG] - lane_length(network, _I(world[j, LANE]))
+                elif _I(world[j, PAST]) == other:
+                    at = world[j, ALONG] + lane_length(network, other)
+                else:
+                    continue
+                rest = conflicts.free[c] + drivers.half_length + _HALF - at
+                if rest <= _ZERO:
+                    continue
+                time = rest / max(world[j, SPEED], _HALF)
+                stops = speed * speed < _TWO * _FIRM * way  # it still can, should the other one not go on
+                if stops and speed * (time + _HALF) < way:
+                    continue  # it has gone by then
+                if world[j, SPEED] < _SLOW and speed < _ONE:
+                    continue  # it waits, for the ego car perhaps
+                before = (conflicts.meet[c] - at) / max(world[j, SPEED], _USUAL)
+                if way / max(speed, _ONE) + _LEAD_TIME < before:
+                    continue  # it comes later, and brakes for the ego car
+                if way < _ZERO or not stops:
+                    slower = -drivers.braking
+                else:
+                    slower = max(_TWO * (way - speed * time) / (time * time), -speed * speed / (_TWO * way))
+                allowed, least = min(allowed, slower), min(least, way)
+        ahead += lane_length(network, lane)
+    return allowed, least
+
+
+@leaf
+def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others):
+    """The acceleration (m/s2) that the other cars leave of a wanted one, and a change of lanes where it pays."""
+    n = _I(world.shape[0])
+    me, nobody = others[n], others[n + 1]
+    rail, speed = _I(memory[RAIL]), max(car[SPEED], _ZERO)
+    m = _I(np.searchsorted(route.offsets, k, side="right") - 1)
+    m = min(m, _I(route.lanes.shape[1] - 1))
+    for j in range(n):
+        for field in range(world.shape[1]):
+            others[j, field] = world[j, field]
+    me[HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_TWO * drivers.comfort))
+    me[GAP], me[LEAD], me[SHIFT] = _F(1e9), _ZERO, _F(memory[BLEND])
+    touch = _F(1e9)  # m to where another car is in the way
+    for side in range(2):
+        if side == 0 and memory[BLEND] == 0.0:
+            continue  # only who changes lanes minds the one it comes from too
+        on = rail if side == 1 else _I(memory[LEFT_RAIL])
+        _seat(network, route, on, m, s, car, me)
+        for j in range(n):
+            if world[j, LANE] >= _ZERO:
+                dx, dy = wrapped(world[j, X] - car[X], network.width), wrapped(world[j, Y] - car[Y], network.height)
+                if math.sqrt(dx * dx + dy * dy) - _F(5.0) < me[HORIZON]:
+                    before = me[GAP]
+                    follow(network, drivers, me, world[j], False)
+                    along = me[COS] * world[j, COS] + me[SIN] * world[j, SIN]
+                    if me[GAP] < before:
+                        touch = min(touch, me[GAP])
+                        if along < _F(0.7):
+                            me[GAP] = max(me[GAP] - _ASIDE, drivers.half_length)
+    wish = max(bend, _ONE)
+    if me[GAP] < _F(1e8):
+        acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
+    allowed, way = _give_way(network, conflicts, drivers, me, world)
+    acceleration = min(acceleration, allowed)
+    if car[IDLE] >= _BORED and way > -_NUDGE and touch > drivers.half_length + _F(0.1):
+        acceleration = drivers.acceleration  # standing too long is idleness in this world
+    if route.lanes.shape[0] > 1:
+        lane = _I(me[LANE])
+        at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
+        me[FACTOR] = wish / network.speeds[at]
+        me[PACE] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD])
+        me[CLOCK] = _F(_I(car[STEPS]) % _I(10))  # it thinks of another lane once a second
+        change_lanes(network, drivers, others, n, nobody)
+        if _I(me[LANE]) != lane:
+            memory[LEFT_RAIL] = rail
+            memory[RAIL] = rail + 1 if _I(me[LANE]) == network.right[lane] else rail - 1
+            memory[BLEND] = me[SHIFT]
+    return acceleration
+
+
+@njit(_nrt=False)
+def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others):
+    """The driver's action for one control period.
+
+    Args: what it keeps in mind float64 [FIELDS_KEPT], changed; `others` [cars + 2, world.FIELDS] is scratch, of which
+    the last row is 0.
+    """
+    rail = _I(memory[RAIL])
+    speed = max(car[SPEED], _ZERO)
+    k, s, _ = _progress(network, route, rail, _I(memory[POINT]), car[X], car[Y])
+    memory[POINT] = k
+    _, _, to, part = _at(route, rail, s + speed * constants.dt, k)
+    bend = route.speeds[rail, to] + part * (route.speeds[rail, to + 1] - route.speeds[rail, to])
+    acceleration = min(max((bend - speed) / constants.dt, -constants.braking), constants.acceleration)
+    if world.shape[0] > 0:
+        acceleration = _mind_others(
+            network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others
+        )  # fmt: skip
+    rail, blend = _I(memory[RAIL]), _F(memory[BLEND])
+    curvature = _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
+    way = drivers.shift * constants.dt
+    memory[BLEND] = blend - min(max(blend, -way), way)
+    action, memory[OWED] = _choose_action(constants, car, curvature, acceleration, _F(memory[OWED]))
+    return action
+
+
+@njit(nogil=True)
+def _drive(
+    road, network, conflicts, constants, traffic_drivers, drivers, tuning, route, start, target, max_steps, world, log
+):
+    """One episode; fills log float64 [max_steps, 8] and returns (state at the end, steps, End)."""
+    cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
+    car, visits = np.empty(FIELDS, dtype=np.float32), np.empty(cells, dtype=np.float32)
+    others = np.zeros((world.shape[0] + 2, world.shape[1]), dtype=np.float32)
+    memory = np.zeros(FIELDS_KEPT)
+    memory[RAIL], memory[POINT] = route.rail, route.first
+    place(road, start, car, visits)
+    steps, end = 0, 0
+    while end == 0:
+        action = _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others)
+        row = log[steps]
+        row[0], row[1], row[2], row[3] = car[X], car[Y], math.atan2(car[SIN], car[COS]), car[SPEED]
+        row[4], row[5], row[7] = car[STEERING], action, memory[RAIL]
+        _, row[6], _ = _progress(network, route, _I(memory[RAIL]), _I(memory[POINT]), car[X], car[Y])
+        flow(network, traffic_drivers, world, car)
+        acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
+        car[STEERING] = steering
+        end = control(road, constants, car, visits, world, acceleration, target, max_steps)
+        steps += 1
+    return car, steps, end
+
+
+class ReferenceDriver:
+    """Drives a batch of cars, each on a route of its own: `reset`, then `act` once each control period."""
+
+    def __init__(
+        self, scenarios: Sequence[Scenario], sim: SimConfig | None = None, config: ReferenceConfig | None = None
+    ):
+        self.scenarios = scenarios
+        self.sim, self.config = sim or SimConfig(), config or ReferenceConfig()
+        self._constants: Constants = constants(self.sim)
+        self._traffic: Drivers = drivers(self.sim)
+        f = np.float32
+        self._drivers = self._traffic._replace(
+            acceleration=f(self.config.acceleration), comfort=f(self.config.braking), headway=f(self.config.headway)
+        )
+        self._tuning = Tuning(f(self.config.nearest), f(self.config.preview), f(self.config.bend_share))
+        self._conflicts: dict[int, Conflicts] = {}
+        self._maps = np.zeros(0, dtype=np.int64)
+        self._routes: list[Route] = []
+        self._memory = np.zeros((0, FIELDS_KEPT))
+
+    def reset(
+        self, starts: np.ndarray, maps: np.ndarray | int, seeds: Sequence[int], length: float | None = None
+    ) -> None:
+        """Begin drives at starts float32 [n, 5] on `scenarios[maps[k]]`, with turns at junctions from seeds [n].
+
+        Routes are `length` m long, or as long as the target and a tenth.
+        """
+        length = 1.1 * self.sim.episode.target if length is None else length
+        self._maps = np.broadcast_to(np.asarray(maps, dtype=np.int64), len(starts))
+        self._conflicts = {m: conflicts(self.scenarios[m], self.sim) for m in np.unique(self._maps).tolist()}
+        self._routes = [
+            plan(self.scenarios[m], start, length, seed, self.config)
+            for m, start, seed in zip(self._maps.tolist(), starts, seeds, strict=True)
+        ]
+        self._memory = np.zeros((len(starts), FIELDS_KEPT))
+        self._memory[:, RAIL] = [route.rail for route in self._routes]
+        self._memory[:, POINT] = [route.first for route in self._routes]
+
+    def act(self, cars: np.ndarray, worlds: np.ndarray) -> np.ndarray:
+        """Actions int64 [n] for cars float32 [n, ego.FIELDS] in worlds [n, cars, world.FIELDS]."""
+        others = np.zeros((worlds.shape[1] + 2, worlds.shape[2]), dtype=np.float32)
+        return np.array(
+            [
+                _decide(
+                    self.scenarios[m].network, self._conflicts[m], self._constants, self._drivers, self._tuning,
+                    route, memory, car, world, others,
+                )
+                for m, route, memory, car, world in zip(
+                    self._maps.tolist(), self._routes, self._memory, cars, worlds, strict=True
+                )
+            ],
+            dtype=np.int64,
+        )  # fmt: skip
+
+    def drive(
+        self,
+        scenario: Scenario,
+        start: np.ndarray,
+        world: np.ndarray,
+        seed: int,
+        target: float | None = None,
+        max_steps: int | None = None,
+    ) -> Drive:
+        """A whole episode from a start float32 [5] in the traffic float32 [cars, world.FIELDS] around it.
+
+        Ends as `simulator.Simulator`'s episodes do; `target` (m) and `max_steps` are the configuration's unless given.
+        """
+        episode = self.sim.episode
+        target = episode.target if target is None else target
+        max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
+        found = conflicts(scenario, self.sim)
+        route = plan(scenario, start, 1.1 * target, seed, self.config)
+        log = np.empty((max_steps, 8))
+        car, steps, end = _drive(
+            scenario.road, scenario.network, found, self._constants, self._traffic,
+            self._drivers, self._tuning, route,
+            np.asarray(start, dtype=np.float32), np.float32(target), max_steps,
+            np.array(world, dtype=np.float32), log,
+        )  # fmt: skip
+        log = log[:steps]
+        return Drive(
+            time=np.arange(steps) * episode.control_period,
+            pose=log[:, :3].astype(np.float32),
+            speed=log[:, 3].astype(np.float32),
+            steering=log[:, 4].astype(np.float32),
+            action=log[:, 5].astype(np.int64),
+            arc=log[:, 6],
+            rail=log[:, 7].astype(np.int64),
+            car=car,
+            end=End(end),
+            route=route,
+        )

@@ -1,0 +1,263 @@
+"""How far a drive is from a reference: velocity error and steering error along the route that was driven.
+
+e_v = v - v_ref in m/s and e_delta = delta - delta_ref in degrees (Trasnea et al. 2019), taken at the same place of the
+route and not at the same time, so that who is late by a second is not wrong all the way. Means are over metres, not
+over seconds: standing weighs nothing. The reference is `routes.profile` along the driven path, or a recorded drive.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.config import SimConfig, VehicleConfig
+from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
+from gridsim.reference.routes import ReferenceConfig, profile, unwrapped
+from gridsim.maps.scenarios import Scenario
+
+APART = 3.5  # m beside the recorded path, a lane's width, from which on two drives are on two paths
+TURNED = math.radians(45.0)  # ... and between their headings
+TURN = 12.0  # m: the bend in which two paths part begins so far before they are apart
+_STANDING = 1e-6  # m
+
+
+class Driven(NamedTuple):
+    """A drive as a path: where a car came forward, without what it reversed and drove again."""
+
+    arc: np.ndarray  # float64 [n], m driven, increasing
+    points: np.ndarray  # float64 [n, 2], m, not wrapped over the torus
+    heading: np.ndarray  # float64 [n], rad
+    speed: np.ndarray  # float64 [n], m/s
+    steering: np.ndarray  # float64 [n], rad, left positive
+    rows: np.ndarray  # int64 [n], which of the drive's states these are
+
+
+@dataclass(frozen=True)
+class Series:
+    """A drive and its reference at the same places of a route; linear between them.
+
+    Attributes:
+        arc: float64 [n], m that the agent drove, increasing.
+        speed: float64 [n], m/s, the agent's.
+        reference_speed: float64 [n], m/s.
+        steering: float64 [n], rad, left positive, the agent's.
+        reference_steering: float64 [n], rad.
+    """
+
+    arc: np.ndarray
+    speed: np.ndarray
+    reference_speed: np.ndarray
+    steering: np.ndarray
+    reference_steering: np.ndarray
+
+    @property
+    def velocity_error(self) -> np.ndarray:
+        """float64 [n], m/s, above 0 where the agent is faster."""
+        return self.speed - self.reference_speed
+
+    @property
+    def steering_error(self) -> np.ndarray:
+        """float64 [n], degrees, above 0 where the agent steers further to the left."""
+        return np.degrees(self.steering - self.reference_steering)
+
+    def errors(self, vehicle: VehicleConfig | None = None) -> Errors:
+        """Means over the metres (trapezoids) and maxima.
+
+        Raises: ValueError if nothing was driven.
+        """
+        metres = float(self.arc[-1] - self.arc[0]) if len(self.arc) > 1 else 0.0
+        if not metres > 0.0:
+            raise ValueError("nothing was driven that could be compared with a reference")
+
+        def mean(values: np.ndarray) -> float:
+            return float(np.trapezoid(values, self.arc)) / metres
+
+        velocity, steering = np.abs(self.velocity_error), np.abs(self.steering_error)
+        return Errors(
+            mean(velocity),
+            float(velocity.max()),
+            mean(self.reference_speed),
+            mean(steering),
+            float(steering.max()),
+            (vehicle or VehicleConfig()).steering_limit,
+            metres,
+        )
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Velocity and steering errors of one or several drives.
+
+    Attributes:
+        velocity_mean_mps: mean |e_v| over the metres, m/s.
+        velocity_max_mps: greatest |e_v|, m/s.
+        reference_mps: mean speed of the reference over the same metres, m/s.
+        steering_mean_deg: mean |e_delta| over the metres, degrees.
+        steering_max_deg: greatest |e_delta|, degrees.
+        steering_limit_deg: how far the wheels turn, degrees.
+        metres: that were compared.
+    """
+
+    velocity_mean_mps: float
+    velocity_max_mps: float
+    reference_mps: float
+    steering_mean_deg: float
+    steering_max_deg: float
+    steering_limit_deg: float
+    metres: float
+
+    @property
+    def velocity_mean_percent(self) -> float:
+        """Of the reference's mean speed: a share of its speed on the spot has no bound where it starts from rest."""
+        return 100.0 * self.velocity_mean_mps / self.reference_mps
+
+    @property
+    def velocity_max_percent(self) -> float:
+        """Of the reference's mean speed."""
+        return 100.0 * self.velocity_max_mps / self.reference_mps
+
+    @property
+    def steering_mean_percent(self) -> float:
+        """Of the greatest steering angle: the reference's own is 0 on a straight."""
+        return 100.0 * self.steering_mean_deg / self.steering_limit_deg
+
+    @property
+    def steering_max_percent(self) -> float:
+        """Of the greatest steering angle, to one side."""
+        return 100.0 * self.steering_max_deg / self.steering_limit_deg
+
+    def figures(self) -> dict[str, float]:
+        """All of it under plain names, for tables and JSON."""
+        names = (
+            "velocity_mean_mps", "velocity_max_mps", "velocity_mean_percent", "velocity_max_percent", "reference_mps",
+            "steering_mean_deg", "steering_max_deg", "steering_mean_percent", "steering_max_percent", "metres",
+        )  # fmt: skip
+        return {name: float(getattr(self, name)) for name in names}
+
+
+def combine(parts: Sequence[Errors]) -> Errors:
+    """Several drives as one: means weighted by metres, greatest maxima.
+
+    Raises: ValueError if there are none, or of different cars.
+    """
+    if not parts:
+        raise ValueError("nothing was driven that could be compared with a reference")
+    if len({part.steering_limit_deg for part in parts}) > 1:
+        raise ValueError("errors of cars with different steering limits cannot be combined")
+    metres = [part.metres for part in parts]
+
+    def mean(name: str) -> float:
+        return float(np.average([getattr(part, name) for part in parts], weights=metres))
+
+    return Errors(
+        mean("velocity_mean_mps"),
+        max(part.velocity_max_mps for part in parts),
+        mean("reference_mps"),
+        mean("steering_mean_deg"),
+        max(part.steering_max_deg for part in parts),
+        parts[0].steering_limit_deg,
+        float(sum(metres)),
+    )
+
+
+def poses_of(states: np.ndarray) -> np.ndarray:
+    """Poses float32 [n, 5] of states [n, ego.FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
+    heading = np.arctan2(states[:, SIN], states[:, COS])
+    return np.stack([states[:, X], states[:, Y], heading, states[:, SPEED], states[:, STEERING]], axis=1)
+
+
+def driven(poses: np.ndarray, scenario: Scenario) -> Driven:
+    """A drive's path from its poses [n, 5] at the control steps, as `poses_of` gives them.
+
+    What was reversed, and as many metres after it, is left out: a reference only drives forward. So is standing, where
+    the wheels may be turned anyhow; a path from rest begins after the first control step that moves the car.
+
+    Raises: ValueError if the car never came forward.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    if poses.ndim != 2 or poses.shape[1] != 5 or not np.isfinite(poses).all():
+        raise ValueError(f"a drive is finite poses [n, 5], not {poses.shape}")
+    points = unwrapped(poses[:, :2], float(scenario.road.width), float(scenario.road.height))
+    way = np.hypot(*np.diff(points, axis=0).T)
+    forward = np.concatenate([[0.0], np.cumsum(np.where(poses[1:, 3] + poses[:-1, 3] < 0.0, -way, way))])
+    furthest = np.maximum.accumulate(forward)
+    moved = np.append(poses[:1, 3] > 0.0, forward[1:] > furthest[:-1] + _STANDING)
+    rows = np.flatnonzero(moved[: len(poses)])
+    if len(rows) < 2:
+        raise ValueError("nothing was driven that could be compared with a reference")
+    points = points[rows]
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    return Driven(arc, points, poses[rows, 2], poses[rows, 3], poses[rows, 4], rows)
+
+
+def error_series(
+    path: Driven, scenario: Scenario, config: ReferenceConfig | None = None, sim: SimConfig | None = None
+) -> Series:
+    """A drive beside the reference driver's profile along its path.
+
+    The reference begins with the agent's speed, speeds up as fast as the car does, and is alone on the road: of a drive
+    in traffic, the error holds what the traffic costs. It takes its bends from the driven path, over 10 m of it: who
+    weaves in longer waves than that gives the reference bends to slow down for, so look at both errors.
+
+    Left out is where the profile does not know the road: the path's first 5 m, half of those 10, and its end, from
+    where on the reference could not have stopped, since what it would have braked for there was not driven.
+    """
+    config = config or ReferenceConfig()
+    interval = float(scenario.road.speed_low), float(scenario.road.speed_high)
+    found = profile(path.points, interval, float(path.speed[0]), config, sim)
+    speed, steering = found.speed_at(path.arc), found.steering_at(path.arc)
+    unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * config.braking) > path.arc[-1])
+    part = slice(int(np.searchsorted(path.arc, config.driven_window / 2)), int(unknown[0]))
+    return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
+
+
+def error_series_beside(path: Driven, recorded: Driven, scenario: Scenario, row: int = 0) -> tuple[Series, float]:
+    """A drive beside a recorded one of which it began at point `row`, as far as it follows it.
+
+    Each of the agent's places is compared with the recorded path's nearest further on. They part where the agent is
+    more than APART beside that path, or TURNED; the TURN before it is left out, and what is after the recording's end.
+    Returns: (the series, empty if nothing is left; m along the recording that the agent came).
+    """
+    sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    points = path.points - np.round((path.points[0] - recorded.points[row]) / sides) * sides
+    steps = np.diff(recorded.points, axis=0)
+    k, last = min(row, len(steps) - 1), len(steps) - 1
+    at, parted = [], False
+    reached = float(recorded.arc[row])
+    for point, heading in zip(points, path.heading, strict=True):
+        while True:
+            length = recorded.arc[k + 1] - recorded.arc[k]
+            away = point - recorded.points[k]
+            along = float(away @ steps[k]) / length
+            if along <= length or k == last:
+                break
+            k += 1
+        if along > length + _STANDING:
+            break
+        turn = heading - recorded.heading[k + 1]
+        if (
+            abs(steps[k, 0] * away[1] - steps[k, 1] * away[0]) > APART * length
+            or abs((turn + math.pi) % (2.0 * math.pi) - math.pi) > TURNED
+        ):
+            parted = True
+            break
+        reached = max(reached, float(recorded.arc[k]) + along)
+        at.append(reached)
+    count = len(at)
+    if parted:
+        count = int(np.searchsorted(path.arc[:count], path.arc[count - 1] - TURN, side="right")) if count else 0
+    places = np.array(at[:count], dtype=np.float64)
+    return (
+        Series(
+            path.arc[:count],
+            path.speed[:count],
+            np.interp(places, recorded.arc, recorded.speed),
+            path.steering[:count],
+            np.interp(places, recorded.arc, recorded.steering),
+        ),
+        reached,
+    )

@@ -1,0 +1,130 @@
+"""Other cars as oriented boxes: what rays hit of them, and whether they are run into."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.jit import leaf
+from gridsim.maps.network import wrapped
+from gridsim.traffic.world import COS, LANE, SIN, SPEED, X, Y
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+
+@leaf
+def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, ranges, closing):
+    """Shorten ranges (m) to the first box of a world that each ray meets: slab test (Kay and Kajiya 1986).
+
+    Args: fan of `sensors.fan`; sides of the torus, m; the sensor's position (m), heading and speed (m/s) along it;
+    world of `world`.
+    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the relative speed (m/s) at which a car that
+    a ray has met and the sensor come closer along it, as a radar tells; 0 where that is the road's edge.
+    """
+    if closing is not None:
+        closing[:] = _ZERO
+    length, breadth = constants.half_length, constants.half_width
+    radius = math.sqrt(length * length + breadth * breadth)
+    last_ray = _I(ranges.shape[0] - 1)
+    # Up to half a turn the field of view is where two half planes meet, by the first and the last ray: no angle is
+    # needed for what lies outside of one.
+    narrow = fan[0, 0] > _ZERO
+    margin, reach = _F(-1.01) * radius, constants.ray_range + radius
+    for j in range(world.shape[0]):
+        if world[j, LANE] < _ZERO:
+            continue
+        dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+        squared = dx * dx + dy * dy
+        if squared > reach * reach:
+            continue
+        forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+        if (
+            narrow
+            and min(aside * fan[0, 0] - forward * fan[1, 0], forward * fan[1, last_ray] - aside * fan[0, last_ray])
+            < margin
+        ):
+            continue
+        first, last = _I(0), last_ray
+        if squared > _F(4.0) * radius * radius:
+            # Only rays within the angle that the box's circle fills; its arc sine is at most 1.05 times its sine here.
+            half = _F(1.06) * radius / math.sqrt(squared)
+            angle = math.atan2(aside, forward)
+            low, high = (angle - half - constants.ray_first), (angle + half - constants.ray_first)
+            if high < _ZERO or low > constants.ray_step * _F(last_ray):
+                continue
+            first = max(_I(low / constants.ray_step), _I(0))
+            last = min(_I(high / constants.ray_step) + _I(1), last_ray)
+        bc, bs = world[j, COS], world[j, SIN]
+        ox, oy = -(dx * bc + dy * bs), -(dy * bc - dx * bs)  # the sensor as the box sees it
+        rc, rs = cosine * bc + sine * bs, sine * bc - cosine * bs
+        for r in range(first, last + 1):
+            ux, uy = rc * fan[0, r] - rs * fan[1, r], rs * fan[0, r] + rc * fan[1, r]
+            ix, iy = _ONE / ux, _ONE / uy
+            x0, x1 = (-length - ox) * ix, (length - ox) * ix
+            y0, y1 = (-breadth - oy) * iy, (breadth - oy) * iy
+            enter = max(min(x0, x1), min(y0, y1))
+            leave = min(max(x0, x1), max(y0, y1))
+            if enter <= leave and leave > _ZERO and enter < ranges[r]:
+                ranges[r] = max(enter, _ZERO)
+                if closing is not None:
+                    closing[r] = speed * fan[0, r] - world[j, SPEED] * ux  # the box moves along its own heading
+
+
+@leaf
+def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
+    """Whether two cars overlap, the other (dx, dy) m away: separating axes (Gottschalk et al. 1996)."""
+    length, breadth = constants.half_length, constants.half_width
+    along = abs(cosine * other_cosine + sine * other_sine)
+    across = abs(cosine * other_sine - sine * other_cosine)
+    long_side = length + length * along + breadth * across
+    short_side = breadth + length * across + breadth * along
+    return (
+        abs(dx * cosine + dy * sine) <= long_side
+        and abs(dy * cosine - dx * sine) <= short_side
+        and abs(dx * other_cosine + dy * other_sine) <= long_side
+        and abs(dy * other_cosine - dx * other_sine) <= short_side
+    )
+
+
+@leaf
+def nearest_box(world, width, height, x, y):
+    """Distance (m) from a point to the nearest box of a world, and the greatest speed (m/s) of any within 20 m."""
+    nearest, fastest = _F(1e18), _ZERO
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= _ZERO:
+            dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+            squared = dx * dx + dy * dy
+            nearest = min(nearest, squared)
+            if squared < _F(400.0):
+                fastest = max(fastest, world[j, SPEED])
+    return math.sqrt(nearest), fastest
+
+
+@leaf
+def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
+    """Whether a car overlaps a box of a world as it was `back` of a control period (share) ago."""
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= _ZERO:
+            behind = back * dt * world[j, SPEED]
+            dx = wrapped(world[j, X] - behind * world[j, COS] - x, width)
+            dy = wrapped(world[j, Y] - behind * world[j, SIN] - y, height)
+            if dx * dx + dy * dy < _F(25.0) and boxes_touch(
+                constants, dx, dy, cosine, sine, world[j, COS], world[j, SIN]
+            ):
+                return True
+    return False
+
+
+@leaf
+def stands_ahead(constants, world, width, height, x, y, cosine, sine):
+    """Whether a standing box is close ahead of the front of a car, in its way."""
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= _ZERO and world[j, SPEED] < _HALF:
+            dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+            forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+            limit = constants.courtesy + _F(2.0) * constants.half_length
+            if _ZERO < forward < limit and abs(aside) < _F(2.0) * constants.half_width:
+                return True
+    return False

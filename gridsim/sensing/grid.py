@@ -1,0 +1,136 @@
+"""The occupancy grid: what the range sensor's rays say about the ground ahead, cell by cell.
+
+80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side. Row 0 is the farthest ahead and
+column 0 the leftmost, so that a picture of a grid has ahead upwards and left on the left. Each cell within the field of
+view belongs to the ray whose direction is nearest to its centre's. With r the centre's distance from the front axle, R
+the ray's range and h half the diagonal of a cell, it is
+
+* free where r < R - h: it lies before what the ray hit;
+* occupied where R - h <= r <= R + h: the ray was stopped there;
+* unknown where r > R + h, hidden; and everywhere outside the field of view.
+
+A ray that reached its full range hit nothing: its cells are free up to there, and unknown beyond.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.config import SimConfig, constants
+from gridsim.jit import leaf, njit
+from gridsim.maps.roads import freeze
+
+_F, _I, _N = np.float32, np.int32, np.uint64
+
+CELLS = 80  # along each side
+CELL = 0.5  # m
+#: Codes of a cell, dark to bright in a picture; divided by 255 they are what a network sees.
+UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
+HALF_DIAGONAL = _F(CELL * math.sqrt(0.5))  # m
+
+
+class GridTable(NamedTuple):
+    """Cells sorted by ray, and by distance within a ray; made once for a configuration of the sensor."""
+
+    first: np.ndarray  # int32 [rays + 1]: where each ray's cells begin
+    cells: np.ndarray  # uint16 [cells in view]: index into a grid, row by row
+    radii: np.ndarray  # float32 [cells in view + 1]: m, of the centres from the front axle; the last is infinite
+    reach: np.float32  # m, the rays' full range
+
+
+def centres() -> tuple[np.ndarray, np.ndarray]:
+    """Centres of the cells in the car's frame: float64 [80, 80] m ahead of the front axle, and m to the left."""
+    at = (np.arange(CELLS) + 0.5) * CELL
+    ahead, left = np.meshgrid(CELLS * CELL - at, CELLS * CELL / 2 - at, indexing="ij")
+    return ahead, left
+
+
+def grid_table(config: SimConfig) -> GridTable:
+    """The table for a configuration's rays. Raises: ValueError as `config.constants`."""
+    k, sensors = constants(config), config.sensors
+    ahead, left = centres()
+    angle, radius = np.arctan2(left, ahead), np.hypot(left, ahead)
+    view = math.radians(sensors.field_of_view)
+    ray = np.rint((angle + view / 2) / (view / (sensors.rays - 1))).astype(np.int64)
+    seen = np.flatnonzero(np.abs(angle) <= view / 2)
+    order = seen[np.lexsort((radius.ravel()[seen], ray.ravel()[seen]))]
+    first = np.searchsorted(ray.ravel()[order], np.arange(sensors.rays + 1))
+    return GridTable(
+        freeze(first.astype(np.int32)),
+        freeze(order.astype(np.uint16)),
+        freeze(np.append(radius.ravel()[order], np.inf).astype(np.float32)),
+        k.ray_range,
+    )
+
+
+@leaf
+def fill_grid(table, ranges, grid):
+    """What one car's rays say of the cells: ranges float32 [rays] in m; writes grid uint8 [6400], row by row."""
+    for i in range(grid.shape[0]):
+        grid[i] = UNKNOWN
+    # Unsigned indices: a signed one might count from the end.
+    for ray in range(ranges.shape[0]):
+        hit = ranges[ray]
+        near, far = hit - HALF_DIAGONAL, hit + HALF_DIAGONAL
+        if hit >= table.reach:
+            near = far = table.reach
+        k, last = _N(table.first[ray]), _N(table.first[ray + 1])
+        while k < last and table.radii[k] < near:
+            grid[_N(table.cells[k])] = FREE
+            k += _N(1)
+        if hit >= table.reach:
+            continue
+        while k < last and table.radii[k] <= far:
+            grid[_N(table.cells[k])] = OCCUPIED
+            k += _N(1)
+
+
+@njit(nogil=True)
+def _fill_grids(table, ranges, grids):
+    for n in range(ranges.shape[0]):
+        fill_grid(table, ranges[n], grids[n])
+
+
+def grids(table: GridTable, ranges: np.ndarray) -> np.ndarray:
+    """Grids uint8 [n, 80, 80] of ranges float32 [n, rays] in m.
+
+    Raises: ValueError with one line for ranges of another shape.
+    """
+    rays = len(table.first) - 1
+    if ranges.ndim != 2 or ranges.shape[1] != rays:
+        raise ValueError(f"a grid is made of the ranges of {rays} rays, [n, {rays}], not {ranges.shape}")
+    made = np.empty((len(ranges), CELLS, CELLS), dtype=np.uint8)
+    _fill_grids(table, np.ascontiguousarray(ranges, dtype=np.float32), made.reshape(len(ranges), CELLS * CELLS))
+    return made
+
+
+@njit(nogil=True)
+def _push_frames(stacked, grids, begun):
+    frames, area = stacked.shape[1], stacked.shape[2]
+    for n in range(stacked.shape[0]):
+        for k in range(frames):
+            if begun[n] or k == frames - 1:
+                for i in range(area):
+                    stacked[n, k, i] = grids[n, i]
+            else:
+                for i in range(area):
+                    stacked[n, k, i] = stacked[n, k + 1, i]
+
+
+def push_frames(stacked: np.ndarray, grids: np.ndarray, begun: np.ndarray) -> None:
+    """Append each car's new grid to its stack, whose oldest drops out; the newest is last.
+
+    Args: stacked uint8 [n, frames, 80, 80], C-contiguous, changed in place; grids uint8 [n, 80, 80]; begun bool [n],
+    where an episode has just begun: there all frames are the first grid.
+    Raises: ValueError with one line where shapes do not fit.
+    """
+    n = len(grids)
+    if grids.shape != (n, CELLS, CELLS) or stacked.ndim != 4 or begun.shape != (n,):
+        raise ValueError(f"grids {grids.shape} and begun {begun.shape} are not [n, {CELLS}, {CELLS}] and [n]")
+    if stacked.shape != (n, stacked.shape[1], CELLS, CELLS) or not stacked.flags.c_contiguous:
+        raise ValueError(f"a stack for {n} grids is [{n}, frames, {CELLS}, {CELLS}], contiguous, not {stacked.shape}")
+    flat = stacked.reshape(n, stacked.shape[1], CELLS * CELLS)
+    _push_frames(flat, np.ascontiguousarray(grids).reshape(n, CELLS * CELLS), np.ascontiguousarray(begun))

@@ -1,0 +1,398 @@
+"""Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change lanes on the highway.
+
+Longitudinal motion is the intelligent driver model (Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
+(Kesting, Treiber and Helbing 2007). The ego car is an obstacle like any other, and has the right of way at junctions
+(`junctions.py`); who meets it keeps to the right (`encounters.py`). What a car's state holds is in `world.py`, a map's
+lanes are in `network.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.config import Constants, SimConfig, constants
+from gridsim.traffic.encounters import meets, moved_over, room_beside, runs_into
+from gridsim.jit import leaf, njit
+from gridsim.traffic.junctions import CAUTION, may_enter
+from gridsim.maps.network import away, is_junction, lane_length, turned, wrapped
+from gridsim.traffic.world import (
+    AFTER,
+    ALONG,
+    CLOCK,
+    COS,
+    FACTOR,
+    GAP,
+    HORIZON,
+    LANE,
+    LEAD,
+    NEXT,
+    PACE,
+    PAST,
+    PERMIT,
+    SHIFT,
+    SIN,
+    SPEED,
+    THINKING,
+    X,
+    Y,
+    choose_lane,
+    set_pose,
+)
+
+_F, _I, _N = np.float32, np.int32, np.uint64
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+_LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
+_LENGTH = _F(5.0)  # m, added to a car's horizon: another car's middle is further away than its rear
+_EASE = _F(0.12)  # m to the right a m of way that a path is thought to go there
+_SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
+
+
+class Drivers(NamedTuple):
+    """`TrafficConfig` as the kernels read it, with the cars' size and the control period."""
+
+    acceleration: np.float32  # m/s2
+    comfort: np.float32  # m/s2, deceleration
+    braking: np.float32  # m/s2, greatest deceleration
+    headway: np.float32  # s
+    jam: np.float32  # m
+    politeness: np.float32
+    threshold: np.float32  # m/s2
+    safe: np.float32  # m/s2
+    shift: np.float32  # m/s
+    half_length: np.float32  # m
+    half_width: np.float32  # m
+    dt: np.float32  # s
+    ego: Constants  # of the ego car, by which its way is foreseen
+
+
+def drivers(sim: SimConfig) -> Drivers:
+    """The configuration for the kernels."""
+    f, config = np.float32, sim.traffic
+    return Drivers(
+        acceleration=f(config.acceleration),
+        comfort=f(config.comfort),
+        braking=f(config.braking),
+        headway=f(config.headway),
+        jam=f(config.jam),
+        politeness=f(config.politeness),
+        threshold=f(config.threshold),
+        safe=f(config.safe_braking),
+        shift=f(config.lane_change_speed),
+        half_length=f(sim.vehicle.length / 2),
+        half_width=f(sim.vehicle.width / 2),
+        dt=f(sim.episode.control_period),
+        ego=constants(sim),
+    )
+
+
+@leaf
+def idm(drivers, speed, desired, gap, leader):
+    """Acceleration (m/s2) of the intelligent driver model: Treiber et al. 2000, equations 2 and 3.
+
+    Args: own speed and the desired one, m/s; m to the leader's rear; the leader's speed, m/s. Without a leader the gap
+    is infinite.
+    """
+    ratio = speed / max(desired, _F(0.1))
+    free = ratio * ratio
+    free *= free
+    wanted = drivers.jam + max(
+        _ZERO,
+        speed * drivers.headway
+        + speed * (speed - leader) / (_F(2.0) * math.sqrt(drivers.acceleration * drivers.comfort)),
+    )
+    near = wanted / max(gap, _F(0.01))
+    return max(drivers.acceleration * (_ONE - free - near * near), -drivers.braking)
+
+
+@leaf
+def _ahead(network, car, other):
+    """Way (m) from a car to one on its lane or on one of the two that come then; 1e9 if it is on none, or behind."""
+    lane, along = other[LANE], other[ALONG]
+    if lane == car[LANE] and along > car[ALONG]:
+        return along - car[ALONG]
+    if lane == car[NEXT]:
+        return lane_length(network, _I(car[LANE])) - car[ALONG] + along
+    if lane == car[AFTER]:
+        return lane_length(network, _I(car[LANE])) - car[ALONG] + lane_length(network, _I(car[NEXT])) + along
+    return _F(1e9)
+
+
+@leaf
+def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
+    """M from a car's middle along its path to where its way is blocked by a car at (x, y) with a heading; 1e9 if not.
+
+    Looks at points of the path from the car's front on, up to `horizon` m. The path is as far to the right of the lane
+    as the car is now, and goes further there, `more` m a m of way, as far as there is room.
+    """
+    right = max(-car[SHIFT], _ZERO)
+    half_length = drivers.half_length + drivers.half_width + CAUTION
+    half_width = drivers.half_width + drivers.half_width + CAUTION
+    lane = _I(car[LANE])
+    travelled = drivers.half_length
+    along = car[ALONG] + travelled
+    reach_x = abs(cosine) * half_length + abs(sine) * half_width
+    reach_y = abs(sine) * half_length + abs(cosine) * half_width
+    for _ in range(3):
+        if travelled > horizon:
+            return _F(1e9)
+        length = lane_length(network, lane)
+        box = network.boxes[_N(lane)]
+        beside_x = abs(turned(box[0] - x, network.width)) - box[2]
+        beside_y = abs(turned(box[1] - y, network.height)) - box[3]
+        if beside_x > reach_x or beside_y > reach_y:  # all of this lane is out of reach
+            travelled += max(length - along, _ZERO)
+            along = max(along, length)
+        else:
+            first, step = _N(network.offsets[_N(lane)]), network.steps[_N(lane)]
+            while along <= length:
+                if travelled > horizon:
+                    return _F(1e9)
+                k = first + _N(_I(along / step))
+                px, py = network.points[k, 0], network.points[k, 1]
+                aside_by = min(network.room[k], right + more * travelled)
+                if aside_by > _ZERO:
+                    px, py = moved_over(network, k, k + _N(1) if along + step <= length else k - _N(1), aside_by)
+                dx, dy = turned(px - x, network.width), turned(py - y, network.height)
+                forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+                free = max(abs(forward) - half_length, abs(aside) - half_width)
+                if free < _ZERO:
+                    return travelled
+                hop = max(free, _SAMPLE)  # nothing can be in the way any sooner
+                along += hop
+                travelled += hop
+        along -= length
+        if lane == _I(car[LANE]):
+            lane = _I(car[NEXT])
+        else:
+            lane = _I(car[AFTER])
+    return _F(1e9)
+
+
+@leaf
+def follow(network, drivers, car, other, is_ego):
+    """Take another car within a car's horizon into account: whether it is the nearest thing to keep behind."""
+    along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
+    at = _F(1e9)
+    dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
+    forward = dx * car[COS] + dy * car[SIN]
+    looked = forward < _F(-6.0)  # who is behind is not in the way
+    if not is_ego:
+        lane = _N(_I(other[LANE]))
+        at = _ahead(network, car, other) - drivers.half_length
+        # Neither is who keeps to a lane beside others.
+        looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
+    if not looked:
+        near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
+        more = _EASE if is_ego and meets(network, car, other) else _ZERO
+        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, more)
+    if at < car[GAP]:
+        car[GAP], car[LEAD] = at, along
+    if is_ego and not looked and other[SPEED] > _ONE:
+        if car[COS] * other[COS] + car[SIN] * other[SIN] <= _HALF:
+            at = runs_into(network, drivers, car, other)
+        elif forward > _ZERO:
+            # Where the ego car will be in a second: it may be about to cut in.
+            x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
+            near = min(car[HORIZON], car[GAP])
+            at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, _ZERO)
+        if at < car[GAP]:
+            car[GAP], car[LEAD] = at, along
+
+
+@leaf
+def _see(network, drivers, world, ego):
+    """Find for each car the nearest thing that it has to keep behind, within its horizon: GAP and LEAD."""
+    cars = world.shape[0]
+    for i in range(cars):
+        speed = world[i, SPEED]
+        world[i, HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_F(2.0) * drivers.comfort))
+        world[i, GAP], world[i, LEAD] = _F(1e9), _ZERO
+    ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
+    for i in range(cars):
+        if world[i, LANE] < _ZERO:
+            continue
+        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + _LENGTH
+        for j in range(i):
+            if world[j, LANE] < _ZERO:
+                continue
+            dx, dy = away(world[j, X] - x, network.width), away(world[j, Y] - y, network.height)
+            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _LENGTH
+            if squared < far * far:
+                follow(network, drivers, world[i], world[j], False)
+            if squared < other_far * other_far:
+                follow(network, drivers, world[j], world[i], False)
+        if ego_is_there:
+            dx, dy = away(ego[X] - x, network.width), away(ego[Y] - y, network.height)
+            if dx * dx + dy * dy < far * far:
+                follow(network, drivers, world[i], ego, True)
+
+
+@leaf
+def _desired(network, car):
+    """Speed (m/s) that a car would like to go where it is."""
+    lane = _N(_I(car[LANE]))
+    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
+    return car[FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
+
+
+@leaf
+def change_lanes(network, drivers, world, i, ego):
+    """Move car i to a neighbouring lane if it is time to think of that, and if it is safe and the car gains by it."""
+    car = world[i]
+    if car[CLOCK] > _ZERO:
+        car[CLOCK] -= _ONE
+        return
+    car[CLOCK] = THINKING - _ONE
+    lane = _I(car[LANE])
+    if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
+        _choose_neighbour(network, drivers, world, i, ego)
+
+
+@njit(_nrt=False)
+def _choose_neighbour(network, drivers, world, i, ego):
+    """MOBIL (Kesting et al. 2007). Not inlined: the call is rare, and dear for all the network's arguments."""
+    car = world[i]
+    lane = _I(car[LANE])
+    mine = car[PACE]
+    best, gain = _I(-1), drivers.threshold
+    for side in range(2):
+        target = network.left[lane] if side == 0 else network.right[lane]
+        if target < 0:
+            continue
+        along = car[ALONG] / network.steps[lane] * network.steps[target]
+        # The gaps to the next cars ahead and behind in the target lane.
+        front, front_speed, rear, rear_speed, rear_desired = _F(1e9), _ZERO, _F(1e9), _ZERO, _ONE
+        free = True
+        for j in range(world.shape[0] + 1):
+            if j == i:
+                continue
+            other = world[j] if j < world.shape[0] else ego
+            if (j < world.shape[0] and other[LANE] < _ZERO) or (other[COS] == _ZERO and other[SIN] == _ZERO):
+                continue
+            dx, dy = other[X] - car[X], other[Y] - car[Y]
+            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+            if dx * dx + dy * dy > _F(10000.0):
+                continue
+            if j < world.shape[0]:
+                there = _I(other[LANE])
+                place = other[ALONG]
+                ahead = _F(1e9)
+                if there == target:
+                    ahead = place - along
+                elif network.successors[target, 0] == there:
+                    ahead = lane_length(network, target) - along + place
+                elif network.successors[there, 0] == target:
+                    ahead = along + lane_length(network, there) - place
+                    ahead = -ahead
+                elif there != lane and other[SHIFT] != _ZERO and dx * dx + dy * dy < _F(400.0):
+                    free = False  # somebody else is moving over, from beyond the target lane or out of it
+                if ahead > _F(1e8):
+                    continue
+            else:
+                ahead = dx * car[COS] + dy * car[SIN]  # of the ego car, which is on no lane
+                aside = dy * car[COS] - dx * car[SIN]
+                sideways = _F(3.75) if side == 0 else _F(-3.75)
+                if abs(aside - sideways) > _F(2.8) + _F(0.004) * ahead * ahead:
+                    continue
+            if abs(ahead) < _F(2.0) * drivers.half_length + drivers.jam:
+                free = False
+            if ahead >= _ZERO and ahead < front:
+                front, front_speed = ahead, other[SPEED]
+            if ahead < _ZERO and -ahead < rear:
+                rear, rear_speed = -ahead, other[SPEED]
+                rear_desired = _desired(network, other) if j < world.shape[0] else other[SPEED]
+        if not free:
+            continue
+        desired = _desired(network, car)
+        there = idm(drivers, car[SPEED], desired, front - _F(2.0) * drivers.half_length, front_speed)
+        behind = _ZERO
+        lost = _ZERO
+        if rear < _F(1e8):
+            behind = idm(drivers, rear_speed, rear_desired, rear - _F(2.0) * drivers.half_length, car[SPEED])
+            alone = idm(drivers, rear_speed, rear_desired, _F(1e9), _ZERO)
+            lost = max(alone - behind, _ZERO)
+        if behind < -drivers.safe or there < -drivers.safe:
+            continue
+        advantage = there - mine - drivers.politeness * lost
+        if advantage > gain:
+            best, gain = _I(target), advantage
+    if best >= 0:
+        toward = _ONE if best == network.left[lane] else -_ONE
+        car[ALONG] = car[ALONG] / network.steps[lane] * network.steps[best]
+        first, second = network.offsets[lane], network.offsets[best]
+        k = _I(car[ALONG] / network.steps[best])
+        dx = network.points[second + k, 0] - network.points[first + k, 0]
+        dy = network.points[second + k, 1] - network.points[first + k, 1]
+        dx, dy = turned(dx, network.width), turned(dy, network.height)
+        car[SHIFT] = -toward * math.sqrt(dx * dx + dy * dy)
+        car[LANE] = _F(best)
+        car[NEXT] = _F(choose_lane(network, best, car))
+        car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
+
+
+@leaf
+def _go(network, drivers, car, ego):
+    """Move one car by its acceleration for a control period, and to the right or back by how it meets the ego car."""
+    after = max(car[SPEED] + car[PACE] * drivers.dt, _ZERO)
+    car[ALONG] += _HALF * (car[SPEED] + after) * drivers.dt
+    car[SPEED] = after
+    sway, place = _ZERO, _ZERO
+    if meets(network, car, ego):
+        place = -room_beside(network, car)
+    if car[SHIFT] != place:
+        slide = min(drivers.shift * drivers.dt, abs(car[SHIFT] - place)) * min(after, _ONE)
+        if car[SHIFT] > place:
+            slide = -slide
+        car[SHIFT] += slide
+        if abs(car[SHIFT] - place) < _F(1e-3):
+            car[SHIFT] = place
+        sway = slide / max(after * drivers.dt, _F(0.1))
+        sway = min(max(sway, _F(-0.2)), _F(0.2))
+    length = lane_length(network, _I(car[LANE]))
+    if car[ALONG] >= length:
+        lane = _I(car[LANE])
+        car[ALONG] -= length
+        car[PAST] = car[LANE] if is_junction(network, lane) else -_ONE
+        car[LANE], car[NEXT] = car[NEXT], car[AFTER]
+        car[PERMIT] = -_ONE
+        car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
+    elif car[PAST] >= _ZERO and car[ALONG] > drivers.half_length + _ONE:
+        car[PAST] = -_ONE
+    set_pose(network, car, sway)
+
+
+@leaf
+def flow(network, drivers, world, ego):
+    """One control period of a world's traffic around the ego car as it was before its own move.
+
+    Args: world [cars, FIELDS], changed; ego, a car of which X to STEERING are read (without a heading, COS and SIN 0,
+    it is not there).
+    """
+    cars = world.shape[0]
+    _see(network, drivers, world, ego)
+    for i in range(cars):
+        car = world[i]
+        if car[LANE] < _ZERO:
+            continue
+        lane, onward = _I(car[LANE]), _I(car[NEXT])
+        desired = _desired(network, car)
+        pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD])
+        if is_junction(network, onward) and car[PERMIT] != car[NEXT]:
+            # A junction comes: up to its line without a permit.
+            line = lane_length(network, lane) - car[ALONG] - drivers.half_length
+            if line < car[HORIZON]:
+                if may_enter(network, drivers, world, i, ego):
+                    car[PERMIT] = car[NEXT]
+                else:
+                    pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - _LINE, _ZERO))
+        car[PACE] = pace
+    for i in range(cars):
+        if world[i, LANE] >= _ZERO:
+            change_lanes(network, drivers, world, i, ego)
+    for i in range(cars):
+        if world[i, LANE] >= _ZERO:
+            _go(network, drivers, world[i], ego)

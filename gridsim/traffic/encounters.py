@@ -1,0 +1,102 @@
+"""How traffic meets the ego car: it keeps to the right of its lane, and sees coming where both would be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.sensing.boxes import boxes_touch
+from gridsim.car.ego import STEERING
+from gridsim.jit import leaf, njit
+from gridsim.maps.network import lane_length, turned, wrapped
+from gridsim.car.vehicle import advance, path_curvature
+from gridsim.traffic.world import AFTER, ALONG, COS, LANE, NEXT, SHIFT, SIN, SPEED, X, Y
+
+_F, _I, _N = np.float32, np.int32, np.uint64
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+_FAR = _F(35.0)  # m from which on it keeps to the right
+_PAST = _F(-4.0)  # m ahead: then both have passed each other
+_TOWARDS = _F(0.3)  # cosine of the angle between the headings of who goes the same way, or turns into it
+_FORESEEN = _F(3.0)  # s
+_TICK = _F(0.25)  # s between the moments that are looked at
+_BRAKING = _F(6.0)  # m/s2 with which it would stop before it is run into
+_NEAR = _F(6.0)  # m between their middles within which two cars may touch
+
+
+@leaf
+def meets(network, car, ego):
+    """Whether the ego car, not far ahead, comes towards a car or crosses its way."""
+    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > _TOWARDS:
+        return False
+    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
+    return dx * dx + dy * dy < _FAR * _FAR and dx * car[COS] + dy * car[SIN] > _PAST
+
+
+@leaf
+def room_beside(network, car):
+    """M to the right that a car can move over where it is."""
+    lane = _N(_I(car[LANE]))
+    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
+    return network.room[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
+
+
+@leaf
+def moved_over(network, k, other, right):
+    """Point k of a lane (m), moved to the right; other is a neighbour of k, before or after it on the lane."""
+    one, two = max(k, other), min(k, other)
+    x, y = network.points[k, 0], network.points[k, 1]
+    ux, uy = network.points[one, 0] - network.points[two, 0], network.points[one, 1] - network.points[two, 1]
+    by = right / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+    return x + by * uy, y - by * ux
+
+
+@njit(_nrt=False)
+def runs_into(network, drivers, car, ego):
+    """M from a car's middle along its path to where it must not get if it is not to run into the ego car.
+
+    Both are taken to go on as they do: the car along its lanes at its speed, keeping to the right, the ego car at its
+    own on the arc that it steers. 1e9 if they do not touch within three seconds; or if the ego car runs into this one's
+    side or rear and it cannot well stop before that: then it had better go on.
+    Not inlined: the call is rare, and dear for all the network's arguments.
+    """
+    lane = _I(car[LANE])
+    length, begin = lane_length(network, lane), -car[ALONG]  # m of the lane, and of way to its beginning
+    x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
+    curvature = path_curvature(drivers.ego, speed, ego[STEERING])
+    dx, dy = wrapped(x - car[X], network.width), wrapped(y - car[Y], network.height)
+    t = _ZERO
+    while True:
+        # Nothing can touch any sooner.
+        hop = max((math.sqrt(dx * dx + dy * dy) - _NEAR) / (car[SPEED] + abs(speed)), _TICK)
+        t += hop
+        if t > _FORESEEN:
+            return _F(1e9)
+        way = car[SPEED] * t
+        while way - begin >= length:
+            begin += length
+            if lane == _I(car[LANE]):
+                lane = _I(car[NEXT])
+            elif lane == _I(car[NEXT]):
+                lane = _I(car[AFTER])
+            else:
+                return _F(1e9)
+            length = lane_length(network, lane)
+        k = _N(network.offsets[_N(lane)]) + _N(_I((way - begin) / network.steps[_N(lane)]))
+        k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
+        right = min(network.room[k], drivers.shift * t - car[SHIFT])
+        px, py = moved_over(network, k, k + _N(1), right)
+        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
+        dx, dy = turned(x - px, network.width), turned(y - py, network.height)
+        if dx * dx + dy * dy > _NEAR * _NEAR:
+            continue
+        ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]
+        ux, uy = ux - network.points[k, 0], uy - network.points[k, 1]
+        norm = _ONE / math.sqrt(max(ux * ux + uy * uy, _F(1e-12)))
+        ux, uy = ux * norm, uy * norm
+        if boxes_touch(drivers, dx, dy, ux, uy, cosine, sine):
+            ahead = dx * ux + dy * uy
+            at = way + ahead - drivers.half_width
+            stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (_F(2.0) * _BRAKING)
+            return max(at, _ZERO) if ahead >= _ZERO or stops else _F(1e9)

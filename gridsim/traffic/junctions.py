@@ -1,0 +1,131 @@
+"""Junctions: who may enter. A junction lane is entered only with a permit, which nobody gets while its ground is taken.
+
+The ego car has the right of way.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.jit import leaf
+from gridsim.maps.network import is_junction, lane_length, turned, wrapped
+from gridsim.traffic.world import AFTER, ALONG, COS, HORIZON, LANE, NEXT, PAST, PERMIT, SIN, SPEED, X, Y
+
+_F, _I = np.float32, np.int32
+_ZERO, _HALF = _F(0.0), _F(0.5)
+
+CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
+_CROSSING_TIME = _F(7.0)  # s, what it takes from a standstill to leave a junction (critical gaps of drivers: 6 to 7)
+_NEAR = _F(7.0)  # m around the ego car where nobody enters a junction
+_AHEAD = _F(0.6)  # cosine of the angle from its heading within which it may get to before long
+
+
+@leaf
+def _passes(network, drivers, lane, other):
+    """Whether a lane passes where a car's rear is that waits at the end of another lane with the same beginning."""
+    step = network.steps[other]
+    q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
+    reach = _F(2.0) * drivers.half_width + _F(2.0) * CAUTION
+    for p in range(network.offsets[lane], network.offsets[lane + 1]):
+        dx = turned(network.points[p, 0] - network.points[q, 0], network.width)
+        dy = turned(network.points[p, 1] - network.points[q, 1], network.height)
+        if dx * dx + dy * dy < reach * reach:
+            return True
+    return False
+
+
+@leaf
+def _reaches(network, lane, x, y, within):
+    """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
+    first, k = network.offsets[lane], network.offsets[lane]
+    while k < network.offsets[lane + 1]:
+        dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
+        apart = math.sqrt(dx * dx + dy * dy)
+        if apart < within:
+            return _F(k - first) * network.steps[lane]
+        k += max(_I((apart - within) / network.steps[lane]), _I(1))
+    return _F(1e9)
+
+
+@leaf
+def _awaits(network, lane, ego, way):
+    """Whether a lane comes within `way` m of the ego car in front of it, or right beside it."""
+    for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
+        dx = turned(network.points[p, 0] - ego[X], network.width)
+        dy = turned(network.points[p, 1] - ego[Y], network.height)
+        squared = dx * dx + dy * dy
+        if squared < way * way:
+            forward = dx * ego[COS] + dy * ego[SIN]
+            if squared < _NEAR * _NEAR or (forward > _ZERO and forward * forward > _AHEAD * _AHEAD * squared):
+                return True
+    return False
+
+
+@leaf
+def may_enter(network, drivers, world, i, ego):
+    """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
+    car = world[i]
+    here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
+    first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
+    # Who enters must be able to leave, or junctions would block each other. Before another junction there is room for
+    # one, else for as many as the lane beyond holds.
+    chained = is_junction(network, beyond)
+    place = _F(2.0) * drivers.half_length + drivers.jam
+    room, needed = max(lane_length(network, beyond), place), place
+    for j in range(world.shape[0]):
+        if j == i or world[j, LANE] < _ZERO:
+            continue
+        there, past, permit = _I(world[j, LANE]), _I(world[j, PAST]), _I(world[j, PERMIT])
+        onward = _I(world[j, NEXT])
+        # Most are nowhere near a junction.
+        for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
+            other = network.crossings[c]
+            if permit == other:
+                return False
+            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + _HALF:
+                return False
+            if past == other and lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
+                network.clear[c] + _HALF
+            ):
+                return False
+        waits = _I(-1)  # lane at whose end the other may have to wait, still in this junction
+        if there == here and world[j, ALONG] > car[ALONG]:
+            if permit != onward:
+                return False  # who is in front of this one waits for others, who must not wait for this one
+            if is_junction(network, _I(world[j, AFTER])):
+                waits = permit
+        elif permit != onward and is_junction(network, there) and is_junction(network, onward):
+            for k in range(network.successors.shape[1]):
+                if there == network.successors[here, k]:
+                    waits = there
+        if waits >= 0 and waits != lane and _passes(network, drivers, lane, waits):
+            return False
+        if chained:
+            if there == lane or permit == lane:
+                return False
+            for k in range(network.successors.shape[1]):
+                slow = there == network.successors[lane, k] and world[j, SPEED] < _F(2.0)
+                if slow and world[j, ALONG] < place + drivers.half_length:
+                    return False
+        elif there == beyond:
+            rear = world[j, ALONG] - drivers.half_length
+            room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
+        elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and is_junction(network, there)):
+            needed += place
+    # The ego car goes first, unless it is behind this one. Which way it will turn nobody knows, so all the ground ahead
+    # of it is left to it; but who is in a junction already, as in a roundabout, goes on.
+    if ego[COS] != _ZERO or ego[SIN] != _ZERO:
+        dx, dy = ego[X] - car[X], ego[Y] - car[Y]
+        dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+        forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+        same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
+        way = _NEAR + _CROSSING_TIME * max(ego[SPEED], _ZERO)
+        far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
+        if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < _F(2.5))):
+            if not is_junction(network, here) and _awaits(network, lane, ego, way):
+                return False
+            rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
+            room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
+    return room >= needed

@@ -1,0 +1,185 @@
+"""Worlds: the other cars around one ego car, where they are on their lanes, and how they get there.
+
+A world is float32 [cars, FIELDS], the fields below. Whatever happens in it follows from that array and from the ego
+car alone. A car is on rails: its centre of mass lies on its lane, shifted sideways while it changes lanes or meets
+the ego car.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.config import TrafficConfig
+from gridsim.counter import GOLDEN, mix, uniform
+from gridsim.jit import leaf, njit
+from gridsim.maps.network import Network, wrapped
+
+_F, _I, _U = np.float32, np.int32, np.uint64
+_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+
+# Fields of a traffic car's state; X to SPEED are where the ego car's are.
+X, Y = 0, 1  # m, centre of mass
+COS, SIN = 2, 3  # heading
+SPEED = 4  # m/s
+LANE = 5  # index of its lane, -1 for a car that is not there
+ALONG = 6  # m along it
+NEXT, AFTER = 7, 8  # the two lanes that come then
+PAST = 9  # junction lane that its rear may still be on, or -1
+PERMIT = 10  # junction lane that it may enter next, or -1
+SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
+FACTOR = 12  # desired speed over the lane's
+SEED = 13  # of its turns, below 2 ** 24
+TURNS = 14  # lanes it has chosen so far
+PACE = 15  # m/s2, its acceleration in this step
+HORIZON = 16  # m ahead that it looks in this step
+GAP = 17  # m from its middle to where it must not get
+LEAD = 18  # m/s of what is there
+CLOCK = 19  # control steps until it thinks of another lane
+FIELDS = 20
+
+_MOST = 1 << 24  # float32 holds all whole numbers up to it
+_FASTEST = 40.0  # m/s; nobody drives as fast on any map, and nobody passes a whole lane in a control period
+THINKING = _F(10.0)  # control steps from one thought of another lane to the next
+
+
+@leaf
+def set_pose(network, car, sway):
+    """Put a car where its lane, its metres along it and its shift say; `sway` is the shift's speed over the car's."""
+    one, two = _U(1), _U(2)
+    lane = _U(_I(car[LANE]))
+    first = _U(network.offsets[lane])
+    last = _U(network.offsets[lane + one]) - first - two
+    at = car[ALONG] / network.steps[lane]
+    k = min(_U(max(_I(at), _I(0))), last)
+    part = at - _F(_I(k))
+    x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
+    dx, dy = network.points[first + k + one, 0] - x0, network.points[first + k + one, 1] - y0
+    # The heading turns from the last piece's to the next one's, so that the car does not jerk at every point.
+    before, after = max(k, one) - one, min(k + two, last + one)
+    ax, ay = x0 + dx - network.points[first + before, 0], y0 + dy - network.points[first + before, 1]
+    bx, by = network.points[first + after, 0] - x0, network.points[first + after, 1] - y0
+    tx, ty = ax + part * (bx - ax), ay + part * (by - ay)
+    norm = _ONE / math.sqrt(max(tx * tx + ty * ty, _F(1e-12)))
+    tx, ty = tx * norm, ty * norm
+    x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
+    # NumPy's floor: that of `math` is an int64, whose product with a float32 is a float64.
+    car[X] = x - np.floor(x / network.width) * network.width
+    car[Y] = y - np.floor(y / network.height) * network.height
+    if sway != _ZERO:
+        norm = _ONE / math.sqrt(_ONE + sway * sway)
+        tx, ty = (tx - sway * ty) * norm, (ty + sway * tx) * norm
+    car[COS], car[SIN] = tx, ty
+
+
+@leaf
+def _draw(car):
+    """A random number in [0, 1) of a car's own."""
+    car[TURNS] += _ONE
+    return uniform(mix(mix(_U(car[SEED])) + _U(car[TURNS]) * GOLDEN))
+
+
+@leaf
+def choose_lane(network, lane, car):
+    """A lane after `lane`, at random."""
+    count = 0
+    for k in range(network.successors.shape[1]):
+        if network.successors[lane, k] >= 0:
+            count += 1
+    return network.successors[lane, min(_I(_draw(car) * _F(count)), _I(count - 1))]
+
+
+@njit
+def _is_free(network, world, n, x, y, apart):
+    for j in range(n):
+        if world[j, LANE] >= _ZERO:
+            dx, dy = world[j, X] - x, world[j, Y] - y
+            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+            if dx * dx + dy * dy < apart * apart:
+                return False
+    return True
+
+
+@njit(nogil=True)
+def _spawn(network, mileage, start, key, gap, ego_gap, world):
+    """Fill a world [cars, FIELDS]: uniformly over the lanes outside junctions, away from each other and the ego car."""
+    draws = 0
+    for i in range(world.shape[0]):
+        car = world[i]
+        car[:] = _ZERO
+        car[LANE], car[PAST], car[PERMIT] = -_ONE, -_ONE, -_ONE
+        car[CLOCK] = _F(i) % THINKING  # not all at once
+        for _ in range(60):
+            draws += 1
+            bits = mix(key + _U(draws) * GOLDEN)
+            metres = (bits >> _U(11)) * (1.0 / (1 << 53)) * mileage[-1]
+            lane = np.searchsorted(mileage, metres, side="right") - 1
+            lane = min(lane, len(mileage) - 2)
+            if network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]:
+                continue
+            car[LANE], car[ALONG] = _F(lane), _F(metres - mileage[lane])
+            set_pose(network, car, _ZERO)
+            dx, dy = car[X] - start[0], car[Y] - start[1]
+            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+            if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
+                car[SEED] = _F(mix(bits) >> _U(40))
+                car[FACTOR] = _F(0.9) + _F(0.3) * uniform(mix(bits + GOLDEN))
+                car[NEXT] = _F(choose_lane(network, lane, car))
+                car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
+                at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
+                car[SPEED] = _HALF * car[FACTOR] * network.speeds[at]
+                break
+            car[LANE] = -_ONE
+
+
+def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: TrafficConfig) -> np.ndarray:
+    """Worlds float32 [n, cars, FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
+
+    Uniform over the lanes outside junctions; a car for which there is no room is not there (LANE is -1).
+    """
+    worlds = np.zeros((len(starts), cars, FIELDS), dtype=np.float32)
+    if cars and len(network.offsets) > 1:
+        lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
+        mileage = np.concatenate([[0.0], np.cumsum(lengths)])
+        for world, start, key in zip(worlds, np.asarray(starts, dtype=np.float32), keys, strict=True):
+            _spawn(network, mileage, start, _U(key), _F(config.spawn_gap), _F(config.spawn_gap_ego), world)
+    else:
+        worlds[:, :, LANE] = -1.0
+    return worlds
+
+
+def check_worlds(worlds: np.ndarray, network: Network | None = None) -> None:
+    """Refuse traffic [..., FIELDS] with which kernels would read what is not there; they do not look for themselves.
+
+    Cars that are not there (LANE is -1) may hold any finite numbers. Without the network that the traffic is on, lanes
+    and metres along them are checked from below only.
+    Raises: ValueError with one line.
+    """
+    if not np.isfinite(worlds).all():
+        raise ValueError("traffic must be finite numbers")
+    cars = worlds[worlds[..., LANE] != -1.0].astype(np.float64)
+    if not len(cars):
+        return
+    lanes = _MOST if network is None else len(network.steps)
+    if not lanes:
+        raise ValueError("there are no lanes for traffic on this map")
+    lowest = np.array([0, 0, 0, -1, -1, 0, 0])
+    highest = np.array([*[lanes - 1] * 5, _MOST, _MOST])
+    whole = cars[:, [LANE, NEXT, AFTER, PAST, PERMIT, SEED, TURNS]]
+    k, field = np.nonzero((whole < lowest) | (whole > highest) | (whole % 1.0 != 0.0))
+    if len(k):
+        name = ("LANE", "NEXT", "AFTER", "PAST", "PERMIT", "SEED", "TURNS")[field[0]]
+        wanted = f"a whole number from {lowest[field[0]]} to {highest[field[0]]}"
+        raise ValueError(f"traffic's {name} must be {wanted}, not {whole[k[0], field[0]]:g}")
+    length = np.full(len(cars), np.inf)
+    if network is not None:
+        lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
+        length = lengths[whole[:, 0].astype(np.intp)]
+    for name, column, most in (
+        ("ALONG (m)", cars[:, ALONG], length + 1e-3),  # float32 may round up
+        ("SPEED (m/s)", cars[:, SPEED], np.full(len(cars), _FASTEST)),
+    ):
+        wrong = (column < 0.0) | (column > most)
+        if wrong.any():
+            raise ValueError(f"traffic's {name} must be from 0 to {most[wrong][0]:g}, not {column[wrong][0]:g}")

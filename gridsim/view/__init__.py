@@ -1,0 +1,1 @@
+"""Pictures, the window, a person at the keys and recorded drives."""

@@ -1,0 +1,303 @@
+"""A person at the keys: driving in a window, keeping the drive as a CSV file, and reading it back.
+
+A row is a control step: where the car was, and the action that was taken there. So a file is a list of (state, action)
+pairs for whoever learns from it, and its actions alone, from the first row on, give the same poses again, bit for bit.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from gridsim.config import SimConfig
+from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y
+from gridsim.view.render import Renderer, Window, between
+from gridsim.maps.scenarios import Scenario, check_name
+from gridsim.envs.simulator import Simulator
+from gridsim.car.vehicle import Action
+from gridsim.traffic.world import LANE
+
+COLUMNS = (
+    "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "traffic",
+    "scenario", "map_seed",
+)  # fmt: skip
+"""Time since the episode's start, pose, speed, steering and action (`vehicle.Action`); then which episode of the file
+(a restart begins the next one), how many other cars there were, and the map."""
+MAX_BYTES = 1 << 28  # of a file that is read
+FPS = 30  # pictures a second in the window
+STANDING = 0.05  # m/s, below which down means reverse and no longer brake
+_LIMITS = (1e7, 1e5, 1e5, 100.0, 200.0, 3.2)  # of time and pose: beyond, a number is nobody's
+_ENDLESS = 10_000_000  # control steps
+
+HELP = "arrows drive   space brakes   R restarts   Esc ends"
+
+
+class DriveError(ValueError):
+    """A recorded drive that cannot be written, read or replayed; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recorded drive; n control steps of one or more episodes on one map.
+
+    Attributes:
+        scenario: the map's name in the registry.
+        map_seed: the seed it is built from.
+        traffic: other cars there were; map and episode say where they began.
+        episodes: int64 [n], 0 first; each begins where its first row says.
+        times: float64 [n], s since the episode's start.
+        poses: float32 [n, 5]: x, y (m), heading (rad), speed (m/s), steering (rad) before each step.
+        actions: int64 [n], what was done then.
+    """
+
+    scenario: str
+    map_seed: int
+    traffic: int
+    episodes: np.ndarray
+    times: np.ndarray
+    poses: np.ndarray
+    actions: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def unhurried(config: SimConfig | None = None) -> SimConfig:
+    """The configuration a person drives with: who stands still goes on standing."""
+    config = config or SimConfig()
+    return dataclasses.replace(config, episode=dataclasses.replace(config.episode, patience=_ENDLESS))
+
+
+def _simulator(scenario: Scenario, config: SimConfig | None, traffic: int) -> Simulator:
+    """One car among so many others, whose episode ends with a collision and with nothing else."""
+    return Simulator([scenario], 1, unhurried(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
+
+
+def _key(scenario: Scenario, episode: int) -> int:
+    """What the traffic of an episode is spawned from."""
+    return int(np.random.SeedSequence([scenario.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
+
+
+def pose(car: np.ndarray) -> np.ndarray:
+    """x, y (m), heading (rad), speed (m/s), steering (rad), float32 [5], of a state [FIELDS]."""
+    return np.array([car[X], car[Y], np.arctan2(car[SIN], car[COS]), car[SPEED], car[STEERING]], dtype=np.float32)
+
+
+def action_for(keys: set[str], speed: float) -> Action:
+    """The action that the held keys ask for: names as in "up"; speed in m/s.
+
+    Braking goes before all else, left and right together cancel, and down reverses once the car stands.
+    """
+    if "space" in keys or ("down" in keys and speed > STANDING):
+        return Action.BRAKE
+    if "down" in keys:
+        return Action.REVERSE
+    turn = ("left" in keys) - ("right" in keys)
+    if "up" in keys:
+        return (Action.ACCELERATE, Action.ACCELERATE_LEFT, Action.ACCELERATE_RIGHT)[turn]
+    return (Action.NONE, Action.LEFT, Action.RIGHT)[turn]
+
+
+# ------------------------------------------------------------------------------------------------------------ files
+
+
+class Recorder:
+    """Writes a drive to a new file, row by row, so that whatever ends it, what was driven is there."""
+
+    def __init__(self, path: str | os.PathLike[str], scenario: Scenario, period: float, traffic: int = 0):
+        """Make the file. Raises: DriveError with one line if it is there already or cannot be made."""
+        self._map = (traffic, scenario.name, scenario.seed)
+        self._period = period
+        self.path, self.rows = Path(path), 0
+        try:
+            self._file = open(path, "x", newline="", encoding="utf-8", buffering=1)  # noqa: SIM115, closed by close()
+        except FileExistsError:
+            raise DriveError(f"{path} exists already; name another file") from None
+        except OSError as error:
+            raise DriveError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._writer = csv.writer(self._file, lineterminator="\n")
+        self._writer.writerow(COLUMNS)
+
+    def write(self, step: int, pose: np.ndarray, action: int, episode: int) -> None:
+        """Write one row: control steps since the episode's start; pose float32 [5]. Raises DriveError."""
+        # Nine digits tell any two float32 apart.
+        numbers = [f"{value:.9g}" for value in (round(step * self._period, 6), *pose.tolist())]
+        try:
+            self._writer.writerow([*numbers, int(action), episode, *self._map])
+        except OSError as error:
+            raise DriveError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        self.rows += 1
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def read_drive(path: str | os.PathLike[str]) -> Drive:
+    """Read a drive that `gridsim-drive --record` wrote.
+
+    Raises: DriveError with one line, the first thing that is wrong and where, for a file that is missing or no drive.
+    """
+    try:
+        if os.stat(path).st_size > MAX_BYTES:
+            raise DriveError(f"{path}: too large for a recorded drive")
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.reader(file, strict=True))
+    except OSError as error:
+        raise DriveError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DriveError(f"{path}: no recorded drive: it is not a CSV file ({type(error).__name__})") from error
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise DriveError(f"{path}: no recorded drive: its first line must be {','.join(COLUMNS)}")
+    if len(rows) < 2:
+        raise DriveError(f"{path}: nothing was driven: it has no rows")
+    numbers, actions, episodes = [], [], []
+    line = 1
+    try:
+        cars, name, map_seed = rows[1][-3:] if len(rows[1]) == len(COLUMNS) else ("0", "", "0")
+        for row in rows[1:]:
+            line += 1
+            numbers.append(_numbers(row))
+            actions.append(_whole(row, 6, len(Action) - 1))
+            episodes.append(_whole(row, 7, 1 << 31))
+            follows = episodes[-1] - (episodes[-2] if len(episodes) > 1 else -1)
+            if follows not in (0, 1):
+                raise ValueError(f"episode {episodes[-1]} does not follow the one before")
+            if (numbers[-1][0] <= numbers[-2][0]) if follows == 0 else (numbers[-1][0] != 0.0):
+                raise ValueError(f"time_s {row[0]} does not follow the time before")
+            if row[-3:] != [cars, name, map_seed]:
+                raise ValueError("traffic, scenario and map_seed must be the same in all rows")
+        check_name(name[:1000])
+        traffic, seed = _whole(rows[1], 8, 1000), _whole(rows[1], 10, (1 << 63) - 1)
+    except ValueError as error:
+        raise DriveError(f"{path}, line {line}: {error}") from error
+    table = np.array(numbers, dtype=np.float64)
+    poses = table[:, 1:].astype(np.float32)
+    return Drive(name, seed, traffic, np.array(episodes), table[:, 0].copy(), poses, np.array(actions))
+
+
+def _numbers(row: Sequence[str]) -> list[float]:
+    """Time and pose of a row. Raises ValueError."""
+    if len(row) != len(COLUMNS):
+        raise ValueError(f"it has {len(row)} columns, not {len(COLUMNS)}; was the file cut off?")
+    values = []
+    for text, column, limit in zip(row, COLUMNS, _LIMITS, strict=False):
+        try:
+            value = float(text)
+        except ValueError:
+            raise ValueError(f"{column} is {text[:40]!r}, no number") from None
+        if not abs(value) <= limit:
+            raise ValueError(f"{column} is {value:g}, which no car can have")
+        values.append(value)
+    return values
+
+
+def _whole(row: Sequence[str], column: int, most: int) -> int:
+    """A column's number, from 0. Raises ValueError."""
+    text = row[column]
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
+        raise ValueError(f"{COLUMNS[column]} is {text[:40]!r}, not a whole number from 0 to {most}")
+    return int(text)
+
+
+def replay(drive: Drive, scenario: Scenario, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
+    """Drive a recorded drive again, by its actions alone.
+
+    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
+    traffic float32 [n, others, world.FIELDS]).
+    Raises: DriveError with one line if an episode has a collision before its end: map and drive do not belong together.
+    """
+    simulator = _simulator(scenario, config, drive.traffic)
+    n, rays = len(drive), simulator.config.sensors.rays
+    poses, cars = np.empty((n, 5), np.float32), np.empty((n, FIELDS), np.float32)
+    views = np.empty((n, rays), np.float32)
+    worlds = np.empty((n, *simulator.state.worlds.shape[1:]), np.float32)
+    for k in range(n):
+        if k == 0 or drive.episodes[k] != drive.episodes[k - 1]:
+            ranges, _ = simulator.reset(drive.poses[k : k + 1], keys=_key(scenario, int(drive.episodes[k])))
+            poses[k] = drive.poses[k]
+        else:
+            ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
+            poses[k] = pose(simulator.state.cars[0])
+            if ends[0] != End.RUNNING:
+                raise DriveError(f"replayed, the drive ends at row {k} of {n}: it was driven on another map")
+        cars[k], views[k], worlds[k] = simulator.state.cars[0], ranges[0], simulator.state.worlds[0]
+    return poses, cars, views, worlds
+
+
+# ---------------------------------------------------------------------------------------------------------- driving
+
+
+def drive(
+    scenario: Scenario,
+    start: np.ndarray,
+    window: Window,
+    renderer: Renderer,
+    recorder: Recorder | None = None,
+    config: SimConfig | None = None,
+    seconds: float = math.inf,
+    traffic: int = 0,
+) -> dict[str, float]:
+    """Let a person drive at true speed until the window is closed, or for so many seconds of simulated time.
+
+    Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
+    Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
+    Raises: DriveError with one line if the recording cannot be written.
+    """
+    simulator = _simulator(scenario, config, traffic)
+    period = simulator.config.episode.control_period
+    pictures = max(1, round(period * FPS))
+    start = np.asarray(start, dtype=np.float32)
+    title = f"{scenario.name}, map {scenario.seed:,}    {HELP}"
+    episode, steps, best = 0, 0, 0.0
+    ranges, _ = simulator.reset(start[None], keys=_key(scenario, 0))
+    path = [start[:2].copy()]
+    while True:
+        pressed, held = window.keys()
+        if window.closed or pressed & {"escape", "q"} or steps * period >= seconds:
+            return {"seconds": steps * period, "episodes": episode + 1, "distance_m": best}
+        if "r" in pressed:
+            if simulator.state.cars[0, STEPS] > 0:
+                episode += 1
+            ranges, _ = simulator.reset(start[None], keys=_key(scenario, episode))
+            path = [start[:2].copy()]
+        before, view = simulator.state.cars[0].copy(), ranges[0]
+        there = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
+        ended = simulator.state.ends[0] != End.RUNNING
+        if not ended:
+            step = int(before[STEPS])
+            action = action_for(held, float(before[SPEED]))
+            if recorder is not None:
+                recorder.write(step, start if step == 0 else pose(before), action, episode)
+            ranges, _, _, _ = simulator.step(np.array([int(action)]))
+            steps += 1
+        after = simulator.state.cars[0]
+        then = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
+        best = max(best, float(after[DISTANCE]))
+        for k in range(1, pictures + 1):
+            part = k / pictures
+            car = between(before, after, part, scenario)
+            text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {car[STEPS] * period:.1f} s"
+            if ended:
+                text += "    collision: R restarts"
+            trace = np.array([*path, car[[X, Y]]])
+            image = renderer.draw(
+                car, boxes=between(there, then, part, scenario) if len(then) else None,
+                ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title),
+            )  # fmt: skip
+            window.show(image, pictures / period)
+        path.append(after[[X, Y]].copy())

@@ -1,0 +1,103 @@
+"""Lane marks: dashes on the line between neighbouring lanes, worked out from the lanes alone; none where ways cross.
+
+A lane's neighbour is found a lane's width to its left, parallel to it, in either direction. Where a lane that is not
+parallel passes close by, there is a junction, and no mark.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gridsim.maps.roads import freeze
+from gridsim.maps.scenarios import Scenario
+
+STEP = 1.0  # m between the points at which lanes are looked at
+NEAREST, FARTHEST = 2.2, 4.6  # m between the centre lines of neighbours
+PARALLEL = 0.985  # cosine of the angle within which lanes are parallel: 10 degrees
+JUNCTION = 3.0  # m from a mark within which a lane that is not parallel makes a junction
+PERIOD, DASH = 6.0, 2.5  # m from dash to dash, and a dash
+CLAIM = 0.5  # m, side of the cells by which a line is known to be marked already
+SHORTEST = 5  # points of a line worth marking
+
+
+def _samples(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points [n, 2] on all lanes every STEP m, on the torus, their directions [n, 2], and lane numbers [n]."""
+    lanes, mileage = scenario.lanes, scenario.mileage
+    at = np.arange(STEP / 2, mileage[-1], STEP)
+    segment = np.clip(np.searchsorted(mileage, at, side="right") - 1, 0, len(mileage) - 2)
+    points = lanes.points.astype(np.float64)
+    along = points[segment + 1] - points[segment]
+    length = np.hypot(along[:, 0], along[:, 1])
+    direction = along / np.maximum(length, 1e-9)[:, None]
+    found = points[segment] + direction * (at - mileage[segment])[:, None]
+    lane = np.searchsorted(lanes.offsets, segment, side="right") - 1
+    return found, direction, lane
+
+
+def lane_marks(scenario: Scenario) -> np.ndarray:
+    """Dashes float32 [n, 6]: centre x, y (m), direction (cosine, sine), half length (m), 1 between opposite lanes."""
+    if not len(scenario.lanes) or scenario.mileage[-1] < STEP:
+        return freeze(np.zeros((0, 6), dtype=np.float32))
+    size = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    points, direction, lane = _samples(scenario)
+    wrapped = np.mod(points, size)
+    # Lanes often lie on one another (the ways into a junction): each place and direction once is enough to search.
+    key = np.concatenate([np.round(wrapped), np.round(direction * 8)], axis=1)
+    _, one = np.unique(key, axis=0, return_index=True)
+    tree = cKDTree(wrapped[one], boxsize=size if scenario.torus else None)
+    left = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+
+    middle, reach = (NEAREST + FARTHEST) / 2, (FARTHEST - NEAREST) / 2 + STEP / 2
+    _, near = tree.query(np.mod(wrapped + middle * left, size), k=8, distance_upper_bound=reach)
+    there = near < len(one)
+    other = one[np.minimum(near, len(one) - 1)]  # [n, k]
+    offset = wrapped[other] - wrapped[:, None]
+    if scenario.torus:
+        offset -= np.round(offset / size) * size
+    across = (offset * left[:, None]).sum(axis=2)
+    ahead = np.abs((offset * direction[:, None]).sum(axis=2))
+    cosine = (direction[other] * direction[:, None]).sum(axis=2)
+    there &= (np.abs(cosine) > PARALLEL) & (ahead < STEP) & (across > NEAREST) & (across < FARTHEST)
+    rank = np.where(there, across + ahead, np.inf)
+    best = rank.argmin(axis=1)
+    row = np.arange(len(points))
+    marked = np.flatnonzero(there[row, best])
+    across, opposite = across[marked, best[marked]], cosine[marked, best[marked]] < 0
+    centre = np.mod(wrapped[marked] + 0.5 * across[:, None] * left[marked], size)
+
+    _, near = tree.query(centre, k=24, distance_upper_bound=JUNCTION)
+    crossing = (direction[one[np.minimum(near, len(one) - 1)]] * direction[marked][:, None]).sum(axis=2)
+    free = ~((near < len(one)) & (np.abs(crossing) < PARALLEL - 0.06)).any(axis=1)
+    marked, centre, opposite = marked[free], centre[free], opposite[free]
+    return freeze(_dashes(centre, direction[marked], opposite, marked, lane[marked], size))
+
+
+def _dashes(
+    centre: np.ndarray,
+    direction: np.ndarray,
+    opposite: np.ndarray,
+    sample: np.ndarray,
+    lane: np.ndarray,
+    size: np.ndarray,
+) -> np.ndarray:
+    """Dashes [n, 6] along the runs of marked points: whole periods, each run by whichever lane comes first."""
+    if not len(sample):
+        return np.zeros((0, 6), dtype=np.float32)
+    columns, rows = np.ceil(size / CLAIM).astype(int)
+    claimed = np.zeros((rows, columns), dtype=bool)
+    around = np.arange(-1, 2)
+    cell = (centre / CLAIM).astype(int)
+    found = []
+    for part in np.split(np.arange(len(sample)), np.flatnonzero((np.diff(sample) != 1) | (np.diff(lane) != 0)) + 1):
+        new = part[~claimed[cell[part, 1] % rows, cell[part, 0] % columns]]
+        for run in np.split(new, np.flatnonzero(np.diff(new) != 1) + 1):
+            if len(run) < SHORTEST:
+                continue
+            x, y = cell[run, 0, None, None] + around, cell[run, 1, None, None] + around[:, None]
+            claimed[y % rows, x % columns] = True
+            periods = max(1, round(len(run) * STEP / PERIOD))
+            at = run[((np.arange(periods) + 0.5) * len(run) / periods).astype(int)]
+            half = np.full(periods, DASH / 2)
+            found.append(np.column_stack([centre[at], direction[at], half, opposite[at]]))
+    return np.concatenate(found).astype(np.float32) if found else np.zeros((0, 6), dtype=np.float32)

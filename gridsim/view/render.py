@@ -1,0 +1,411 @@
+"""Pictures: a state of the simulator as an RGB array, or in a window. It reads only.
+
+Each pixel of the ground asks the road's clearance field how far the edge is, so that any map, turned and scaled in any
+way, has smooth edges, and a torus has no seam. All else but text is rounded boxes (lane marks, cars, rays and their
+dots, the path), blended by how much of a pixel they cover. Neither needs a display or a surface; pygame draws the text
+and opens the window.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gridsim.view import paint
+from gridsim.config import SimConfig, constants
+from gridsim.car.ego import COS, SIN, STEERING, X, Y
+from gridsim.view.marks import lane_marks
+from gridsim.maps.roads import CELLS_PER_M, freeze
+from gridsim.maps.scenarios import Scenario
+
+if TYPE_CHECKING:
+    import pygame
+
+CAR_AT = 0.74  # of the picture's height where the car is, where the view follows it
+GRID_CELL = 0.5  # m, of the occupancy grid
+
+
+class NoDisplayError(RuntimeError):
+    """There is nowhere to open a window; the message is one line that says what to do."""
+
+
+class Renderer:
+    """Draws pictures of one map.
+
+    A view that follows the car has its heading upwards, and the map, if it is a torus, repeats without a seam. The view
+    of the whole map has north upwards.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        size: tuple[int, int] = (640, 480),
+        metres: float = 52.0,
+        follow: bool = True,
+        config: SimConfig | None = None,
+    ):
+        """Prepare pictures of `size` (width, height in pixels).
+
+        Args: metres that a picture is high, where it follows the car; whether it does, or shows the whole map.
+        Raises: ValueError with one line where a number makes no sense.
+        """
+        width, height = size
+        if not (16 <= width <= 8192 and 16 <= height <= 8192):
+            raise ValueError(f"a picture is 16 to 8192 pixels wide and high, not {width} x {height}")
+        if not 1.0 <= metres <= 10_000.0:
+            raise ValueError(f"a picture shows 1 to 10,000 metres, not {metres}")
+        self.scenario, self.size, self.follow = scenario, (int(width), int(height)), follow
+        self.config = config or SimConfig()
+        self._constants = constants(self.config)
+        road = scenario.road
+        self._field = paint.smoothed(scenario)
+        self._world = np.array([road.width, road.height], dtype=np.float64)
+        self.pixels_per_m = height / metres if follow else min(width / self._world[0], height / self._world[1])
+        self._anchor = np.array([width / 2, height * (CAR_AT if follow else 0.5)])
+        self._centre, self._up = self._world / 2, np.array([0.0, 1.0])
+        self._marks = lane_marks(scenario)
+        # Parked cars: boxes that are part of the map, where it has any.
+        blocks = getattr(scenario.strips, "blocks", None)
+        self._blocks = np.zeros((0, 5)) if blocks is None else np.asarray(blocks, dtype=np.float64)
+        self._colours = freeze(
+            np.array([paint.GROUND, paint.GROUND_OTHER, paint.VERGE, paint.ASPHALT, paint.EDGE_LINE], dtype=np.float32)
+        )
+        vehicle, k = self.config.vehicle, self._constants
+        self._outline = (vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle))
+        self._other = paint.car_parts(*self._outline, 0.0, paint.OTHER)
+
+    # ------------------------------------------------------------------------------------------------- the view
+
+    def pixel(self, points: np.ndarray) -> np.ndarray:
+        """Where points [n, 2] (m) are in the last picture drawn: pixels float64 [n, 2], x right, y down.
+
+        Of a point of a torus, the one of its places that is nearest to the view's centre.
+        """
+        offset = np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre
+        if self.scenario.torus and self.follow:
+            offset -= np.round(offset / self._world) * self._world
+        return self._anchor + self._turn(offset) * self.pixels_per_m
+
+    def _turn(self, vectors: np.ndarray) -> np.ndarray:
+        """World directions [n, 2] as directions in the picture (y down)."""
+        (ux, uy), (x, y) = self._up, vectors.T
+        return np.stack([x * uy - y * ux, -(x * ux + y * uy)], axis=1)
+
+    def _near(self, pixels: np.ndarray, margin: float) -> np.ndarray:
+        """Which of pixels [n, 2] are in the picture, or `margin` pixels from it."""
+        return np.all((pixels > -margin) & (pixels < np.array(self.size) + margin), axis=1)
+
+    # ------------------------------------------------------------------------------------------------- drawing
+
+    def draw(
+        self,
+        car: np.ndarray,
+        boxes: np.ndarray | None = None,
+        ranges: np.ndarray | None = None,
+        grid: np.ndarray | None = None,
+        path: np.ndarray | None = None,
+        text: str | Sequence[str] = (),
+    ) -> np.ndarray:
+        """Draw a state: uint8 [h, w, 3].
+
+        Args:
+            car: the car's state float32 [FIELDS] (`gridsim.car.ego`); it is read only.
+            boxes: other cars [n, 4 or more]: x, y (m), heading (cosine, sine).
+            ranges: of the car's rays [rays], m.
+            grid: occupancy grid uint8 [cells, cells]: row 0 farthest ahead, column 0 leftmost; 0 unknown, 127 free, 255
+                occupied.
+            path: where the car has been [n, 2], m.
+            text: a line at the lower left, or a pair of lines at the lower left and the upper left.
+        """
+        width, height = self.size
+        position, heading = np.asarray(car[[X, Y]], np.float64), np.asarray(car[[COS, SIN]], np.float64)
+        if self.follow:
+            self._centre, self._up = position, heading / max(math.hypot(*heading), 1e-9)
+        image = np.empty((height, width, 3), dtype=np.uint8)
+        right = np.array([self._up[1], -self._up[0]])
+        metre = 1.0 / self.pixels_per_m
+        origin = self._centre - (self._anchor[0] - 0.5) * metre * right + (self._anchor[1] - 0.5) * metre * self._up
+        road = self.scenario.road
+        # Float32 positions stay exact to a millimetre or two: tiles enough to be above 0, and no more.
+        turn = 1 + math.ceil(math.hypot(width, height) * metre / self._world.min())
+        paint.draw_ground(
+            self._field, road.columns, road.rows, self.scenario.torus and self.follow, turn,
+            (origin + turn * self._world) * CELLS_PER_M, right * metre * CELLS_PER_M, -self._up * metre * CELLS_PER_M,
+            self.pixels_per_m, self._colours, image,
+        )  # fmt: skip
+        shapes = [self._mark_shapes(), self._block_shapes()]
+        if grid is not None:
+            shapes.append(self._grid_shapes(position, heading, np.asarray(grid)))
+        if path is not None:
+            shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64)))
+        if ranges is not None:
+            shapes.append(self._ray_shapes(position, heading, np.asarray(ranges, dtype=np.float64)))
+        if boxes is not None and len(boxes):
+            boxes = np.asarray(boxes, dtype=np.float64)
+            shapes.append(self._placed(self._other, boxes[:, :2], boxes[:, 2:4]))
+        own = paint.car_parts(*self._outline, float(car[STEERING]), paint.EGO)
+        shapes.append(self._placed(own, position[None], heading[None]))
+        paint.draw_shapes(freeze(np.concatenate(shapes)), image)
+        lines = (text,) if isinstance(text, str) else text
+        for line, corner in zip(lines, ("lower", "upper"), strict=False):
+            if line:
+                self._write(image, line, corner)
+        return image
+
+    def _shapes(
+        self,
+        centre: np.ndarray,
+        direction: np.ndarray,
+        length: np.ndarray | float,
+        across: float,
+        radius: float,
+        colour: Sequence[float] | np.ndarray,
+        opacity: float,
+        least: float = 0.5,
+    ) -> np.ndarray:
+        """Shapes [n, 11]: pixels [n, 2], directions [n, 2] in the picture, half length, half width and radius in m.
+
+        What is thinner than `least` pixels (half) is drawn so wide, and fainter.
+        """
+        scale = self.pixels_per_m
+        shapes = np.empty((len(centre), paint.SHAPE), dtype=np.float32)
+        shapes[:, 0:2], shapes[:, 2:4] = centre - 0.5, direction  # pixel (0, 0) has its centre at (0.5, 0.5)
+        drawn = max(across * scale, least)
+        shapes[:, 4] = np.maximum(length * scale, drawn)
+        shapes[:, 5], shapes[:, 6] = drawn, min(radius * scale, drawn)
+        shapes[:, 7:10] = colour
+        shapes[:, 10] = opacity * min(1.0, across * scale / least)
+        return shapes
+
+    def _mark_shapes(self) -> np.ndarray:
+        marks = self._marks
+        at = self.pixel(marks[:, :2])
+        seen = self._near(at, 2.0 * self.pixels_per_m)
+        marks, at = marks[seen], at[seen]
+        colour = np.where(marks[:, 5:6] > 0, np.array(paint.MARK_OPPOSITE), np.array(paint.MARK))
+        return self._shapes(at, self._turn(marks[:, 2:4]), marks[:, 4], 0.07, 0.02, colour, 0.9)
+
+    def _block_shapes(self) -> np.ndarray:
+        """Parked cars: as cars of their own length and width."""
+        blocks = self._blocks
+        if not len(blocks):
+            return np.zeros((0, paint.SHAPE), dtype=np.float32)
+        blocks = blocks[self._near(self.pixel(blocks[:, :2]), 8.0 * self.pixels_per_m)]
+        shapes = [
+            self._placed(
+                paint.car_parts(2 * a, 2 * b, 0.62 * a, 0.62 * a, 0.0, paint.PARKED),
+                np.array([[x, y]]),
+                np.array([[math.cos(turn), math.sin(turn)]]),
+            )
+            for x, y, turn, a, b in blocks
+        ]
+        return np.concatenate(shapes) if shapes else np.zeros((0, paint.SHAPE), dtype=np.float32)
+
+    def _placed(self, parts: np.ndarray, positions: np.ndarray, headings: np.ndarray) -> np.ndarray:
+        """A car's parts [k, 11] in m, put at positions [n, 2] with headings [n, 2]: shapes [n * k, 11] in pixels."""
+        scale = self.pixels_per_m
+        at, along = self.pixel(positions), self._turn(headings)
+        seen = self._near(at, 8.0 * scale)
+        at, along = at[seen], along[seen]
+        left = np.stack([along[:, 1], -along[:, 0]], axis=1)  # y is down
+        shapes = np.repeat(parts[None], len(at), axis=0)
+        for to, offset in ((slice(0, 2), at[:, None] - 0.5), (slice(2, 4), 0.0)):
+            factor = scale if to.start == 0 else 1.0
+            shapes[:, :, to] = offset + factor * (
+                parts[None, :, to.start, None] * along[:, None] + parts[None, :, to.start + 1, None] * left[:, None]
+            )
+        # Far away, a car is still a visible dot.
+        shapes[:, :, 4:7] *= max(scale, 2.0)
+        return shapes.reshape(-1, paint.SHAPE)
+
+    def _path_shapes(self, path: np.ndarray) -> np.ndarray:
+        if len(path) < 2:
+            return np.zeros((0, paint.SHAPE), dtype=np.float32)
+        at = self.pixel(path)
+        step = at[1:] - at[:-1]
+        length = np.hypot(step[:, 0], step[:, 1])
+        middle = (at[1:] + at[:-1]) / 2
+        # A step across the picture is one over the torus's edge.
+        seen = (length > 0.01) & (length < 20.0 * self.pixels_per_m)
+        seen &= self._near(middle, 20.0 * self.pixels_per_m)
+        middle, length = middle[seen], length[seen]
+        half = length / 2 / self.pixels_per_m + 0.12
+        return self._shapes(middle, step[seen] / length[:, None], half, 0.12, 0.12, paint.PATH, 1.0, 0.7)
+
+    def _ray_shapes(self, position: np.ndarray, heading: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+        k = self._constants
+        angle = k.ray_first + k.ray_step * np.arange(len(ranges))
+        c, s = np.cos(angle), np.sin(angle)
+        direction = np.stack([heading[0] * c - heading[1] * s, heading[1] * c + heading[0] * s], axis=1)
+        origin = position + k.front_axle * heading
+        half = ranges / 2
+        at = self.pixel(origin[None]) + self._turn(direction * half[:, None]) * self.pixels_per_m
+        rays = self._shapes(at, self._turn(direction), half, 0.04, 0.0, paint.RAY, 0.5, 0.5)
+        rays[:, 10] = np.maximum(rays[:, 10], 0.3)
+        hit = ranges < float(k.ray_range) - 1e-3
+        ends = self.pixel(origin[None]) + self._turn(direction * ranges[:, None])[hit] * self.pixels_per_m
+        dots = self._shapes(ends, self._turn(direction[hit]), 0.22, 0.22, 0.22, paint.RAY, 1.0, 1.5)
+        return np.concatenate([rays, dots])
+
+    def _grid_shapes(self, position: np.ndarray, heading: np.ndarray, grid: np.ndarray) -> np.ndarray:
+        cells = grid.shape[0]
+        row, column = np.divmod(np.arange(grid.size), grid.shape[1])
+        ahead = (cells - row - 0.5) * GRID_CELL + float(self._constants.front_axle)
+        left = (grid.shape[1] / 2 - column - 0.5) * GRID_CELL
+        side = np.array([-heading[1], heading[0]])
+        at = (
+            self.pixel(position[None]) + self._turn(ahead[:, None] * heading + left[:, None] * side) * self.pixels_per_m
+        )
+        value = grid.ravel()[:, None]
+        colour = np.where(
+            value == 0, np.array(paint.UNKNOWN), np.where(value == 255, np.array(paint.OCCUPIED), np.array(paint.FREE))
+        )
+        shapes = self._shapes(at, self._turn(heading[None]), 0.23, 0.23, 0.0, colour, 0.34, 0.5)
+        shapes[value[:, 0] == 0, 10] = 0.16
+        shapes[value[:, 0] == 255, 10] = 0.75
+        return shapes[self._near(at, self.pixels_per_m)]
+
+    def _write(self, image: np.ndarray, text: str, corner: str) -> None:
+        """Write a line of text on a dark pill into a corner."""
+        height = self.size[1]
+        glyphs = _glyphs(text, max(11, round(height / 28)))
+        glyphs = glyphs[:, : max(1, self.size[0] - height // 12)]
+        h, w = glyphs.shape
+        edge, inner = height // 40, h // 2
+        x = edge + inner
+        y = edge + inner // 2 if corner == "upper" else height - edge - h - inner // 2
+        pill = np.array(
+            [[x + w / 2 - 0.5, y + h / 2 - 0.5, 1, 0, w / 2 + inner, h / 2 + inner / 2, h / 2, *paint.HUD, 0.72]],
+            np.float32,
+        )
+        paint.draw_shapes(freeze(pill), image)
+        under = image[y : y + h, x : x + w]
+        cover = glyphs[: under.shape[0], : under.shape[1], None].astype(np.uint16)
+        under[:] = (under * (255 - cover) + 245 * cover) // 255
+
+
+def _pygame() -> Any:
+    """pygame, imported without its greeting."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    import pygame
+
+    return pygame
+
+
+@cache
+def _font(pixels: int) -> pygame.font.Font:
+    pygame = _pygame()
+    pygame.font.init()
+    return pygame.font.Font(None, round(pixels * 1.5))
+
+
+def _glyphs(text: str, pixels: int) -> np.ndarray:
+    """Coverage uint8 [h, w] of a line of text."""
+    pygame = _pygame()
+    surface = _font(pixels).render(text, True, (255, 255, 255))
+    rgba = np.frombuffer(pygame.image.tobytes(surface, "RGBA"), dtype=np.uint8)
+    return rgba.reshape(surface.get_height(), surface.get_width(), 4)[:, :, 3]
+
+
+def between(before: np.ndarray, after: np.ndarray, part: float, scenario: Scenario) -> np.ndarray:
+    """A state float32 [FIELDS] between two, or boxes [n, 4 or more] (x, y, cosine, sine): for pictures, not physics.
+
+    Args: part in [0, 1] of the way from the first to the second, over the torus's edge where that is shorter.
+    """
+    size = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    gap = np.asarray(after, dtype=np.float64) - before
+    if scenario.torus:
+        gap[..., :2] -= np.round(gap[..., :2] / size) * size
+    state = before + part * gap
+    if scenario.torus:
+        state[..., :2] = np.mod(state[..., :2], size)
+    state[..., COS : SIN + 1] /= np.maximum(np.hypot(state[..., COS], state[..., SIN]), 1e-9)[..., None]
+    return state.astype(np.float32)
+
+
+@contextlib.contextmanager
+def _driver_for_display(chosen: str | None) -> Iterator[None]:
+    """On Linux, let SDL try no driver whose display is not there: some of them complain on stderr by themselves."""
+    x11, wayland = os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY")
+    if chosen or wayland or not sys.platform.startswith("linux"):
+        yield
+    elif not x11:
+        raise _pygame().error("no display")
+    else:
+        os.environ["SDL_VIDEODRIVER"] = "x11"
+        try:
+            yield
+        finally:
+            del os.environ["SDL_VIDEODRIVER"]
+
+
+class Window:
+    """A window on a display, and the keys that are pressed in it."""
+
+    def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
+        """Open it. Raises: NoDisplayError with one line that says what to do."""
+        pygame = self._pygame = _pygame()
+        chosen = os.environ.get("SDL_VIDEODRIVER")
+        try:
+            with _driver_for_display(chosen):
+                pygame.display.init()
+            # SDL falls back on drivers that show nothing; that is right only for who asked for one.
+            if not chosen and pygame.display.get_driver() in ("dummy", "offscreen", "evdev"):
+                raise pygame.error("no display")
+            self._screen = pygame.display.set_mode(size)
+        except pygame.error as error:
+            pygame.display.quit()
+            raise NoDisplayError(
+                f"no window can be opened ({error}): set DISPLAY to a running display, or do without the window"
+            ) from error
+        pygame.display.set_caption(caption)
+        self._due = 0.0
+        self.closed = False
+
+    def show(self, image: np.ndarray, fps: float = 0.0) -> None:
+        """Show a picture uint8 [h, w, 3], and wait for so long that there are `fps` a second (0: do not wait)."""
+        pygame = self._pygame
+        height, width = image.shape[:2]
+        self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB"), (0, 0))
+        pygame.display.flip()
+        if fps > 0:
+            now = time.perf_counter()
+            if not now - 0.25 < self._due < now + 1.0:  # the first picture, or one after a pause
+                self._due = now
+            time.sleep(max(self._due - now, 0.0))
+            self._due += 1.0 / fps
+
+    def keys(self) -> tuple[set[str], set[str]]:
+        """Names of the keys that went down since the last call, and of those that are down or were in between.
+
+        Names are pygame's: "up", "space", "q", "escape". Closing the window, too, sets `closed`.
+        """
+        pygame = self._pygame
+        pressed: set[str] = set()
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT:
+                self.closed = True
+            elif event.type == pygame.KEYDOWN:
+                pressed.add(pygame.key.name(event.key))
+        state = pygame.key.get_pressed()
+        watched = {name for name in ("up", "down", "left", "right", "space") if state[pygame.key.key_code(name)]}
+        return pressed, pressed | watched
+
+    def close(self) -> None:
+        """Close it."""
+        self._pygame.display.quit()
+        self.closed = True
+
+    def __enter__(self) -> Window:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
