@@ -22,21 +22,21 @@ from typing import Any
 import numpy as np
 from simulation import ROWS  # beside this file
 
-from cluster.training.trainer import Maps
-from cluster.workers.pool import Chunk, WorkerPool
-from cluster.workers.ray_pool import RayPool
 from cluster.runs.run import Session, make_tracker, new_run
 from cluster.runs.settings import EvolveSettings
 from cluster.tracking.address import check_uri
+from cluster.training.trainer import Maps
+from cluster.workers.pool import Chunk, WorkerPool
+from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import Task, Worker
-from evolution.search import fitness
-from evolution.search.breeding import Kind, Mutation, breed, moments
-from evolution.networks.policy import PolicySpec
-from evolution.search.recombination import Recombination
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, no_traffic, targets
+from evolution.networks.policy import PolicySpec
+from evolution.search import fitness
 from evolution.search.base import recipes as some_recipes
-from gridsim.config import SimConfig
+from evolution.search.breeding import Kind, Mutation, breed, moments
+from evolution.search.recombination import Recombination
 from gridsim.car.ego import End
+from gridsim.config import SimConfig
 from gridsim.maps.scenarios import build, sample_starts
 
 POLICY = "mlp:6,7"  # 311 genes

@@ -8,10 +8,10 @@ import numpy as np
 
 from cluster.training.trainer import Maps, held_out_episodes
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
-from gridsim.config import SimConfig
 from gridsim.car.ego import DISTANCE, PACED, End
-from gridsim.reference.driver import ReferenceDriver
+from gridsim.config import SimConfig
 from gridsim.maps.scenarios import REGISTRY
+from gridsim.reference.driver import ReferenceDriver
 
 TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default is none
 

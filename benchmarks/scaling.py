@@ -60,15 +60,15 @@ from ceilings import (  # beside this file
 from ceilings import POLICY as MLP
 from simulation import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, table
 
+from cluster.runs.settings import MAX_STEPS, EvolveSettings
 from cluster.training.trainer import Maps
+from cluster.workers.kernels import compile_kernels
 from cluster.workers.pool import Chunk, Meanwhile, Outcome, Progress
 from cluster.workers.ray_pool import RayPool
-from cluster.runs.settings import MAX_STEPS, EvolveSettings
-from cluster.workers.kernels import compile_kernels
 from cluster.workers.worker import Task
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import targets
+from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
 LAST = 10  # generations that are measured

@@ -22,8 +22,8 @@ import numpy as np
 
 from cluster.workers.pool import Chunk, cut, metres
 from cluster.workers.worker import Task
-from evolution.search.breeding import RECIPE, Mutation
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
+from evolution.search.breeding import RECIPE, Mutation
 from gridsim.config import SimConfig
 
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)

@@ -25,10 +25,10 @@ from pathlib import Path
 from ceilings import learn, session  # beside this file
 
 from cluster.runs.champion import load_champion
-from cluster.training.trainer import Maps
-from cluster.workers.ray_pool import RayPool
 from cluster.runs.settings import EvolveSettings
+from cluster.training.trainer import Maps
 from cluster.workers.kernels import compile_kernels
+from cluster.workers.ray_pool import RayPool
 from gridsim.config import SimConfig
 
 FIRST = 100  # generations, after which nothing may grow

@@ -37,11 +37,11 @@ from peers import NOT_INSTALLED, PEERS  # beside this file
 import gridsim.envs.env
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CheckpointError
-from evolution.search.breeding import Kind, Mutation, breed
+from evolution.episodes.rollout import Limits, evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size, scratch_size
-from evolution.episodes.rollout import Limits, evaluate
 from evolution.search.base import recipes as some_recipes
+from evolution.search.breeding import Kind, Mutation, breed
 from gridsim.car.ego import DISTANCE
 from gridsim.jit import njit
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build

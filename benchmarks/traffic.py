@@ -25,11 +25,11 @@ import time
 
 import numpy as np
 
-from gridsim.sensing.boxes import boxes_touch
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.network import Network, wrapped
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.sensing.boxes import boxes_touch
 from gridsim.traffic.behaviour import drivers, flow
 from gridsim.traffic.world import COS, LANE, SIN, SPEED, X, Y, spawn
 

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from cluster.runs.champion import Champion, evaluate, load_champion
+from cluster.runs.settings import EvolveSettings
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool, WorkerPool
-from cluster.runs.settings import EvolveSettings
 from gridsim.config import SimConfig
 
 __all__ = ["Champion", "EvolveSettings", "evaluate", "evolve", "load_champion"]

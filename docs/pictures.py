@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from cluster.runs.champion import load_champion
 from cluster.report.film import picture, record
+from cluster.runs.champion import load_champion
 from evolution.episodes.starts import lane_starts
-from gridsim.view.render import Renderer
 from gridsim.maps.scenarios import HELD_OUT_SEED, build
+from gridsim.view.render import Renderer
 
 SIZE = (480, 360)
 TRAFFIC = 24  # more than usual, so that there is something to see

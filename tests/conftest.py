@@ -54,8 +54,8 @@ def root() -> Path:
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
-    from cluster.tracking.tracker import Tracker
     from cluster.tracking.address import check_uri
+    from cluster.tracking.tracker import Tracker
 
     folder = tmp_path_factory.mktemp("mlflow")
     begun = Tracker(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {})
@@ -78,7 +78,8 @@ def uri(empty_database: Path, tmp_path: Path) -> str:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Short pauses of a tracker."""
-    from cluster.tracking import tracker, address as tracking_address
+    from cluster.tracking import address as tracking_address
+    from cluster.tracking import tracker
 
     monkeypatch.setattr(tracker, "FLUSH_S", 0.05)
     monkeypatch.setattr(tracker, "RETRY_S", 0.1)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from gridsim.envs.env import GridSimVectorEnv
 from gridsim.car.vehicle import Action
+from gridsim.envs.env import GridSimVectorEnv
 
 SENSING = [("rays", 1), ("grid", 1), ("grid", 4)]
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.runs.champion import Champion
 from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
+from cluster.runs.champion import Champion
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 

@@ -6,8 +6,8 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gridsim.config import SimConfig, constants
 from gridsim.car.ego import collides
+from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.roads import Strips, clearance, freeze
 

@@ -9,8 +9,8 @@ from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champio
 from cluster.runs.checkpoint import CheckpointError, save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import DqnSettings, SettingsError
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import Limits, trajectory
+from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import STEERING
 from gridsim.maps.scenarios import build
 

@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, nearest_box, stands_ahead
-from gridsim.config import SimConfig, TrafficConfig, constants
 from gridsim.car.ego import DISTANCE, IDLE, End
+from gridsim.car.vehicle import Action
+from gridsim.config import SimConfig, TrafficConfig, constants
+from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, freeze, make_road
 from gridsim.maps.scenarios import Scenario
+from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, nearest_box, stands_ahead
 from gridsim.sensing.rays import fan
-from gridsim.envs.simulator import Simulator
-from gridsim.car.vehicle import Action
 from gridsim.traffic.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, SIN, SPEED, X, Y
 
 F = np.float32

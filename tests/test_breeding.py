@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evolution.search.breeding import QUANTILES, RECIPE, Kind, Mutation, breed, moments
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
+from evolution.search.breeding import QUANTILES, RECIPE, Kind, Mutation, breed, moments
 
 F = np.float32
 SPEC, CNN = PolicySpec.parse("mlp:6,7"), PolicySpec.parse("cnn:8,8,16@1")

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from commands import BIN, answers, descendants, finish, rows, start, summary, wait_until
 
-from cluster.runs.checkpoint import save
 from cluster.commands.cli import REMOVED, EvolveFlags, evaluate_main, evolve_main
+from cluster.commands.watch import watch_main
+from cluster.runs.checkpoint import save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import EvolveSettings
-from cluster.commands.watch import watch_main
 
 # Of all maps these are built fastest.
 ROAD = ["--scenario", "curved", "--traffic", "2"]

@@ -22,9 +22,9 @@ from commands import BIN, all_in_mlflow, ray_workers, rows, start, summary, wait
 from hosts import HOME, Host
 from packaging.requirements import Requirement
 
-from cluster.workers import shipping
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
+from cluster.workers import shipping
 from gridsim.jit import CACHE_FOLDER
 
 CLOUDS = ("aws", "gcp")

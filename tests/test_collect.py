@@ -11,19 +11,19 @@ import pytest
 from cluster.runs.champion import load_champion
 from cluster.workers.pool import SerialPool
 from cluster.workers.worker import CollectTask, Worker
-from evolution.networks import convnet
-from evolution.episodes.collecting import collect
-from evolution.episodes.starts import lane_starts
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, to_bytes, unpack
-from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
+from evolution.episodes.collecting import collect
 from evolution.episodes.rollout import Limits, evaluate, no_traffic
-from gridsim.config import EpisodeConfig, SimConfig
+from evolution.episodes.starts import lane_starts
+from evolution.networks import convnet
+from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
 from gridsim.car.ego import STEERING, End
+from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimVectorEnv
-from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
+from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.scenarios import Scenario, build
-from gridsim.envs.simulator import Simulator
+from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 
 F = np.float32
 CONFIG = SimConfig()

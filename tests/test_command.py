@@ -10,13 +10,12 @@ import pytest
 from commands import finish
 
 from cluster.commands import common as command
-
-from cluster.workers import ray_pool
 from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
 from cluster.commands.common import called, parse, warn_of_crowd
 from cluster.commands.compare import CompareFlags
-from cluster.workers.pool import PoolError
 from cluster.commands.watch import DriveFlags, WatchFlags
+from cluster.workers import ray_pool
+from cluster.workers.pool import PoolError
 
 FLAGS = {
     "gridsim-evolve": EvolveFlags,

@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evolution.networks import convnet
-from evolution.search.breeding import RECIPE, Kind, Mutation, breed
-from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import CnnSpec, PolicySpec
 from evolution.episodes.rollout import Limits, evaluate, trajectory
+from evolution.episodes.starts import lane_starts
+from evolution.networks import convnet
 from evolution.networks.dense import plain_dense, plain_tile, vector_dense, vector_tile
-from gridsim.config import SensorConfig, SimConfig
+from evolution.networks.policy import CnnSpec, PolicySpec
+from evolution.search.breeding import RECIPE, Kind, Mutation, breed
 from gridsim.car.ego import DISTANCE, STEPS, End
-from gridsim.sensing.grid import grid_table, grids, push_frames
-from gridsim.maps.scenarios import build
+from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs.simulator import Simulator
+from gridsim.maps.scenarios import build
+from gridsim.sensing.grid import grid_table, grids, push_frames
 
 torch = pytest.importorskip("torch")
 

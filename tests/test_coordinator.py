@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from cluster.runs.checkpoint import CheckpointError, load, save
+from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
+from cluster.runs.settings import EvolveSettings
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import MAX_TRIED, Champion, Maps
 from cluster.workers.pool import PoolError, SerialPool
-from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
-from cluster.runs.settings import EvolveSettings
-from evolution.search.breeding import RECIPE, Kind, breed
 from evolution.episodes.curriculum import CrashError
+from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
+from evolution.search.breeding import RECIPE, Kind, breed
 from evolution.search.recombination import Recombination
-from evolution.episodes.rollout import targets
 from evolution.search.two_parents import TwoParents
 from gridsim.config import SimConfig
 from gridsim.traffic.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED

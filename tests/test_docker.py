@@ -25,7 +25,8 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from cluster.commands import cli, common as command
+from cluster.commands import cli
+from cluster.commands import common as command
 from cluster.runs.settings import DqnSettings, EvolveSettings
 from cluster.workers.kernels import everything_by_default
 from gridsim.maps.scenarios import REGISTRY
@@ -158,7 +159,10 @@ def test_no_compiler_gets_in_and_kernels_are_compiled_by_the_user_from_sources_o
     steps = instructions()
     assert "apt-get" not in DOCKERFILE
     runs = [k for k, (name, rest) in enumerate(steps) if name == "RUN"]
-    at = {what: next(k for k in runs if what in steps[k][1]) for what in ("touch", "cluster.workers.kernels", "command -v gcc")}
+    at = {
+        what: next(k for k in runs if what in steps[k][1])
+        for what in ("touch", "cluster.workers.kernels", "command -v gcc")
+    }
     user = max(k for k, (name, _) in enumerate(steps) if name == "USER")
     assert at["touch"] < user < at["cluster.workers.kernels"]
     assert steps[at["cluster.workers.kernels"]][1].split() == ["python", "-m", "cluster.workers.kernels", "everything"]

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from evolution.networks import convnet, policy
-from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, Training, device_of, new_weights, tanh
 from evolution.dqn.experience import NO_ACTION, Experience
-from evolution.networks.policy import CnnSpec, PolicySpec
+from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, Training, device_of, new_weights, tanh
 from evolution.dqn.replay import Batch, PriorityConfig, Replay
+from evolution.networks import convnet, policy
+from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.car.ego import End
 from gridsim.maps.roads import freeze
 

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cluster.training import dqn as dqn_loop
 from cluster.runs.checkpoint import CheckpointError
+from cluster.runs.settings import DqnSettings, SettingsError
+from cluster.training import dqn as dqn_loop
 from cluster.training.dqn import Dqn
 from cluster.training.trainer import Maps
 from cluster.workers.pool import Chunk, PoolError, SerialPool, new_collected
-from cluster.runs.settings import DqnSettings, SettingsError
 from cluster.workers.worker import Worker
 from gridsim.config import SimConfig
 

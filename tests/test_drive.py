@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, unhurried
 from gridsim.car.ego import End
-from gridsim.maps.scenarios import build, sample_starts
-from gridsim.envs.simulator import Simulator
 from gridsim.car.vehicle import Action
+from gridsim.envs.simulator import Simulator
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, unhurried
 
 KEYS = ("up", "down", "left", "right", "space")
 COMMAND = [sys.executable, "-c", "from cluster.commands.entry import drive_main; drive_main()"]

@@ -12,15 +12,15 @@ from gymnasium.wrappers import RecordEpisodeStatistics as RecordOne
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from gymnasium.wrappers.vector import FlattenObservation as FlattenAll
 
-from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size
 from evolution.episodes.rollout import EPISODE, Limits, evaluate
-from gridsim.config import EpisodeConfig, SimConfig
+from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size
 from gridsim.car.ego import End
+from gridsim.car.vehicle import Action
+from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.envs.simulator import Simulator
 from gridsim.maps.roads import clearance, freeze
 from gridsim.maps.scenarios import REGISTRY, Scenario, build, sample_starts, starts_at
-from gridsim.envs.simulator import Simulator
-from gridsim.car.vehicle import Action
 
 SPEC = PolicySpec.parse("mlp:6,7")
 IDS = [env_id(name) for name in REGISTRY]

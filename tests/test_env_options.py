@@ -12,11 +12,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from gridsim.car.ego import DISTANCE, SPEED
-from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
-from gridsim.sensing.grid import CELLS, grid_table, grids
-from gridsim.maps.scenarios import REGISTRY, Scenario
-from gridsim.envs.simulator import views
 from gridsim.car.vehicle import Action
+from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.envs.simulator import views
+from gridsim.maps.scenarios import REGISTRY, Scenario
+from gridsim.sensing.grid import CELLS, grid_table, grids
 from gridsim.traffic.world import LANE
 
 # --- the checker

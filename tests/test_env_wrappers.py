@@ -13,10 +13,10 @@ from driving import SENSING, drive
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
-from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv, env_id
-from gridsim.view.render import NoDisplayError
-from gridsim.maps.scenarios import Scenario
 from gridsim.car.vehicle import Action
+from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.maps.scenarios import Scenario
+from gridsim.view.render import NoDisplayError
 
 F = np.float32
 

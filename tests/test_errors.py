@@ -9,17 +9,27 @@ import numpy as np
 import pytest
 
 from cluster.commands import cli
-from cluster.runs.champion import Champion, load_champion
 from cluster.comparison.errors import errors, series
-from evolution.networks.policy import PolicySpec
+from cluster.runs.champion import Champion, load_champion
 from evolution.episodes.rollout import Limits, trajectory
+from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
-from gridsim.view.drive import DriveError, Recorder
-from gridsim.reference.errors import APART, TURN, Errors, Series, combine, driven, error_series, error_series_beside, poses_of
-from gridsim.reference.driver import ReferenceDriver
-from gridsim.reference.routes import ReferenceConfig, plan, profile, top_speed
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build, sample_starts
+from gridsim.reference.driver import ReferenceDriver
+from gridsim.reference.errors import (
+    APART,
+    TURN,
+    Errors,
+    Series,
+    combine,
+    driven,
+    error_series,
+    error_series_beside,
+    poses_of,
+)
+from gridsim.reference.routes import ReferenceConfig, plan, profile, top_speed
 from gridsim.traffic.world import FIELDS
+from gridsim.view.drive import DriveError, Recorder
 
 INTERVAL = REGISTRY["seamless"].speed_interval
 TOP = top_speed(INTERVAL, ReferenceConfig())

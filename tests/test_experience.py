@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution.networks import convnet
 from evolution.dqn.experience import (
     NO_ACTION,
     OLDEST,
@@ -22,9 +21,10 @@ from evolution.dqn.experience import (
     to_bytes,
     unpack,
 )
+from evolution.networks import convnet
 from evolution.networks.policy import SPEED_SCALE, CnnSpec, MlpSpec, PolicySpec
-from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 from gridsim.jit import njit
+from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 
 F = np.float32
 AREA = CELLS * CELLS

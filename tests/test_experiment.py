@@ -10,12 +10,11 @@ from finished_runs import make_run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.runs import checkpoint
-
 from cluster.comparison import plan as experiment
 from cluster.comparison.cells import Cells, settings_of
 from cluster.comparison.plan import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
 from cluster.comparison.results import LEARNERS, ExperimentError, learner_of
+from cluster.runs import checkpoint
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import DqnSettings, to_dict
 from evolution.networks.policy import PolicySpec

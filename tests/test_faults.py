@@ -21,11 +21,11 @@ import pytest
 from commands import BIN, all_in_mlflow, end, finish, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
+from cluster.runs.settings import EvolveSettings
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool
 from cluster.workers.ray_pool import RayPool
-from cluster.runs.settings import EvolveSettings
 from cluster.workers.worker import Task, Worker
 from gridsim.config import SimConfig
 from gridsim.maps.scenarios import Scenario

@@ -7,8 +7,8 @@ import math
 import pytest
 from finished_runs import HELD_OUT, make_run
 
-from cluster.runs.champion import evaluate, load_champion
 from cluster.comparison.results import ERROR_FIGURES, LEARNERS, Errors, ExperimentError, errors_of, read_run
+from cluster.runs.champion import evaluate, load_champion
 
 
 def test_errors_are_measured_once(tmp_path):

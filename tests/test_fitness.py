@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evolution.search.fitness import elements, scalar
 from evolution.episodes.rollout import RESULT
+from evolution.search.fitness import elements, scalar
 
 TARGET = 500.0
 

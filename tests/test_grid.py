@@ -9,11 +9,22 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gridsim.config import SensorConfig, SimConfig
 from gridsim.car.ego import COS, SIN, X, Y
-from gridsim.sensing.grid import CELL, CELLS, FREE, OCCUPIED, UNKNOWN, centres, fill_grid, grid_table, grids, push_frames
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs.simulator import Simulator
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.sensing.grid import (
+    CELL,
+    CELLS,
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    centres,
+    fill_grid,
+    grid_table,
+    grids,
+    push_frames,
+)
 
 F = np.float32
 CONFIG = SimConfig()

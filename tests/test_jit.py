@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evolution.search.breeding import RECIPE, Mutation, breed, moments
 from evolution.episodes.collecting import collect
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import EPISODE, Limits, evaluate
+from evolution.networks.policy import PolicySpec
+from evolution.search.breeding import RECIPE, Mutation, breed, moments
 from gridsim import jit
-from gridsim.config import SimConfig, constants
 from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y, drive, look, place
+from gridsim.config import SimConfig, constants
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import Scenario, build, sample_starts
 from gridsim.sensing.rays import LANES, fan

@@ -23,17 +23,17 @@ from pictures import (
 )
 from PIL import Image
 
-from cluster.runs.champion import Champion, evaluate
 from cluster.commands.cli import EvolveFlags, _prepare
+from cluster.runs.champion import Champion, evaluate
 from cluster.runs.run import RunError, new_run, open_run, read_config
 from cluster.runs.settings import EvolveSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
+from gridsim.envs.simulator import Simulator
 from gridsim.maps.files import MapFile, load_map, map_digest, read_free, read_map_file, short_lap
 from gridsim.maps.raster import signed_clearance
 from gridsim.maps.scenarios import Scenario, build, label, sample_starts, starts_at
-from gridsim.envs.simulator import Simulator
 
 
 @pytest.fixture(scope="module")

@@ -28,11 +28,11 @@ from cluster.workers.pool import (
     new_outcome,
 )
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.search.breeding import RECIPE, Kind, Mutation
-from evolution.episodes.starts import lane_starts
 from evolution.dqn.experience import Experience, to_bytes
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
+from evolution.episodes.starts import lane_starts
+from evolution.networks.policy import PolicySpec
+from evolution.search.breeding import RECIPE, Kind, Mutation
 from gridsim.config import SimConfig
 from gridsim.maps.scenarios import Scenario, build
 from gridsim.traffic.world import FIELDS

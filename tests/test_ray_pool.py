@@ -33,8 +33,8 @@ from test_pool import (
 from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool, check_address
 from cluster.workers.worker import CollectTask, Task
-from evolution.search.breeding import RECIPE
 from evolution.dqn.experience import Experience, to_bytes
+from evolution.search.breeding import RECIPE
 from gridsim.maps.scenarios import Scenario
 
 pytestmark = pytest.mark.e2e

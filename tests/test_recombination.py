@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from searching import first_gene, leader, told
 
-from evolution.search.breeding import Kind, Mutation, breed
 from evolution.networks.policy import PolicySpec, gene_scales
-from evolution.search.recombination import Recombination
-from evolution.search.base import SearchConfig, ranks, tournament_weights
 from evolution.networks.symmetry import symmetry
+from evolution.search.base import SearchConfig, ranks, tournament_weights
+from evolution.search.breeding import Kind, Mutation, breed
+from evolution.search.recombination import Recombination
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:1")

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from evolution.episodes.starts import lane_starts
-from gridsim.config import TrafficConfig
 from gridsim.car.ego import DISTANCE, End, X
+from gridsim.car.vehicle import Action
+from gridsim.config import TrafficConfig
+from gridsim.envs.simulator import Simulator
 from gridsim.maps.lanes import Path, lay_lanes, strips_along
 from gridsim.maps.network import make_network
-from gridsim.reference.driver import ReferenceDriver
 from gridsim.maps.roads import Lanes, clearance_nodes, freeze, make_road
-from gridsim.reference.routes import ReferenceConfig, locate, plan, profile, top_speed, unwrapped
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build, sample_starts
-from gridsim.envs.simulator import Simulator
-from gridsim.car.vehicle import Action
+from gridsim.reference.driver import ReferenceDriver
+from gridsim.reference.routes import ReferenceConfig, locate, plan, profile, top_speed, unwrapped
 from gridsim.traffic.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT
 from gridsim.traffic.world import X as TRAFFIC_X
 from gridsim.traffic.world import Y as TRAFFIC_Y

@@ -7,13 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from gridsim.view import paint, render
-from gridsim.config import SimConfig
 from gridsim.car.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
-from gridsim.view.render import Renderer, between
+from gridsim.config import SimConfig
+from gridsim.envs.simulator import Simulator
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build, sample_starts
-from gridsim.envs.simulator import Simulator
+from gridsim.view import paint, render
+from gridsim.view.render import Renderer, between
 
 BARE = {**os.environ}
 for _name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR"):

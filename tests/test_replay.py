@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evolution.dqn.experience import NO_ACTION, Experience, observation_dtype_and_width
-from evolution.networks.policy import PolicySpec
 from evolution.dqn.replay import Batch, PriorityConfig, Replay
+from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 
 RAYS, GRID, FRAME = (PolicySpec.parse(text) for text in ("mlp:3", "cnn:8,8,8@4", "cnn:8,8,8@1"))

@@ -7,11 +7,10 @@ import pytest
 
 from cluster.runs.champion import load_champion
 from cluster.workers.worker import Task, Worker
-from evolution.search.breeding import RECIPE, Mutation
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
-from gridsim.config import SimConfig
+from evolution.search.breeding import RECIPE, Mutation
 from gridsim.car.ego import (
     COS,
     SIN,
@@ -21,9 +20,10 @@ from gridsim.car.ego import (
     X,
     Y,
 )
+from gridsim.config import SimConfig
+from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.scenarios import build, sample_starts
-from gridsim.envs.simulator import Simulator
 from gridsim.traffic.world import ALONG, LANE, SHIFT, spawn
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 

@@ -13,12 +13,12 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 import gridsim.maps.generators.city as city
 import gridsim.maps.generators.curved as curved
 import gridsim.maps.generators.highway as highway
-from gridsim.config import SimConfig, constants
 from gridsim.car.ego import collides
+from gridsim.config import SimConfig, constants
+from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
 from gridsim.maps.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
 from gridsim.maps.scenarios import REGISTRY, Scenario, build, sample_starts
-from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
 
 LAID = range(16)  # seeds of which strips and lanes are looked at
 BUILT = (0, 1)  # ... whole maps

@@ -6,10 +6,8 @@ from collections import Counter, deque
 import numpy as np
 import pytest
 
-from gridsim.config import SimConfig, constants
 from gridsim.car.ego import collides
-from gridsim.maps.lanes import LANE_STEP
-from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
+from gridsim.config import SimConfig, constants
 from gridsim.maps.generators.seamless import (
     DIRECTIONS,
     FLARE_HALF,
@@ -22,6 +20,8 @@ from gridsim.maps.generators.seamless import (
     seamless_layout,
     tile_graph,
 )
+from gridsim.maps.lanes import LANE_STEP
+from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
 
 SEEDS = range(300)  # of which graphs are looked at
 LAID = range(60)  # ... lanes and strips

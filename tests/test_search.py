@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.recombination import Recombination
 from evolution.search.base import SearchConfig, checked, ranks, recipes, split, tournament_weights, tournaments
+from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 
 SPEC = PolicySpec.parse("mlp:1")

@@ -7,7 +7,6 @@ import numpy as np
 import oracle
 import pytest
 
-from gridsim.config import EpisodeConfig, SimConfig, constants
 from gridsim.car.ego import (
     COS,
     DISTANCE,
@@ -27,11 +26,12 @@ from gridsim.car.ego import (
     look,
     place,
 )
+from gridsim.car.vehicle import Action
+from gridsim.config import EpisodeConfig, SimConfig, constants
+from gridsim.envs.simulator import Simulator
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build, sample_starts
 from gridsim.sensing.rays import LANES, fan
-from gridsim.envs.simulator import Simulator
-from gridsim.car.vehicle import Action
 
 F = np.float32
 CONFIG = SimConfig()

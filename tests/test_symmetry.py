@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evolution.search.breeding import RECIPE, Kind, Mutation, breed, moments
 from evolution.networks.convnet import forward, push, scratch
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
-from gridsim.sensing.grid import CELLS
+from evolution.search.breeding import RECIPE, Kind, Mutation, breed, moments
 from gridsim.car.vehicle import Action
+from gridsim.sensing.grid import CELLS
 
 F = np.float32
 SPECS = st.builds(

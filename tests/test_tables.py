@@ -10,12 +10,11 @@ from finished_runs import run
 from PIL import Image
 from rich.console import Console
 
-from cluster.report import pictures as report
-
-from cluster.comparison import tables
 from cluster.commands.compare import Results, _route_title
-from cluster.training.evolution import COLUMNS
+from cluster.comparison import tables
 from cluster.comparison.plan import Budget, Plan
+from cluster.report import pictures as report
+from cluster.training.evolution import COLUMNS
 from gridsim.maps.scenarios import REGISTRY
 
 ALL = tuple(REGISTRY)

@@ -14,8 +14,8 @@ import pytest
 from tracked import NAMES, PARAMS, TAGS, client, row, runs, steps, tracker, with_path
 
 import cluster.tracking.commit
-from cluster.tracking.commit import git_commit
 from cluster.tracking.address import check_uri
+from cluster.tracking.commit import git_commit
 
 # ---------------------------------------------------------------------------------------------- what is logged
 

@@ -13,8 +13,8 @@ from tracked import client, drive_both, row, steps, tracker
 
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.settings import EvolveSettings
-from cluster.tracking.mlflow_run import save_model, saved_champion
 from cluster.tracking.description import torch_model
+from cluster.tracking.mlflow_run import save_model, saved_champion
 from evolution.networks.export import example, to_torch
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig

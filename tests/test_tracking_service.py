@@ -17,8 +17,8 @@ import pytest
 from commands import finish, rows, start, summary, wait_until
 from tracked import client, drive_registered, free_port, mlflow_server
 
-from cluster.tracking.resend import NOTHING, send
 from cluster.runs.run import open_run
+from cluster.tracking.resend import NOTHING, send
 
 pytestmark = pytest.mark.e2e
 

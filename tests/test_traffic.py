@@ -9,17 +9,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from gridsim.sensing.boxes import boxes_touch
-from gridsim.config import SimConfig, constants
 from gridsim.car.ego import STEERING
+from gridsim.car.vehicle import path_curvature
+from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.network import make_network, wrapped
 from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.sensing.boxes import boxes_touch
 from gridsim.traffic.behaviour import drivers, flow, idm
-from gridsim.car.vehicle import path_curvature
-from gridsim.traffic.world import AFTER, ALONG, COS, FACTOR, FIELDS, LANE, NEXT, PAST, PERMIT, SHIFT, SIN, SPEED, X, Y, spawn
+from gridsim.traffic.world import (
+    AFTER,
+    ALONG,
+    COS,
+    FACTOR,
+    FIELDS,
+    LANE,
+    NEXT,
+    PAST,
+    PERMIT,
+    SHIFT,
+    SIN,
+    SPEED,
+    X,
+    Y,
+    spawn,
+)
 
 F = np.float32
 CONFIG = SimConfig()

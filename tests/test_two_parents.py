@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from searching import first_gene, leader, told
 
-from evolution.search.breeding import Kind, Mutation, breed
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import SearchConfig, ranks
+from evolution.search.breeding import Kind, Mutation, breed
 from evolution.search.two_parents import PARENTS, TwoParents
 
 F = np.float32

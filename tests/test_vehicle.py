@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridsim.config import Constants, EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
 from gridsim.car.vehicle import Action, act, advance, path_curvature
+from gridsim.config import Constants, EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
 
 CONFIG = SimConfig()
 K = constants(CONFIG)

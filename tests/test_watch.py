@@ -15,20 +15,19 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from cluster.runs import checkpoint
-
-from cluster.report import film as video
-from cluster.runs.champion import load_champion
 from cluster.commands.common import UsageError
-from cluster.report.film import Filming, Recording, VideoError, frames, picture, record, write_video
 from cluster.commands.watch import Elites, watch_main
+from cluster.report import film as video
+from cluster.report.film import Filming, Recording, VideoError, frames, picture, record, write_video
+from cluster.runs import checkpoint
+from cluster.runs.champion import load_champion
 from evolution.episodes.curriculum import spread_starts
-from gridsim.config import SimConfig
-from gridsim.view.drive import Recorder, pose, unhurried
 from gridsim.car.ego import DISTANCE, End
-from gridsim.view.render import Renderer
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
+from gridsim.maps.scenarios import build, sample_starts
+from gridsim.view.drive import Recorder, pose, unhurried
+from gridsim.view.render import Renderer
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["--workers", "0", "--population", "48", "--generations", "4", "--seed", "5"]
@@ -38,7 +37,12 @@ def run(command, *arguments, cwd, timeout=240, **environment):
     """A command, run to its end without a display: `run("watch", ...)` is gridsim-watch."""
     bare = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")}
     return subprocess.run(
-        [sys.executable, "-c", f"from cluster.commands.entry import {command}_main; {command}_main()", *map(str, arguments)],
+        [
+            sys.executable,
+            "-c",
+            f"from cluster.commands.entry import {command}_main; {command}_main()",
+            *map(str, arguments),
+        ],
         cwd=cwd,
         env={**bare, "PYTHONPATH": str(ROOT), **environment},
         stdin=subprocess.DEVNULL,

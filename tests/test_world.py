@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from pictures import picture, save
 
+from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
+from gridsim.envs.simulator import Simulator
 from gridsim.maps.files import load_map
 from gridsim.maps.network import lane_length
 from gridsim.maps.scenarios import REGISTRY, build, sample_starts
-from gridsim.envs.simulator import Simulator
 from gridsim.traffic.behaviour import drivers, flow
-from gridsim.car.vehicle import Action
 from gridsim.traffic.world import (
     AFTER,
     ALONG,

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from cluster.tracking import mlflow_run as tracking
-from cluster.tracking.tracker import Tracker
 from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.tracker import Tracker
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}

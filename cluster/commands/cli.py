@@ -37,12 +37,12 @@ from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, Sett
 from gridsim.maps.scenarios import is_map_file
 
 if TYPE_CHECKING:
-    from cluster.training.trainer import Maps
-    from cluster.workers.pool import WorkerPool
     from cluster.runs.run import RunFolder
-    from cluster.tracking.tracker import Tracker
     from cluster.tracking.mlflow_run import Status
+    from cluster.tracking.tracker import Tracker
+    from cluster.training.trainer import Maps
     from cluster.workers.kernels import Warming
+    from cluster.workers.pool import WorkerPool
 
 REMOVED = {
     "islands": "a run has one population; use --recombination all, the default, which needs no others",
@@ -262,17 +262,17 @@ def settings_of(flags: Flags) -> RunSettings:
 
 
 def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
-    from cluster.workers.pool import PoolError, SerialPool
     from cluster.tracking.address import TrackingError, check_uri
+    from cluster.workers.pool import PoolError, SerialPool
 
     prog = kind.command
     console = Console()
     try:
         flags, run = _prepare(kind, arguments)
-        from cluster.workers import kernels as warm
-        from cluster.training.trainer import Maps
-        from cluster.workers.ray_pool import RayPool, check_address
         from cluster.runs.run import is_finished, make_tracker
+        from cluster.training.trainer import Maps
+        from cluster.workers import kernels as warm
+        from cluster.workers.ray_pool import RayPool, check_address
         from gridsim.config import SimConfig
 
         if is_finished(run):
@@ -356,9 +356,9 @@ def _run(
     """Learn and finish. Returns the closing words."""
     from cluster.commands import progress
     from cluster.report import pictures as report
-    from cluster.workers import kernels as warm
     from cluster.runs.champion import load_champion
     from cluster.runs.run import Session
+    from cluster.workers import kernels as warm
 
     initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
     session = Session(run, pool, maps, tracker, started, initial)
@@ -415,9 +415,9 @@ def evaluate_main() -> None:
     prog = "gridsim-evaluate"
     try:
         flags = parse(EvaluateFlags, prog, sys.argv[1:])
+        from cluster.comparison.errors import errors
         from cluster.runs.champion import evaluate, load_champion
         from cluster.runs.checkpoint import CheckpointError
-        from cluster.comparison.errors import errors
 
         try:
             champion = load_champion(flags.champion)

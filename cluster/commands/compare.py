@@ -21,10 +21,6 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from cluster.runs import checkpoint
-
-from cluster.comparison import plan as experiment, tables
-from cluster.runs.checkpoint import CheckpointError
 from cluster.commands.common import (
     FAILED,
     INTERRUPTED,
@@ -38,6 +34,8 @@ from cluster.commands.common import (
     typed,
     warn_of_crowd,
 )
+from cluster.comparison import plan as experiment
+from cluster.comparison import tables
 from cluster.comparison.plan import Budget, Cell, CellError, ComparisonFolder, Plan
 from cluster.comparison.results import (
     ERROR_FIGURES,
@@ -51,6 +49,8 @@ from cluster.comparison.results import (
     read_run,
     series_of,
 )
+from cluster.runs import checkpoint
+from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.settings import SettingsError, check_workers
 from evolution.networks.policy import Observation
 from gridsim.maps.scenarios import REGISTRY

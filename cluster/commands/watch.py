@@ -16,20 +16,20 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from cluster.commands.common import INTERRUPTED, UsageError, called, fail, parse
+from cluster.report.film import SUFFIXES, Recording, VideoError, frames, others, picture, record, write_video
 from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
 from cluster.runs.checkpoint import CheckpointError
-from cluster.commands.common import INTERRUPTED, UsageError, called, fail, parse
 from cluster.runs.run import CHECKPOINT, CONFIG, ELITES, RunError, read_config
 from cluster.runs.settings import MAX_TRAFFIC
-from cluster.report.film import SUFFIXES, Recording, VideoError, frames, others, picture, record, write_video
 from evolution.networks.policy import PolicySpec
-from gridsim.config import SimConfig
-from gridsim.view.drive import DriveError, Recorder, drive, read_drive, replay
 from gridsim.car.ego import End
-from gridsim.view.render import NoDisplayError, Renderer, Window
+from gridsim.config import SimConfig
 from gridsim.maps.scenarios import HELD_OUT_SEED, Scenario, build, check_name, default_traffic, label, sample_starts
 from gridsim.traffic.world import spawn
+from gridsim.view.drive import DriveError, Recorder, drive, read_drive, replay
+from gridsim.view.render import NoDisplayError, Renderer, Window
 
 FILM_S = 60.0  # s of a film, unless told
 FOLLOW_S = 10.0  # s that an elite is watched before a newer one may take its place

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from cluster.workers import kernels as warm
-from cluster.runs.checkpoint import CheckpointError
 from cluster.comparison.plan import COMPARISON, Cell, CellError
-from cluster.training.trainer import Maps
-from cluster.workers.pool import PoolError, SerialPool, WorkerPool
+from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_tracker, new_run, open_run
 from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
 from cluster.tracking.mlflow_run import Status
+from cluster.training.trainer import Maps
+from cluster.workers import kernels as warm
+from cluster.workers.pool import PoolError, SerialPool, WorkerPool
 from evolution.episodes.curriculum import CrashError
 from gridsim.config import SimConfig
 from gridsim.maps.scenarios import Scenario

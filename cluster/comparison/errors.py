@@ -9,11 +9,21 @@ import numpy as np
 
 from cluster.runs.champion import Champion, held_out
 from cluster.training.trainer import Maps
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import Limits, trajectory
-from gridsim.view.drive import Drive, DriveError, read_drive, replay
-from gridsim.reference.errors import TURN, Driven, Errors, Series, combine, driven, error_series, error_series_beside, poses_of
+from evolution.networks.policy import PolicySpec
 from gridsim.maps.scenarios import HELD_OUT_SEED, Scenario
+from gridsim.reference.errors import (
+    TURN,
+    Driven,
+    Errors,
+    Series,
+    combine,
+    driven,
+    error_series,
+    error_series_beside,
+    poses_of,
+)
+from gridsim.view.drive import Drive, DriveError, read_drive, replay
 
 _STRETCH = 1.0  # m of a recording that are worth another start
 _DRIFT = 0.5  # m by which a drive, replayed, may miss what was recorded

@@ -19,13 +19,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
-from cluster.runs import checkpoint
 from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, learner_of, part, read_json, read_run
+from cluster.runs import checkpoint
 from cluster.runs.run import CONFIG, SUMMARY
 from cluster.runs.settings import MAX_TRAFFIC
 from evolution.networks.policy import Observation
-from gridsim.view.drive import DriveError, read_drive
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
+from gridsim.view.drive import DriveError, read_drive
 
 COMPARISON = "comparison.json"
 FORMAT = 1

@@ -20,13 +20,13 @@ import numpy as np
 
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CheckpointError
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import Limits, trajectory
+from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import DISTANCE, SPEED, End, X, Y
-from gridsim.view.render import Renderer, between
-from gridsim.maps.scenarios import Scenario, build
 from gridsim.envs.simulator import views
+from gridsim.maps.scenarios import Scenario, build
 from gridsim.traffic.world import LANE
+from gridsim.view.render import Renderer, between
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, FPS, SECONDS = (640, 360), 15, 20.0  # of champion.mp4, which a run waits for: a second or two of one core

@@ -20,14 +20,14 @@ import numpy as np
 
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
-from cluster.training.trainer import Maps, summarise
 from cluster.runs.settings import MAX_TRAFFIC, SETTINGS, EvolveSettings
-from evolution.networks import convnet
+from cluster.training.trainer import Maps, summarise
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
-from evolution.episodes.starts import Episodes
-from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from evolution.episodes.rollout import Limits
 from evolution.episodes.rollout import evaluate as roll_out
+from evolution.episodes.starts import Episodes
+from evolution.networks import convnet
+from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
 from gridsim.maps.scenarios import HELD_OUT_SEED, check_name, default_traffic
 

@@ -26,16 +26,15 @@ from typing import Any
 import numpy as np
 
 from cluster.runs import checkpoint
-
-from cluster.tracking import description as tracking_run
 from cluster.runs.champion import Champion
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
+from cluster.runs.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
+from cluster.tracking import description as tracking_run
+from cluster.tracking.address import TrackingError
+from cluster.tracking.tracker import Tracker
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Learning, Maps, held_out_episodes, now
 from cluster.workers.pool import WorkerPool
-from cluster.runs.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
-from cluster.tracking.tracker import Tracker
-from cluster.tracking.address import TrackingError
 from evolution.episodes.curriculum import HELD_OUT_SEEDS
 from evolution.episodes.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig

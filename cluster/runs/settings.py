@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
 
 from cluster.runs.checkpoint import MAX_BYTES
-from evolution.episodes.curriculum import CurriculumConfig
 from evolution.dqn.experience import observation_dtype_and_width
-from evolution.networks.policy import Observation, PolicySpec
 from evolution.dqn.replay import MAX_N_STEP
+from evolution.episodes.curriculum import CurriculumConfig
+from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 

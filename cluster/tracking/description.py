@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from cluster.runs.champion import Champion
-from cluster.tracking.commit import git_commit
 from cluster.runs.settings import RunSettings, to_dict
-from cluster.tracking.tracker import Model
+from cluster.tracking.commit import git_commit
 from cluster.tracking.mlflow_run import MODEL, RUN_ID, Version
+from cluster.tracking.tracker import Model
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.maps.scenarios import label

@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from cluster.tracking.commit import git_commit
 from cluster.tracking.address import TrackingError, connect, sqlite_path
+from cluster.tracking.commit import git_commit
 
 if TYPE_CHECKING:
     from mlflow.entities import FileInfo, Metric, Run

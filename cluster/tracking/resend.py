@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import time
 
-from cluster.tracking import description as tracking_run
+from cluster.comparison.results import ExperimentError, part, read_json
 from cluster.runs.champion import load_champion
 from cluster.runs.checkpoint import CheckpointError
-from cluster.comparison.results import ExperimentError, part, read_json
 from cluster.runs.run import CHAMPION, NOT_LOGGED, SUMMARY, RunFolder, make_tracker, write_summary
+from cluster.tracking import description as tracking_run
 from cluster.tracking.address import TrackingError, check_uri
 
 WAIT_S = 60.0  # for MLflow to be there, and then for it to have everything

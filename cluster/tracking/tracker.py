@@ -21,8 +21,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cluster.tracking.mlflow_run import CHAMPION_TAG, MODEL, Identity, LoggedRun, Row, Status, Version, save_model, saved_champion
 from cluster.tracking.address import TrackingError, check_uri, one_line, shown
+from cluster.tracking.mlflow_run import (
+    CHAMPION_TAG,
+    MODEL,
+    Identity,
+    LoggedRun,
+    Row,
+    Status,
+    Version,
+    save_model,
+    saved_champion,
+)
 
 if TYPE_CHECKING:
     import numpy as np

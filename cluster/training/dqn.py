@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.training.trainer import Learning, made_good, some_left, unmodified
 from cluster.runs.settings import DqnSettings
+from cluster.training.trainer import Learning, made_good, some_left, unmodified
 from cluster.workers.worker import CollectTask
-from evolution.episodes.curriculum import success_rate
 from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
 from evolution.dqn.replay import PriorityConfig, Replay
+from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import Limits
 from gridsim.maps.scenarios import map_of
 

@@ -12,15 +12,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from cluster.runs.settings import EvolveSettings
 from cluster.training.trainer import Bred, Learning, made_good, some_left
 from cluster.workers.pool import Chunk
-from cluster.runs.settings import EvolveSettings
-from evolution.search import fitness
 from evolution.episodes.curriculum import success_rate
-from evolution.episodes.starts import Episodes
-from evolution.search.recombination import Recombination
 from evolution.episodes.rollout import EPISODE, targets
+from evolution.episodes.starts import Episodes
+from evolution.search import fitness
 from evolution.search.base import Search
+from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 from gridsim.traffic.world import check_worlds
 

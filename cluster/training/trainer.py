@@ -22,10 +22,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from cluster.runs.checkpoint import CheckpointError
-from cluster.workers.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.runs.settings import RunSettings
+from cluster.workers.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.workers.worker import Task
-from evolution.search.breeding import Kind, Mutation
 from evolution.episodes.curriculum import (
     HELD_OUT_EPISODES,
     HELD_OUT_SEEDS,
@@ -36,12 +35,13 @@ from evolution.episodes.curriculum import (
     spread_starts,
     success_rate,
 )
+from evolution.episodes.rollout import Limits
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
-from evolution.episodes.rollout import Limits
 from evolution.search.base import recipes
-from gridsim.config import SimConfig
+from evolution.search.breeding import Kind, Mutation
 from gridsim.car.ego import End
+from gridsim.config import SimConfig
 from gridsim.maps.scenarios import Scenario, build, map_of
 
 MAX_TRIED = 4  # members that are on validation's first stage at once

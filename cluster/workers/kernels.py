@@ -21,18 +21,18 @@ from typing import get_args
 import llvmlite.binding
 import numpy as np
 
-from cluster.workers.pool import answer
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.workers.pool import answer
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.search.breeding import Kind, Mutation
-from evolution.networks.policy import Observation, PolicySpec
 from evolution.episodes.rollout import EPISODE, Limits, trajectory
+from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import recipes
-from gridsim.config import SimConfig
+from evolution.search.breeding import Kind, Mutation
 from gridsim.car.ego import FIELDS
+from gridsim.config import SimConfig
+from gridsim.envs.simulator import views
 from gridsim.jit import CACHE_FOLDER, CONFIG
 from gridsim.maps.scenarios import REGISTRY, blank, build, default_traffic, is_map_file, sample_starts
-from gridsim.envs.simulator import views
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic.world import LANE, spawn
 

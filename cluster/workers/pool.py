@@ -13,10 +13,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.search.breeding import RECIPE, Kind
 from evolution.dqn.experience import Experience, from_bytes, join, to_bytes
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import RESULT, targets
+from evolution.networks.policy import PolicySpec
+from evolution.search.breeding import RECIPE, Kind
 from gridsim.maps.roads import freeze
 from gridsim.maps.scenarios import Scenario
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evolution.search.breeding import Mutation, breed
-from evolution.episodes.collecting import collect
 from evolution.dqn.experience import Experience
-from evolution.networks.policy import PolicySpec
+from evolution.episodes.collecting import collect
 from evolution.episodes.rollout import Limits, evaluate
+from evolution.networks.policy import PolicySpec
+from evolution.search.breeding import Mutation, breed
 from gridsim.config import SimConfig
 from gridsim.maps.roads import freeze
 from gridsim.maps.scenarios import Scenario

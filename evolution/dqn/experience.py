@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution.networks.policy import SPEED_SCALE, CnnSpec, PolicySpec
-from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
+from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 
 _F = np.float32
 

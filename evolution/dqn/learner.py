@@ -28,8 +28,8 @@ import numpy as np
 import torch
 from torch.optim.adam import adam
 
-from evolution.networks.policy import CELLS, KERNEL_1, KERNEL_2, STRIDE_1, STRIDE_2, CnnSpec, PolicySpec, squash
 from evolution.dqn.replay import Batch, PriorityConfig, Replay
+from evolution.networks.policy import CELLS, KERNEL_1, KERNEL_2, STRIDE_1, STRIDE_2, CnnSpec, PolicySpec, squash
 from gridsim.jit import njit
 
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers

@@ -25,8 +25,8 @@ import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, ages, observation_dtype_and_width, unpack
 from evolution.networks.policy import CnnSpec, PolicySpec
-from gridsim.counter import GOLDEN, mix
 from gridsim.car.ego import End
+from gridsim.counter import GOLDEN, mix
 from gridsim.jit import njit
 from gridsim.maps.roads import freeze, power_of_two
 

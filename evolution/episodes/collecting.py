@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, empty, join, keep_grid, keep_rays
-from evolution.networks.policy import PolicySpec
 from evolution.episodes.rollout import (
     RESULT,
     Limits,
@@ -28,11 +27,12 @@ from evolution.episodes.rollout import (
     settings_on,
     world_of,
 )
+from evolution.networks.policy import PolicySpec
+from gridsim.car.ego import DISTANCE, SPEED, place
+from gridsim.car.reward import reward
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
-from gridsim.car.ego import DISTANCE, SPEED, place
 from gridsim.jit import leaf, njit
-from gridsim.car.reward import reward
 from gridsim.maps.roads import freeze
 from gridsim.maps.scenarios import Scenario
 

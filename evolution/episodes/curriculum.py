@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from evolution.episodes.starts import Episodes, lane_starts
 from evolution.episodes.rollout import EPISODE, Limits
+from evolution.episodes.starts import Episodes, lane_starts
 from gridsim.car.ego import End
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, Scenario
 from gridsim.traffic.world import FIELDS, LANE, check_worlds

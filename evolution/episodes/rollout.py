@@ -25,7 +25,6 @@ from evolution.networks.policy import (
     packed_size,
     scratch_size,
 )
-from gridsim.config import Constants, SimConfig, constants
 from gridsim.car.ego import (
     COS,
     DISTANCE,
@@ -41,11 +40,12 @@ from gridsim.car.ego import (
     look,
     place,
 )
-from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
+from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road, freeze
 from gridsim.maps.scenarios import Scenario
+from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.rays import LANES, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evolution.networks.dense import tile
 from evolution.networks.policy import (
     KERNEL_1,
     KERNEL_2,
@@ -23,10 +24,9 @@ from evolution.networks.policy import (
     STRIDE_2,
     CnnSpec,
 )
-from evolution.networks.dense import tile
-from gridsim.sensing.grid import CELLS
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
+from gridsim.sensing.grid import CELLS
 
 _F = np.float32
 _CODE = _F(1.0 / 255.0)

@@ -16,9 +16,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from evolution.networks.dense import dense
-from gridsim.sensing.grid import CELLS
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
+from gridsim.sensing.grid import CELLS
 
 RAYS = 31
 INPUTS = RAYS + 1  # and the speed

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.search.breeding import RECIPE, Mutation, breed
 from evolution.networks.policy import PolicySpec
+from evolution.search.breeding import RECIPE, Mutation, breed
 
 Arrays = dict[str, np.ndarray]
 

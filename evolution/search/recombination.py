@@ -13,10 +13,20 @@ import math
 
 import numpy as np
 
-from evolution.search.breeding import Kind, Mutation, moments
 from evolution.networks.policy import PolicySpec, gene_scales
-from evolution.search.base import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournament_weights
 from evolution.networks.symmetry import symmetry
+from evolution.search.base import (
+    Arrays,
+    Asked,
+    Search,
+    SearchConfig,
+    checked,
+    ranks,
+    recipes,
+    split,
+    tournament_weights,
+)
+from evolution.search.breeding import Kind, Mutation, moments
 
 _CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
 _ELITES = 2  # the centre, and the champion: before there is one, the average

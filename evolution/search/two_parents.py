@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from evolution.search.breeding import Kind, Mutation
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournaments
+from evolution.search.breeding import Kind, Mutation
 
 PARENTS = 64  # size of the mating pool, which bounds what is broadcast
 

@@ -11,11 +11,11 @@ from enum import IntEnum
 
 import numpy as np
 
-from gridsim.sensing.boxes import cast_boxes, hits_box, nearest_box, stands_ahead
+from gridsim.car.vehicle import act, advance, path_curvature
 from gridsim.jit import leaf
 from gridsim.maps.roads import VISIT_CELL, clearance
+from gridsim.sensing.boxes import cast_boxes, hits_box, nearest_box, stands_ahead
 from gridsim.sensing.rays import sense
-from gridsim.car.vehicle import act, advance, path_curvature
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)

@@ -26,12 +26,13 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
+from gridsim.car.reward import reward
+from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
-from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
-from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
+from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.car.reward import reward
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import (
     REGISTRY,
@@ -44,8 +45,7 @@ from gridsim.maps.scenarios import (
     map_of,
     starts_at,
 )
-from gridsim.envs.simulator import Simulator
-from gridsim.car.vehicle import Action
+from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 from gridsim.traffic.world import LANE
 
 if TYPE_CHECKING:

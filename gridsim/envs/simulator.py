@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
-from gridsim.config import Constants, SimConfig, constants
 from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place
+from gridsim.car.vehicle import Action, act, act_continuous
+from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
+from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.roads import VISIT_CELL, Road
 from gridsim.maps.scenarios import Scenario
 from gridsim.sensing.rays import LANES, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
-from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic.world import check_worlds, spawn
 

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.maps.generators.city import city_layout
 from gridsim.config import SimConfig
+from gridsim.jit import njit
+from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
 from gridsim.maps.generators.highway import highway_layout
-from gridsim.jit import njit
+from gridsim.maps.generators.seamless import roundabout_layout, seamless_layout
 from gridsim.maps.network import Network, make_network, network_of_lanes
 from gridsim.maps.roads import (
     CELLS_PER_M,
@@ -31,7 +32,6 @@ from gridsim.maps.roads import (
     freeze,
     make_road,
 )
-from gridsim.maps.generators.seamless import roundabout_layout, seamless_layout
 
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion

@@ -15,15 +15,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import Constants, SimConfig, constants
 from gridsim.car.ego import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
+from gridsim.car.vehicle import act, path_curvature
+from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, turned, wrapped
 from gridsim.maps.roads import VISIT_CELL, freeze
-from gridsim.reference.routes import ReferenceConfig, Route, plan
 from gridsim.maps.scenarios import Scenario
+from gridsim.reference.routes import ReferenceConfig, Route, plan
 from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, follow, idm
-from gridsim.car.vehicle import act, path_curvature
 from gridsim.traffic.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
 
 _F, _I = np.float32, np.int32

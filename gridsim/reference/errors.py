@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import SimConfig, VehicleConfig
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
-from gridsim.reference.routes import ReferenceConfig, profile, unwrapped
+from gridsim.config import SimConfig, VehicleConfig
 from gridsim.maps.scenarios import Scenario
+from gridsim.reference.routes import ReferenceConfig, profile, unwrapped
 
 APART = 3.5  # m beside the recorded path, a lane's width, from which on two drives are on two paths
 TURNED = math.radians(45.0)  # ... and between their headings

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.traffic.encounters import meets, moved_over, room_beside, runs_into
 from gridsim.jit import leaf, njit
-from gridsim.traffic.junctions import CAUTION, may_enter
 from gridsim.maps.network import away, is_junction, lane_length, turned, wrapped
+from gridsim.traffic.encounters import meets, moved_over, room_beside, runs_into
+from gridsim.traffic.junctions import CAUTION, may_enter
 from gridsim.traffic.world import (
     AFTER,
     ALONG,

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from gridsim.sensing.boxes import boxes_touch
 from gridsim.car.ego import STEERING
+from gridsim.car.vehicle import advance, path_curvature
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, turned, wrapped
-from gridsim.car.vehicle import advance, path_curvature
+from gridsim.sensing.boxes import boxes_touch
 from gridsim.traffic.world import AFTER, ALONG, COS, LANE, NEXT, SHIFT, SIN, SPEED, X, Y
 
 _F, _I, _N = np.float32, np.int32, np.uint64

@@ -17,13 +17,13 @@ from types import TracebackType
 
 import numpy as np
 
-from gridsim.config import SimConfig
 from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y
-from gridsim.view.render import Renderer, Window, between
-from gridsim.maps.scenarios import Scenario, check_name
-from gridsim.envs.simulator import Simulator
 from gridsim.car.vehicle import Action
+from gridsim.config import SimConfig
+from gridsim.envs.simulator import Simulator
+from gridsim.maps.scenarios import Scenario, check_name
 from gridsim.traffic.world import LANE
+from gridsim.view.render import Renderer, Window, between
 
 COLUMNS = (
     "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "traffic",

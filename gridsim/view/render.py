@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gridsim.view import paint
-from gridsim.config import SimConfig, constants
 from gridsim.car.ego import COS, SIN, STEERING, X, Y
-from gridsim.view.marks import lane_marks
+from gridsim.config import SimConfig, constants
 from gridsim.maps.roads import CELLS_PER_M, freeze
 from gridsim.maps.scenarios import Scenario
+from gridsim.view import paint
+from gridsim.view.marks import lane_marks
 
 if TYPE_CHECKING:
     import pygame

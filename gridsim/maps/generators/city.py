@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gridsim.maps.generators.seamless import DIRECTIONS, square_strips, turned
 from gridsim.maps.lanes import Path, lay_lanes, through_square
 from gridsim.maps.roads import Lanes, Strips
-from gridsim.maps.generators.seamless import DIRECTIONS, square_strips, turned
 
 SIDE = 256.0  # m, of the torus
 LANE_WIDTH = 3.0  # m
