@@ -1,10 +1,10 @@
 """A generation on 1 to 10,000 workers, as a discrete-event simulation fed by what `ceilings.py` measured.
 
-The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to who is free, looks at all who are busy, and
-takes in what has come. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the network's latency and
-the bandwidth of its own link, the search's few rows on their way to the nodes, and the evaluation of the members and of
-the leader, whose long episodes go out first. All members count as one group. Not simulated: who is on trial for
-champion, maps, deaths, and other people's load.
+The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to who is free, looks at all who are
+busy, and takes in what has come. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the
+network's latency and the bandwidth of its own link, the search's few rows on their way to the nodes, and the evaluation
+of the members and of the leader, whose long episodes go out first. All members count as one group. Not simulated: who
+is on trial for champion, maps, deaths, and other people's load.
 
 Efficiency is the time of evaluation over what all workers had: 1 means that nobody ever waited.
 """

@@ -33,8 +33,8 @@ def kernel_digest() -> str:
     for package in KERNEL_PACKAGES:
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec else ():
-            for path in sorted(Path(folder).glob("*.py")):
-                digest.update(path.name.encode() + b"\0" + path.read_bytes())
+            for path in sorted(Path(folder).rglob("*.py")):
+                digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -67,7 +67,9 @@ class CacheLocator(UserProvidedCacheLocator):
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
-        return Path(py_file).resolve().parent.name
+        folder = Path(py_file).resolve().parent
+        package = next((above for above in (folder, *folder.parents) if above.name in KERNEL_PACKAGES), folder)
+        return folder.relative_to(package.parent).as_posix()
 
 
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable[..., Any]:

@@ -48,7 +48,7 @@ import json
 from pathlib import Path
 from gridsim import jit
 digests = {"before": jit.kernel_digest()}
-for path in sorted(Path(".").glob("*/*.py")):
+for path in sorted(Path(".").rglob("*.py")):
     text = path.read_bytes()
     path.write_bytes(text + b"# edited\\n")
     digests[str(path)] = jit.kernel_digest()
@@ -91,7 +91,7 @@ def test_an_edited_kernel_is_seen_by_its_callers_in_other_files(copy, tmp_path):
     assert again["folder"] == first["folder"]
     assert (again["hit"], again["from_cache"]) == (False, 1)
 
-    roads = copy / "gridsim" / "roads.py"
+    roads = copy / "gridsim" / "maps" / "roads.py"
     text, edits = re.subn(r"(?m)^FIELD_FLOOR = -2\.0\b", "FIELD_FLOOR = -9.0", roads.read_text())
     assert edits == 1
     roads.write_text(text)
@@ -112,7 +112,7 @@ def test_a_copy_elsewhere_has_the_same_kernels(copy, tmp_path):
 def test_an_edit_of_any_file_is_another_cache_folder(copy, tmp_path):
     digests = python(DIGESTS, copy, tmp_path / "cache")
     assert digests.pop("after") == digests["before"]
-    files = {str(p.relative_to(copy)) for p in copy.glob("*/*.py")}
+    files = {str(p.relative_to(copy)) for p in copy.rglob("*.py")}
     assert {"gridsim/car/vehicle.py", "gridsim/config.py", "evolution/networks/policy.py"} < files
     assert set(digests) == files | {"before"}
     assert len(set(digests.values())) == len(digests)

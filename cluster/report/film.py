@@ -1,7 +1,7 @@
 """Films: a champion's drive, kept state by state, drawn picture by picture, written as MP4 or GIF at true speed.
 
-Run as `python -m cluster.report.film CHAMPION SEED FILM TITLE`, it is a process that draws a run's champion.mp4 while the run
-does what else there is to do at its end (`Filming`).
+Run as `python -m cluster.report.film CHAMPION SEED FILM TITLE`, it is a process that draws a run's champion.mp4 while
+the run does what else there is to do at its end (`Filming`).
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class Actor:
         self, serial: int, payload: bytes, first: int, stop: int,
         names: Sequence[Name] = (), gone: Sequence[Name] = (), task: Task | CollectTask | None = None, *maps: Any,
     ) -> bytes:  # fmt: skip
-        """What `cluster.workers.pool.answer` says; `names` and all after it for a worker that does not have the task yet."""
+        """What `pool.answer` says; `names` and all after it are for a worker that does not have the task yet."""
         if task is not None:
             self._maps |= {name: Scenario.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:

@@ -3,9 +3,10 @@
 Numba compiles one function at a time in a process. So processes of their own compile what a run needs while this one
 starts Ray, and all others then load it from the cache on disk (`gridsim.jit`).
 
-Run as `python -m cluster.workers.kernels kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it prints a line
-when what a run needs first is there, and goes on with what is needed at the run's end. `python -m cluster.workers.kernels
-everything` compiles what the learners need by default on all roads, for an image that is to be started often.
+Run as `python -m cluster.workers.kernels kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it
+prints a line when what a run needs first is there, and goes on with what is needed at the run's end. `python -m
+cluster.workers.kernels everything` compiles what the learners need by default on all roads, for an image that is to be
+started often.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Experience: what episodes bring to a learner, as arrays, and the fixed point in which observations are kept.
 
 Episodes follow one another. An episode of T steps has T + 1 rows. Row t < T holds the observation before step t, its
-action, the reward of that step, and in `ends` 0, but for row T - 1, where it is the `gridsim.car.ego.End` that the step led
-to. Row T holds the observation after the last step, the action NO_ACTION, reward 0 and 0 in `ends`. COLLISION, IDLE and
-SUCCESS terminate: nothing comes after them. TIME truncates: what would have come is estimated from row T.
+action, the reward of that step, and in `ends` 0, but for row T - 1, where it is the `gridsim.car.ego.End` that the step
+led to. Row T holds the observation after the last step, the action NO_ACTION, reward 0 and 0 in `ends`. COLLISION, IDLE
+and SUCCESS terminate: nothing comes after them. TIME truncates: what would have come is estimated from row T.
 
 An observation is what the network sees, small enough to keep a million of them:
 
