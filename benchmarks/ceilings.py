@@ -37,7 +37,8 @@ from evolution.search.breeding import Kind, Mutation, breed, moments
 from evolution.search.recombination import Recombination
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import build
 
 POLICY = "mlp:6,7"  # 311 genes
 CHILDREN = 100_000  # members that the coordinator alone is timed with

@@ -44,7 +44,8 @@ from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed
 from gridsim.car.ego import DISTANCE
 from gridsim.jit import njit
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 
 MAPS = 8
 EPISODES = 16  # of the rollout, over all maps
@@ -63,7 +64,7 @@ def median_s(run: Callable[[], object], runs: int) -> float:
     return statistics.median(times)
 
 
-def rollout_rays(champion: Champion, maps: list[Scenario], runs: int, traffic: int = 0) -> tuple[float, float]:
+def rollout_rays(champion: Champion, maps: list[Map], runs: int, traffic: int = 0) -> tuple[float, float]:
     """(car-steps/s, m/s driven) of the fused rollout of whole episodes."""
     spec, episode = PolicySpec.parse(champion.policy), champion.sim.episode
     rng = np.random.default_rng(0)
@@ -90,7 +91,7 @@ def _actions(packed, layers, ranges, speeds, actions):
 
 def vector_env(
     champion: Champion,
-    maps: list[Scenario],
+    maps: list[Map],
     runs: int,
     traffic: int = 0,
     observation: Literal["rays", "grid"] = "rays",

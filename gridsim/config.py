@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+FILE_SPEEDS = (5.0, 12.0)  # m/s, the speed interval of a map from a file that names none
+
 
 @dataclass(frozen=True)
 class VehicleConfig:

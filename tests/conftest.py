@@ -18,7 +18,7 @@ from commands import BIN, answers, end, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from gridsim.maps.scenarios import Scenario
+    from gridsim.maps.map import Map
 
 # Tests take nothing from the machine's home (a cluster's token) or shell (a cluster's or tracking server's address).
 # Caches stay where they are, as compiling all kernels takes minutes.
@@ -88,7 +88,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def maps() -> dict[str, list[Scenario]]:
+def maps() -> dict[str, list[Map]]:
     """Two maps of each scenario."""
     from gridsim.maps.scenarios import REGISTRY, build
 

@@ -14,9 +14,9 @@ from gridsim.config import SimConfig, TrafficConfig, constants
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
+from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, freeze, make_road
-from gridsim.maps.scenarios import Scenario
 from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, nearest_box, stands_ahead
 from gridsim.sensing.rays import fan
 from gridsim.traffic.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, SIN, SPEED, X, Y
@@ -220,7 +220,7 @@ def cross():
         freeze(array)
     road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 50.0)
     network = make_network(lanes, SIDE, SIDE, 30.0, CONFIG.traffic)
-    return Scenario("cross", 0, road, lanes, strips, network)
+    return Map("cross", 0, road, lanes, strips, network)
 
 
 def on_lane(lane, along, speed, pose):

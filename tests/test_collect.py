@@ -22,7 +22,8 @@ from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimVectorEnv
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.maps.scenarios import Scenario, build
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 
 F = np.float32
@@ -37,7 +38,7 @@ class Asked(NamedTuple):
 
     spec: PolicySpec
     weights: np.ndarray
-    scenarios: list[Scenario]
+    scenarios: list[Map]
     episodes: np.ndarray
     epsilons: np.ndarray
     keys: np.ndarray
@@ -57,7 +58,7 @@ class Asked(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def scenarios() -> list[Scenario]:
+def scenarios() -> list[Map]:
     return [build("seamless", 3), build("highway", 4)]
 
 
@@ -68,7 +69,7 @@ def driver(root: Path) -> np.ndarray:
 
 
 def asked(
-    policy: str, scenarios: list[Scenario], driver: np.ndarray, n: int, epsilon: float, cars: int, seed: int = 5
+    policy: str, scenarios: list[Map], driver: np.ndarray, n: int, epsilon: float, cars: int, seed: int = 5
 ) -> Asked:
     rng = np.random.default_rng(seed)
     spec = PolicySpec.parse(policy)
@@ -168,7 +169,7 @@ class Slow:
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", POLICIES)
 def test_every_row_is_what_a_slow_loop_sees_does_and_gains(
-    scenarios: list[Scenario], driver: np.ndarray, policy: str, cars: int
+    scenarios: list[Map], driver: np.ndarray, policy: str, cars: int
 ) -> None:
     of = asked(policy, scenarios, driver, 8, 0.3, cars)
     experience, results = collect(*of)
@@ -195,7 +196,7 @@ def test_every_row_is_what_a_slow_loop_sees_does_and_gains(
 
 
 @pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
-def test_the_environment_pays_and_shows_the_same(scenarios: list[Scenario], driver: np.ndarray, policy: str) -> None:
+def test_the_environment_pays_and_shows_the_same(scenarios: list[Map], driver: np.ndarray, policy: str) -> None:
     """Bit for bit, stepped with the same actions: rewards, ends, the frames, and the ranges' fixed point."""
     of = asked(policy, scenarios, driver, 12, 0.0, 0)
     of.epsilons[:] = np.linspace(0.1, 0.9, 12)
@@ -242,9 +243,7 @@ def test_the_environment_pays_and_shows_the_same(scenarios: list[Scenario], driv
 
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", POLICIES)
-def test_without_exploring_it_is_evaluate(
-    scenarios: list[Scenario], driver: np.ndarray, policy: str, cars: int
-) -> None:
+def test_without_exploring_it_is_evaluate(scenarios: list[Map], driver: np.ndarray, policy: str, cars: int) -> None:
     of = asked(policy, scenarios, driver, 12, 0.0, cars)
     _, results = collect(*of)
     wanted, _, _ = evaluate(of.spec, of.weights[None], scenarios, of.episodes, LIMITS, CONFIG, worlds=of.worlds)
@@ -256,7 +255,7 @@ def test_without_exploring_it_is_evaluate(
 
 
 def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(
-    scenarios: list[Scenario], driver: np.ndarray
+    scenarios: list[Map], driver: np.ndarray
 ) -> None:
     of = asked("mlp:6,7", scenarios, driver, 60, 0.1, 0)
     of.epsilons[1::2] = 0.8
@@ -284,7 +283,7 @@ def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
 def test_a_network_without_numbers_leaves_whole_rows(
-    scenarios: list[Scenario], driver: np.ndarray, policy: str, poison: float
+    scenarios: list[Map], driver: np.ndarray, policy: str, poison: float
 ) -> None:
     of = asked(policy, scenarios, driver, 6, 0.5, 0)
     weights = of.weights.copy()
@@ -300,7 +299,7 @@ def test_a_network_without_numbers_leaves_whole_rows(
     assert not experience.ends.any()
 
 
-def test_a_network_that_loses_its_numbers_on_the_way(scenarios: list[Scenario], driver: np.ndarray) -> None:
+def test_a_network_that_loses_its_numbers_on_the_way(scenarios: list[Map], driver: np.ndarray) -> None:
     """Speeding up until 5 m/s, where infinities meet: the episode ends IDLE there, in its last step's row too."""
     spec = MlpSpec((2,))
     weights = np.zeros(spec.size, dtype=F)
@@ -323,7 +322,7 @@ def test_a_network_that_loses_its_numbers_on_the_way(scenarios: list[Scenario], 
 # --- Exploring -------------------------------------------------------------------------------------------------------
 
 
-def test_random_actions_are_uniform_and_as_many_as_asked_for(scenarios: list[Scenario], driver: np.ndarray) -> None:
+def test_random_actions_are_uniform_and_as_many_as_asked_for(scenarios: list[Map], driver: np.ndarray) -> None:
     of = asked("mlp:6,7", scenarios, driver, 600, 1.0, 0)
     counts = np.bincount(collect(*of)[0].actions, minlength=256)
     n, counts = counts[:8].sum(), counts[:8]
@@ -336,7 +335,7 @@ def test_random_actions_are_uniform_and_as_many_as_asked_for(scenarios: list[Sce
     assert np.mean(driven != 4) == pytest.approx(0.25 * 7 / 8, abs=5 * math.sqrt(0.22 * 0.78 / len(driven)))
 
 
-def test_an_episode_depends_on_itself_alone(scenarios: list[Scenario], driver: np.ndarray) -> None:
+def test_an_episode_depends_on_itself_alone(scenarios: list[Map], driver: np.ndarray) -> None:
     """In any order, alone or in company, and with epsilons of its own; another key, another episode."""
     of = asked("mlp:6,7", scenarios, driver, 12, 0.0, CARS)
     of.epsilons[:] = np.linspace(0.0, 1.0, 12)
@@ -364,7 +363,7 @@ def as_task(of: Asked) -> CollectTask:
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_the_serial_pool_keeps_the_order_whatever_the_cut(
-    scenarios: list[Scenario], driver: np.ndarray, policy: str
+    scenarios: list[Map], driver: np.ndarray, policy: str
 ) -> None:
     of = asked(policy, scenarios, driver, 40, 0.2, CARS)
     whole, results = collect(*of)
@@ -382,7 +381,7 @@ def test_the_serial_pool_keeps_the_order_whatever_the_cut(
     assert np.concatenate([r for _, r, _ in parts]).tobytes() == results.tobytes()
 
 
-def test_what_does_not_fit_is_refused(scenarios: list[Scenario], driver: np.ndarray) -> None:
+def test_what_does_not_fit_is_refused(scenarios: list[Map], driver: np.ndarray) -> None:
     of = asked("mlp:6,7", scenarios, driver, 4, 0.5, 0)
     for change, text in (
         ({"weights": driver[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
@@ -396,6 +395,6 @@ def test_what_does_not_fit_is_refused(scenarios: list[Scenario], driver: np.ndar
             collect(*of._replace(**change))
 
 
-def test_no_episodes_no_rows(scenarios: list[Scenario], driver: np.ndarray) -> None:
+def test_no_episodes_no_rows(scenarios: list[Map], driver: np.ndarray) -> None:
     experience, results = collect(*asked("mlp:6,7", scenarios, driver, 4, 0.5, 0).only([]))
     assert len(results) == len(experience.actions) == 0

@@ -90,7 +90,7 @@ def test_what_is_copied_is_there_and_is_what_pip_needs() -> None:
         "pyproject.toml",
         project["readme"],
         *project["license-files"],
-        *PROJECT["tool"]["setuptools"]["packages"],
+        *(name.removesuffix("*") for name in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]),
     }
     assert needed <= set(sources)
     assert ignored("runs/a/checkpoint.npz")

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, unhurried
 
 KEYS = ("up", "down", "left", "right", "space")

@@ -19,15 +19,16 @@ from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
 from gridsim.envs.simulator import Simulator
+from gridsim.maps.map import Map, sample_starts, starts_at
 from gridsim.maps.roads import clearance, freeze
-from gridsim.maps.scenarios import REGISTRY, Scenario, build, sample_starts, starts_at
+from gridsim.maps.scenarios import REGISTRY, build
 
 SPEC = PolicySpec.parse("mlp:6,7")
 IDS = [env_id(name) for name in REGISTRY]
 
 
 @pytest.fixture(scope="module")
-def maps() -> list[Scenario]:
+def maps() -> list[Map]:
     """Three maps that several tests share."""
     return [build("seamless", seed) for seed in range(3)]
 
@@ -81,7 +82,7 @@ def test_an_id_is_the_scenario_in_camel_case() -> None:
     assert env_id("one_two") == "GridSim/OneTwo-v0"
 
 
-def test_observations_are_ranges_and_speed(maps: list[Scenario]) -> None:
+def test_observations_are_ranges_and_speed(maps: list[Map]) -> None:
     env = GridSimVectorEnv(5, maps=maps)
     env.reset(seed=3)
     observations, _, _, _, info = env.step(np.full(5, Action.ACCELERATE))
@@ -93,7 +94,7 @@ def test_observations_are_ranges_and_speed(maps: list[Scenario]) -> None:
 # --- seeds
 
 
-def test_the_same_seed_gives_the_same_episodes_alone_and_in_a_batch_of_64(maps: list[Scenario]) -> None:
+def test_the_same_seed_gives_the_same_episodes_alone_and_in_a_batch_of_64(maps: list[Map]) -> None:
     actions = np.random.default_rng(0).integers(len(Action), size=(150, 64))
     batch = GridSimVectorEnv(64, maps=maps)
     first_seen, _ = batch.reset(seed=100)
@@ -121,7 +122,7 @@ def test_the_same_seed_gives_the_same_episodes_alone_and_in_a_batch_of_64(maps: 
             assert (reward, term, trunc) == tuple(x[car] for x in first[step][1:])
 
 
-def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: list[Scenario]) -> None:
+def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: list[Map]) -> None:
     env = GridSimEnv(maps=maps)
     first, _ = env.reset(seed=8)
     second, _ = env.reset()
@@ -132,7 +133,7 @@ def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: list[Scen
     assert not np.array_equal(GridSimEnv(maps=maps).reset()[0], GridSimEnv(maps=maps).reset()[0])
 
 
-def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Scenario]) -> None:
+def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Map]) -> None:
     limits = Limits(30.0, 40)
     config = SimConfig(episode=EpisodeConfig(target=limits.target, time_limit=limits.steps / 10))
     episodes = np.zeros(24, dtype=EPISODE)
@@ -159,7 +160,7 @@ def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Scenario]) ->
     assert ends == {"running", "collision", "idle", "success", "time"}
 
 
-def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Scenario]) -> None:
+def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Map]) -> None:
     scenario = maps[0]
     starts = sample_starts(scenario, 500, np.random.default_rng(1))
     assert starts.shape == (500, 5)
@@ -178,7 +179,7 @@ def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Scenario]) 
 # --- ends, rewards, automatic resets
 
 
-def test_time_truncates_and_everything_else_terminates(maps: list[Scenario]) -> None:
+def test_time_truncates_and_everything_else_terminates(maps: list[Map]) -> None:
     timed = GridSimEnv(maps=maps, max_episode_steps=3)
     timed.reset(seed=0)
     outcomes = [timed.step(Action.NONE) for _ in range(3)]
@@ -212,7 +213,7 @@ def test_time_truncates_and_everything_else_terminates(maps: list[Scenario]) -> 
     assert info["distance_m"] >= 1.0
 
 
-def test_the_reward_is_the_papers(maps: list[Scenario]) -> None:
+def test_the_reward_is_the_papers(maps: list[Map]) -> None:
     env = GridSimVectorEnv(16, maps=maps)
     env.reset(seed=2)
     before = np.zeros(16)
@@ -228,7 +229,7 @@ def test_the_reward_is_the_papers(maps: list[Scenario]) -> None:
         np.testing.assert_allclose(rewards, expected, atol=1e-4)
 
 
-def test_the_step_after_an_end_begins_the_next_episode_and_does_not_drive(maps: list[Scenario]) -> None:
+def test_the_step_after_an_end_begins_the_next_episode_and_does_not_drive(maps: list[Map]) -> None:
     env = GridSimVectorEnv(8, maps=maps, max_episode_steps=4)
     env.reset(seed=0)
     for _ in range(4):
@@ -243,7 +244,7 @@ def test_the_step_after_an_end_begins_the_next_episode_and_does_not_drive(maps: 
     assert (info["distance_m"] > 0.0).all()
 
 
-def test_what_was_returned_is_the_callers_own(maps: list[Scenario]) -> None:
+def test_what_was_returned_is_the_callers_own(maps: list[Map]) -> None:
     env = GridSimVectorEnv(4, maps=maps)
     first, first_info = env.reset(seed=0)
     kept = [first, *first_info.values()]
@@ -255,7 +256,7 @@ def test_what_was_returned_is_the_callers_own(maps: list[Scenario]) -> None:
         kept = [*outcome, *info.values()]
 
 
-def test_options_set_map_and_start(maps: list[Scenario]) -> None:
+def test_options_set_map_and_start(maps: list[Map]) -> None:
     env = GridSimVectorEnv(2, maps=1, map_seed=0)
     start = starts_at(maps[2], np.array([0.3]))[0]
     observations, info = env.reset(seed=0, options={"map_seed": 2, "start": start})
@@ -290,7 +291,7 @@ def test_gymnasiums_time_limit_truncates() -> None:
     assert env.step(4)[2:4] == (False, True)
 
 
-def test_wrappers_of_vector_environments_work(maps: list[Scenario]) -> None:
+def test_wrappers_of_vector_environments_work(maps: list[Map]) -> None:
     n = 6
     env = DictInfoToList(RecordEpisodeStatistics(FlattenAll(GridSimVectorEnv(n, maps=maps, max_episode_steps=30))))
     env.reset(seed=0)
@@ -308,7 +309,7 @@ def test_wrappers_of_vector_environments_work(maps: list[Scenario]) -> None:
     assert counted > n
 
 
-def test_the_native_environment_equals_gymnasiums_own_vector_of_singles(maps: list[Scenario]) -> None:
+def test_the_native_environment_equals_gymnasiums_own_vector_of_singles(maps: list[Map]) -> None:
     native = GridSimVectorEnv(4, maps=maps)
     synced = gymnasium.vector.SyncVectorEnv([lambda: GridSimEnv(maps=maps)] * 4)
     np.testing.assert_array_equal(native.reset(seed=40)[0], synced.reset(seed=40)[0])
@@ -329,7 +330,7 @@ def test_the_native_environment_equals_gymnasiums_own_vector_of_singles(maps: li
     ("action", "text"),
     [(8, "not 8"), (-1, "not -1"), (np.nan, "nan"), (1.0, "whole numbers"), (None, "whole numbers")],
 )
-def test_an_action_that_is_none_is_refused(maps: list[Scenario], n: int, action: object, text: str) -> None:
+def test_an_action_that_is_none_is_refused(maps: list[Map], n: int, action: object, text: str) -> None:
     env = GridSimVectorEnv(n, maps=maps)
     env.reset(seed=0)
     before = env.simulator.state.cars.copy()
@@ -339,7 +340,7 @@ def test_an_action_that_is_none_is_refused(maps: list[Scenario], n: int, action:
     np.testing.assert_array_equal(env.simulator.state.cars, before)
 
 
-def test_a_wrong_number_of_actions_is_refused(maps: list[Scenario]) -> None:
+def test_a_wrong_number_of_actions_is_refused(maps: list[Map]) -> None:
     env = GridSimVectorEnv(3, maps=maps)
     env.reset(seed=0)
     for actions in (np.zeros(2, dtype=int), np.array(1), np.zeros((3, 1), dtype=int)):
@@ -351,7 +352,7 @@ def test_a_wrong_number_of_actions_is_refused(maps: list[Scenario]) -> None:
         single.step(9)
 
 
-def test_a_step_before_reset_or_after_an_end_says_so(maps: list[Scenario]) -> None:
+def test_a_step_before_reset_or_after_an_end_says_so(maps: list[Map]) -> None:
     with pytest.raises(ResetNeeded, match="before reset"):
         GridSimVectorEnv(2, maps=maps).step(np.zeros(2, dtype=int))
     single = GridSimEnv(maps=maps, max_episode_steps=1)

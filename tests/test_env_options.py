@@ -15,7 +15,8 @@ from gridsim.car.ego import DISTANCE, SPEED
 from gridsim.car.vehicle import Action
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
 from gridsim.envs.simulator import views
-from gridsim.maps.scenarios import REGISTRY, Scenario
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import REGISTRY
 from gridsim.sensing.grid import CELLS, grid_table, grids
 from gridsim.traffic.world import LANE
 
@@ -27,7 +28,7 @@ from gridsim.traffic.world import LANE
 @pytest.mark.parametrize(("observation", "frames"), SENSING)
 @pytest.mark.parametrize("name", REGISTRY)
 def test_gymnasiums_checker_passes(
-    maps: dict[str, list[Scenario]], name: str, observation: str, frames: int, actions: str
+    maps: dict[str, list[Map]], name: str, observation: str, frames: int, actions: str
 ) -> None:
     """It makes the environment in both of its render modes, too."""
     options: dict[str, Any] = {"observation": observation, "frames": frames, "actions": actions}
@@ -68,7 +69,7 @@ def test_traffic_is_the_scenarios_unless_given() -> None:
     ],
 )
 def test_an_episode_follows_from_seed_and_number_alone(
-    maps: dict[str, list[Scenario]], name: str, options: dict[str, Any]
+    maps: dict[str, list[Map]], name: str, options: dict[str, Any]
 ) -> None:
     """Traffic included: the same again, among other cars that do other things, and alone."""
     n, steps = 12, 110
@@ -113,7 +114,7 @@ def test_an_episode_follows_from_seed_and_number_alone(
         np.testing.assert_array_equal(single.cars.simulator.state.worlds[0], ours[1][car])
 
 
-def test_traffic_follows_from_the_seed_too(maps: dict[str, list[Scenario]]) -> None:
+def test_traffic_follows_from_the_seed_too(maps: dict[str, list[Map]]) -> None:
     env = GridSimVectorEnv(2, scenario="city", maps=maps["city"])
     same = {"map_seed": 0, "start": [*maps["city"][0].lanes.points[0], 0.0, 0.0, 0.0]}
     env.reset(seed=1, options=same)
@@ -128,7 +129,7 @@ def test_traffic_follows_from_the_seed_too(maps: dict[str, list[Scenario]]) -> N
 # --- rewards and observations
 
 
-def test_the_reward_among_traffic_is_the_papers(maps: dict[str, list[Scenario]]) -> None:
+def test_the_reward_among_traffic_is_the_papers(maps: dict[str, list[Map]]) -> None:
     """Recomputed from the states, in float64."""
     env = GridSimVectorEnv(8, scenario="highway", maps=maps["highway"])
     env.reset(seed=0)
@@ -159,7 +160,7 @@ def test_the_reward_among_traffic_is_the_papers(maps: dict[str, list[Scenario]])
 
 
 @pytest.mark.parametrize("name", ["city", "highway"])
-def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Scenario]], name: str) -> None:
+def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Map]], name: str) -> None:
     options: dict[str, Any] = {"scenario": name, "maps": maps[name]}
     env, rays = GridSimVectorEnv(6, observation="grid", **options), GridSimVectorEnv(6, **options)
     seen, _ = env.reset(seed=4)
@@ -176,7 +177,7 @@ def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Scenario]], name: str)
     assert set(info) == {"distance_m", "speed_mps", "end", "_distance_m", "_speed_mps", "_end"}
 
 
-def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str, list[Scenario]]) -> None:
+def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str, list[Map]]) -> None:
     n = 5
     env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="grid", frames=4, max_episode_steps=9)
     table = grid_table(env.config)
@@ -196,7 +197,7 @@ def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str
         assert any((stack[0] != stack[3]).any() for stack in past)
 
 
-def test_pedal_and_wheel_do_what_they_say(maps: dict[str, list[Scenario]]) -> None:
+def test_pedal_and_wheel_do_what_they_say(maps: dict[str, list[Map]]) -> None:
     env = GridSimVectorEnv(3, maps=maps["seamless"], actions="continuous")
     env.reset(seed=0, options={"map_seed": 0})
     *_, info = env.step(np.array([[1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]))
@@ -229,7 +230,7 @@ def test_pedal_and_wheel_do_what_they_say(maps: dict[str, list[Scenario]]) -> No
     ],
 )
 def test_a_continuous_action_that_is_none_is_refused(
-    maps: dict[str, list[Scenario]], n: int, action: object, text: str
+    maps: dict[str, list[Map]], n: int, action: object, text: str
 ) -> None:
     env = GridSimVectorEnv(n, scenario="city", maps=maps["city"][:1], actions="continuous")
     env.reset(seed=0)
@@ -242,7 +243,7 @@ def test_a_continuous_action_that_is_none_is_refused(
     env.step(np.zeros((n, 2)))
 
 
-def test_an_error_is_one_line_for_any_number_of_cars(maps: dict[str, list[Scenario]]) -> None:
+def test_an_error_is_one_line_for_any_number_of_cars(maps: dict[str, list[Map]]) -> None:
     kinds: list[dict[str, Any]] = [{"actions": "discrete"}, {"actions": "continuous"}]
     for options in kinds:
         env = GridSimVectorEnv(100, maps=maps["seamless"][:1], **options)
@@ -279,7 +280,7 @@ def test_a_wrong_argument_is_refused(kind: Any, arguments: dict[str, Any], text:
 
 
 @pytest.mark.parametrize("options", [{"observation": "grid"}, {"actions": "continuous"}, {"render_mode": "rgb_array"}])
-def test_nothing_goes_before_reset(maps: dict[str, list[Scenario]], options: dict[str, Any]) -> None:
+def test_nothing_goes_before_reset(maps: dict[str, list[Map]], options: dict[str, Any]) -> None:
     env = GridSimVectorEnv(2, maps=maps["seamless"][:1], **options)
     single = GridSimEnv(maps=maps["seamless"][:1], **options)
     with pytest.raises(ResetNeeded, match="before reset"):

@@ -15,7 +15,7 @@ from gymnasium.wrappers import vector as wrappers
 
 from gridsim.car.vehicle import Action
 from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv, env_id
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 from gridsim.view.render import NoDisplayError
 
 F = np.float32
@@ -25,7 +25,7 @@ F = np.float32
 
 
 def test_a_window_without_a_display_is_a_clear_error(
-    maps: dict[str, list[Scenario]], monkeypatch: pytest.MonkeyPatch
+    maps: dict[str, list[Map]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(variable, raising=False)
@@ -38,7 +38,7 @@ def test_a_window_without_a_display_is_a_clear_error(
 
 
 @pytest.mark.usefixtures("dummy")
-def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str, list[Scenario]]) -> None:
+def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str, list[Map]]) -> None:
     import pygame
 
     options: dict[str, Any] = {"scenario": "city", "maps": maps["city"]}
@@ -65,7 +65,7 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
     human.close()
 
 
-def test_pictures_show_each_cars_world(maps: dict[str, list[Scenario]]) -> None:
+def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
     env = GridSimVectorEnv(3, scenario="highway", maps=maps["highway"], render_mode="rgb_array", observation="grid")
     env.reset(seed=0)
     pictures = env.render()
@@ -245,7 +245,7 @@ def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
     env.close()
 
 
-def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Scenario]]) -> None:
+def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Map]]) -> None:
     """Gymnasium copies what it is given; a kernel takes arrays that can be written to for another type."""
     spec = gymnasium.make(env_id("city"), maps=maps["city"][:1]).spec
     assert spec is not None

@@ -14,7 +14,8 @@ from cluster.runs.champion import Champion, load_champion
 from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.reference.driver import ReferenceDriver
 from gridsim.reference.errors import (
     APART,

@@ -28,7 +28,7 @@ from cluster.workers.pool import SerialPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import Task, Worker
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 
 pytestmark = pytest.mark.e2e
 
@@ -79,7 +79,7 @@ class Deadly(Worker):
     def __init__(self, key: int, seed: int):
         self._key, self._seed = key, seed
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         if self._key == task.key and self._seed in recipes["seed"]:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().evaluate(task, maps, recipes)
@@ -141,7 +141,7 @@ class Stopping(Answering):
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         with contextlib.suppress(FileNotFoundError):
             (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
             os.kill(os.getpid(), signal.SIGSTOP)

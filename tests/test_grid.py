@@ -12,7 +12,8 @@ from hypothesis.extra import numpy as arrays
 from gridsim.car.ego import COS, SIN, X, Y
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import (
     CELL,
     CELLS,

@@ -19,8 +19,9 @@ from evolution.search.breeding import RECIPE, Mutation, breed, moments
 from gridsim import jit
 from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y, drive, look, place
 from gridsim.config import SimConfig, constants
+from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.maps.scenarios import Scenario, build, sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.sensing.rays import LANES, fan
 
 F = np.float32
@@ -198,7 +199,7 @@ def lay_a_road():
 
 def everything(given):
     """Each part's arrays, or the exception that it raised, by name."""
-    scenario = Scenario.from_arrays({k[4:]: v for k, v in given.items() if k.startswith("map_")})
+    scenario = Map.from_arrays({k[4:]: v for k, v in given.items() if k.startswith("map_")})
     parts = {
         "drive": lambda: drive_a_while(scenario, given["start"], given["actions"]),
         "rollout": lambda: roll_out(scenario, given["start"], given["genomes"]),
@@ -230,7 +231,7 @@ def both(root, tmp_path_factory):
     code = (
         "import sys, json, numpy as np; import numba; assert numba.config.DISABLE_JIT\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r}); import test_jit\n"
-        "from gridsim import vehicle; assert type(vehicle.act).__name__ == 'function'\n"
+        "from gridsim.car import vehicle; assert type(vehicle.act).__name__ == 'function'\n"
         f"given = dict(np.load({str(folder / 'given.npz')!r}))\n"
         f"np.savez({str(folder / 'plain.npz')!r}, **test_jit.everything(given))\n"
         "print(json.dumps('done'))\n"

@@ -32,8 +32,9 @@ from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.files import MapFile, load_map, map_digest, read_free, read_map_file, short_lap
+from gridsim.maps.map import Map, sample_starts, starts_at
 from gridsim.maps.raster import signed_clearance
-from gridsim.maps.scenarios import Scenario, build, label, sample_starts, starts_at
+from gridsim.maps.scenarios import build, label
 
 
 @pytest.fixture(scope="module")
@@ -302,7 +303,7 @@ def test_one_map_for_all_seeds(track):
 
 
 def test_arrays_and_back(track):
-    again = Scenario.from_arrays({k: v.copy() for k, v in track.arrays().items()})
+    again = Map.from_arrays({k: v.copy() for k, v in track.arrays().items()})
     for key, array in track.arrays().items():
         np.testing.assert_array_equal(again.arrays()[key], array)
     assert again.name == track.name

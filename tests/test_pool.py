@@ -34,7 +34,8 @@ from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import Scenario, build
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import build
 from gridsim.traffic.world import FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
@@ -44,7 +45,7 @@ Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # what `Worker.eva
 class Answering(Worker):
     """A stand-in that answers at once: each result is a function of the recipe and the episode."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         started = time.perf_counter()
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         results["distance"] = recipes["seed"][:, None] * 16.0 + task.episodes["start"][:, 4]
@@ -56,7 +57,7 @@ class Answering(Worker):
         return results, rewound, worlds, time.perf_counter() - started
 
     def collect(
-        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
     ) -> tuple[Experience, np.ndarray, float]:
         """Episodes of key % 5 steps whose rows are all marked by their keys."""
         started = time.perf_counter()
@@ -72,13 +73,13 @@ class Answering(Worker):
 class Failing(Answering):
     """Answers until it meets a member that it cannot bear."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         if 300 in recipes["seed"]:
             raise ValueError("member 300 is\nnot to be had")
         return super().evaluate(task, maps, recipes)
 
     def collect(
-        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
     ) -> tuple[Experience, np.ndarray, float]:
         if 300 in task.keys[first:stop]:
             raise ValueError("episode 300 is\nnot to be had")
@@ -111,7 +112,7 @@ def make_collect_task(n: int) -> CollectTask:
     return CollectTask(policy, weights, episodes, no_traffic(n), (), epsilons, keys, Limits(150.0, 300), SimConfig())
 
 
-def collect_drive_task(n: int) -> tuple[CollectTask, list[Scenario]]:
+def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:
     """A small real task on two maps, and the maps."""
     scenarios = [build(*name) for name in MAPS]
     rng = np.random.default_rng(1)
@@ -133,11 +134,11 @@ def make_recipes(n: int) -> np.ndarray:
     return recipes
 
 
-def never_built(name: str, seed: int) -> Scenario:
+def never_built(name: str, seed: int) -> Map:
     raise AssertionError(f"nobody asked for {name} {seed}")
 
 
-def drive_task() -> tuple[Task, list[Scenario]]:
+def drive_task() -> tuple[Task, list[Map]]:
     """A small real task on two maps, and the maps."""
     scenarios = [build(*name) for name in MAPS]
     episodes, _ = lane_starts(scenarios, np.array([0, 1, 1]), np.random.default_rng(1))
@@ -290,7 +291,7 @@ def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
     assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
-def rewound_task() -> tuple[Task, list[Scenario]]:
+def rewound_task() -> tuple[Task, list[Map]]:
     """A small real task; of its last two episodes the states before their ends are wanted back."""
     scenarios = [build(*name) for name in MAPS]
     episodes, worlds = lane_starts(scenarios, np.array([0, 1, 1, 0]), np.random.default_rng(1), 2)
@@ -381,7 +382,7 @@ def test_every_input_of_the_kernels_is_read_only() -> None:
     seen: list[np.ndarray] = []
 
     class Looking(Answering):
-        def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+        def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
             seen.extend([task.parents, task.episodes, recipes])
             seen.extend(value for value in maps[0].road if isinstance(value, np.ndarray))
             return super().evaluate(task, maps, recipes)

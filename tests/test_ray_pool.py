@@ -35,7 +35,7 @@ from cluster.workers.ray_pool import RayPool, check_address
 from cluster.workers.worker import CollectTask, Task
 from evolution.dqn.experience import Experience, to_bytes
 from evolution.search.breeding import RECIPE
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 
 pytestmark = pytest.mark.e2e
 
@@ -49,12 +49,12 @@ class Obeying(Answering):
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         self._obey(recipes["seed"] if len(recipes) else np.array([NOBODY]))
         return super().evaluate(task, maps, recipes)
 
     def collect(
-        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
     ) -> tuple[Experience, np.ndarray, float]:
         if stop > first:
             with (self._folder / "collected").open("a") as collected:
@@ -84,7 +84,7 @@ class Obeying(Answering):
 class Inspecting(Answering):
     """Tells of its process: modules that should not be there, writable inputs, the time that SIGINT is ignored."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         results, rewound, worlds, seconds = super().evaluate(task, maps, recipes)
         arrays = [task.parents, task.episodes, recipes, *(m.road.field for m in maps)]
         results["distance"] = sum(name in sys.modules for name in BANNED)
@@ -477,7 +477,7 @@ def test_a_cluster_is_told_how_a_run_is_doing(
 class Stepping(Answering):
     """Three steps an episode."""
 
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         results, rewound, worlds, seconds = super().evaluate(task, maps, recipes)
         results["steps"] = 3
         return results, rewound, worlds, seconds

@@ -21,7 +21,7 @@ from test_ray_pool import gone
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_pool import RayPool, check_address
 from cluster.workers.worker import Task
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 
 pytestmark = pytest.mark.e2e
 
@@ -56,7 +56,7 @@ SCRIPT = """
 
 
 class Slow(Answering):
-    def evaluate(self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
         time.sleep(0.001 * len(recipes))
         return super().evaluate(task, maps, recipes)
 

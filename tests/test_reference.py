@@ -12,9 +12,10 @@ from gridsim.car.vehicle import Action
 from gridsim.config import TrafficConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.lanes import Path, lay_lanes, strips_along
+from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Lanes, clearance_nodes, freeze, make_road
-from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, Scenario, build, sample_starts
+from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.reference.driver import ReferenceDriver
 from gridsim.reference.routes import ReferenceConfig, locate, plan, profile, top_speed, unwrapped
 from gridsim.traffic.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT
@@ -29,12 +30,12 @@ NOBODY = np.zeros((0, FIELDS), dtype=np.float32)
 START = np.array([10.0, 32.0, 0.0, 0.0, 0.0], dtype=np.float32)
 
 
-def on_path(path: Path, width: float, height: float) -> Scenario:
+def on_path(path: Path, width: float, height: float) -> Map:
     """A map of one lane, 8 m wide."""
     strips = strips_along(path, 4.0)
     lanes = lay_lanes([path], width, height)
     lanes = Lanes(**{name: freeze(array) for name, array in vars(lanes).items()})
-    return Scenario(
+    return Map(
         name="one lane",
         seed=0,
         road=make_road(clearance_nodes(strips, width, height), INTERVAL, 50.0),

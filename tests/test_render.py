@@ -10,8 +10,9 @@ import pytest
 from gridsim.car.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
+from gridsim.maps.map import sample_starts
 from gridsim.maps.roads import clearance
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.view import paint, render
 from gridsim.view.render import Renderer, between
 

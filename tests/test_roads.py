@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gridsim.maps.map import ROAD_FIELDS, Map
 from gridsim.maps.roads import (
     CELLS_PER_M,
     FIELD_FLOOR,
@@ -22,7 +23,7 @@ from gridsim.maps.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.maps.scenarios import ROAD_FIELDS, Scenario, build
+from gridsim.maps.scenarios import build
 
 F = np.float32
 SIDE = 64.0  # m, of the small maps
@@ -261,7 +262,7 @@ def test_in_the_open_the_table_reaches_as_far_as_the_field_can_tell():
 def test_arrays_and_back(scenario):
     arrays = scenario.arrays()
     assert all(isinstance(a, np.ndarray) and a.dtype != object for a in arrays.values())
-    again = Scenario.from_arrays({key: value.copy() for key, value in arrays.items()})
+    again = Map.from_arrays({key: value.copy() for key, value in arrays.items()})
     assert (again.name, again.seed, again.torus) == (scenario.name, scenario.seed, scenario.torus)
     for name in scenario.road._fields:
         one, other = getattr(scenario.road, name), getattr(again.road, name)

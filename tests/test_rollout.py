@@ -23,7 +23,8 @@ from gridsim.car.ego import (
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.traffic.world import ALONG, LANE, SHIFT, spawn
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 

@@ -17,8 +17,9 @@ from gridsim.car.ego import collides
 from gridsim.config import SimConfig, constants
 from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
 from gridsim.maps.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
+from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
-from gridsim.maps.scenarios import REGISTRY, Scenario, build, sample_starts
+from gridsim.maps.scenarios import REGISTRY, build
 
 LAID = range(16)  # seeds of which strips and lanes are looked at
 BUILT = (0, 1)  # ... whole maps
@@ -228,7 +229,7 @@ def test_a_map_is_small_and_survives_as_arrays(built):
     for scenario in built:
         arrays = scenario.arrays()
         assert sum(array.nbytes for array in arrays.values()) <= MEMORY
-        again = Scenario.from_arrays({key: value.copy() for key, value in arrays.items()}).arrays()
+        again = Map.from_arrays({key: value.copy() for key, value in arrays.items()}).arrays()
         assert {k: (v.dtype, v.tobytes()) for k, v in again.items()} == {
             k: (v.dtype, v.tobytes()) for k, v in arrays.items()
         }

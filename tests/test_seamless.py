@@ -21,7 +21,8 @@ from gridsim.maps.generators.seamless import (
     tile_graph,
 )
 from gridsim.maps.lanes import LANE_STEP
-from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, build
 
 SEEDS = range(300)  # of which graphs are looked at
 LAID = range(60)  # ... lanes and strips

@@ -29,8 +29,9 @@ from gridsim.car.ego import (
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig, constants
 from gridsim.envs.simulator import Simulator
+from gridsim.maps.map import sample_starts
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.sensing.rays import LANES, fan
 
 F = np.float32

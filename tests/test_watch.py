@@ -25,7 +25,8 @@ from evolution.episodes.curriculum import spread_starts
 from gridsim.car.ego import DISTANCE, End
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.scenarios import build, sample_starts
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import build
 from gridsim.view.drive import Recorder, pose, unhurried
 from gridsim.view.render import Renderer
 

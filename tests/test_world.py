@@ -10,8 +10,9 @@ from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.files import load_map
+from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length
-from gridsim.maps.scenarios import REGISTRY, build, sample_starts
+from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.traffic.behaviour import drivers, flow
 from gridsim.traffic.world import (
     AFTER,

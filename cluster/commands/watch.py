@@ -26,7 +26,8 @@ from cluster.runs.settings import MAX_TRAFFIC
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import HELD_OUT_SEED, Scenario, build, check_name, default_traffic, label, sample_starts
+from gridsim.maps.map import Map, sample_starts
+from gridsim.maps.scenarios import HELD_OUT_SEED, build, check_name, default_traffic, label
 from gridsim.traffic.world import spawn
 from gridsim.view.drive import DriveError, Recorder, drive, read_drive, replay
 from gridsim.view.render import NoDisplayError, Renderer, Window
@@ -119,7 +120,7 @@ def _traffic(value: int, default: int) -> int:
     return default if value == -1 else value
 
 
-def _map(name: str, seed: int, config: SimConfig) -> tuple[Scenario, np.ndarray]:
+def _map(name: str, seed: int, config: SimConfig) -> tuple[Map, np.ndarray]:
     """A map and a start float32 [5] on it, both of this seed. Raises UsageError."""
     with _as_usage_error():
         scenario = build(name, seed, config)

@@ -21,7 +21,7 @@ from cluster.workers import kernels as warm
 from cluster.workers.pool import PoolError, SerialPool, WorkerPool
 from evolution.episodes.curriculum import CrashError
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 
 UNBOUND = MAX_STEPS  # generations or car-steps, where a budget is what ends a run
 EVALUATIONS = 10  # of the DQN at least, since a budget of car-steps is looked at after each
@@ -123,7 +123,7 @@ class Cells:
             self._pool = SerialPool(self._build)
         return self._pool
 
-    def _build(self, scenario: str, seed: int) -> Scenario:
+    def _build(self, scenario: str, seed: int) -> Map:
         assert self._maps is not None
         return self._maps.build(scenario, seed)
 

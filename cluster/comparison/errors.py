@@ -11,7 +11,8 @@ from cluster.runs.champion import Champion, held_out
 from cluster.training.trainer import Maps
 from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
-from gridsim.maps.scenarios import HELD_OUT_SEED, Scenario
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import HELD_OUT_SEED
 from gridsim.reference.errors import (
     TURN,
     Driven,
@@ -78,7 +79,7 @@ def series(
         maps.close()
 
 
-def _drive(champion: Champion, road: Scenario, start: np.ndarray, world: np.ndarray, target: float) -> Driven | None:
+def _drive(champion: Champion, road: Map, start: np.ndarray, world: np.ndarray, target: float) -> Driven | None:
     """The path of an episode of so many m; None if the car never came forward."""
     episode = champion.sim.episode
     limits = Limits(target, round(episode.time_limit / episode.control_period))
@@ -123,7 +124,7 @@ def _beside(
     return found
 
 
-def _longest(kept: Drive, road: Scenario) -> tuple[np.ndarray, Driven]:
+def _longest(kept: Drive, road: Map) -> tuple[np.ndarray, Driven]:
     """The rows of the longest episode of a recording, and its path."""
     episodes = []
     for episode in range(int(kept.episodes[-1]) + 1):

@@ -24,7 +24,8 @@ from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import DISTANCE, SPEED, End, X, Y
 from gridsim.envs.simulator import views
-from gridsim.maps.scenarios import Scenario, build
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import build
 from gridsim.traffic.world import LANE
 from gridsim.view.render import Renderer, between
 
@@ -49,7 +50,7 @@ class Recording:
         period: s from state to state.
     """
 
-    scenario: Scenario
+    scenario: Map
     cars: np.ndarray
     ranges: np.ndarray
     boxes: np.ndarray
@@ -63,7 +64,7 @@ class Recording:
 
 
 def record(
-    champion: Champion, scenario: Scenario, start: np.ndarray, seconds: float, world: np.ndarray | None = None
+    champion: Champion, scenario: Map, start: np.ndarray, seconds: float, world: np.ndarray | None = None
 ) -> Recording:
     """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for so many seconds.
 

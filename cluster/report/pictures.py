@@ -11,8 +11,8 @@ import numpy as np
 from rich.table import Table
 
 from gridsim.car.ego import X, Y
+from gridsim.maps.map import Map
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS
-from gridsim.maps.scenarios import Scenario
 
 if TYPE_CHECKING:
     from cluster.comparison.tables import Group
@@ -70,7 +70,7 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
     figure.savefig(Path(path), dpi=100)
 
 
-def draw_map(axis: Any, scenario: Scenario) -> None:
+def draw_map(axis: Any, scenario: Map) -> None:
     """Draw a scenario's drivable area and lane marks."""
     road = scenario.road
     nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
@@ -82,7 +82,7 @@ def draw_map(axis: Any, scenario: Scenario) -> None:
     axis.set(xlim=(0, width), ylim=(0, height), aspect="equal", xlabel="x, m", ylabel="y, m")
 
 
-def trajectory(scenario: Scenario, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
+def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
 

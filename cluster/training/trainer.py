@@ -42,7 +42,8 @@ from evolution.search.base import recipes
 from evolution.search.breeding import Kind, Mutation
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
-from gridsim.maps.scenarios import Scenario, build, map_of
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import build, map_of
 
 MAX_TRIED = 4  # members that are on validation's first stage at once
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
@@ -54,7 +55,7 @@ class Maps:
 
     def __init__(self, scenario: str, config: SimConfig):
         self._scenario, self._config = scenario, config
-        self._built: dict[int, Future[Scenario]] = {}
+        self._built: dict[int, Future[Map]] = {}
         self._lock = threading.Lock()
         self._soon, self._later = (ThreadPoolExecutor(1, thread_name_prefix=f"maps-{k}") for k in range(2))
 
@@ -66,7 +67,7 @@ class Maps:
                 if seed not in self._built:
                     self._built[seed] = thread.submit(build, self._scenario, seed, self._config)
 
-    def get(self, seed: int) -> Scenario:
+    def get(self, seed: int) -> Map:
         """The map of a seed."""
         self.ahead([seed])
         with self._lock:
@@ -76,7 +77,7 @@ class Maps:
                 del self._built[next(iter(self._built))]
         return future.result()
 
-    def build(self, scenario: str, seed: int) -> Scenario:
+    def build(self, scenario: str, seed: int) -> Map:
         """As pools ask for it."""
         if scenario != self._scenario:
             raise ValueError(f"a run on {self._scenario} has no map of {scenario}")

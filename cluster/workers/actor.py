@@ -18,7 +18,7 @@ import numpy as np
 from cluster.workers.pool import BuildMap, answer
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.search.breeding import RECIPE
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 
 NOBODY = np.zeros(0, RECIPE).tobytes()
 Name = tuple[str, int]
@@ -49,7 +49,7 @@ class Actor:
         self._worker = factory()
         self._serial = 0
         self._task: Task | CollectTask | None = None
-        self._maps: dict[Name, Scenario] = {}
+        self._maps: dict[Name, Map] = {}
 
     def hello(self) -> int:
         return os.getpid()
@@ -65,7 +65,7 @@ class Actor:
     ) -> bytes:  # fmt: skip
         """What `pool.answer` says; `names` and all after it are for a worker that does not have the task yet."""
         if task is not None:
-            self._maps |= {name: Scenario.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
+            self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:
                 self._maps.pop(name, None)
             self._task, self._serial = task, serial

@@ -33,7 +33,8 @@ from gridsim.car.ego import FIELDS
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import views
 from gridsim.jit import CACHE_FOLDER, CONFIG
-from gridsim.maps.scenarios import REGISTRY, blank, build, default_traffic, is_map_file, sample_starts
+from gridsim.maps.map import blank, sample_starts
+from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic.world import LANE, spawn
 

@@ -17,10 +17,10 @@ from evolution.dqn.experience import Experience, from_bytes, join, to_bytes
 from evolution.episodes.rollout import RESULT, targets
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind
+from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
-from gridsim.maps.scenarios import Scenario
 
-BuildMap = Callable[[str, int], Scenario]  # (scenario, seed) -> map; remembers what it built lately
+BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; remembers what it built lately
 Progress = Callable[[int, int], None]  # (members done, members in all), or episodes where experience is collected
 Meanwhile = Callable[[], bool | None]  # something to do; called until it returns something false
 
@@ -184,7 +184,7 @@ class Collected(Cost):
 
 
 def answer(
-    worker: Worker, task: Task | CollectTask, maps: Sequence[Scenario], payload: bytes, first: int, stop: int
+    worker: Worker, task: Task | CollectTask, maps: Sequence[Map], payload: bytes, first: int, stop: int
 ) -> bytes:
     """What a worker says to a chunk: its seconds as float64, its results, its experience if that is what is asked for.
 

@@ -14,8 +14,8 @@ from evolution.episodes.rollout import Limits, evaluate
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import Mutation, breed
 from gridsim.config import SimConfig
+from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
-from gridsim.maps.scenarios import Scenario
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Worker:
     """Breeds and drives members, or collects experience. It keeps nothing that a result depends on."""
 
     def evaluate(
-        self, task: Task, maps: Sequence[Scenario], recipes: np.ndarray
+        self, task: Task, maps: Sequence[Map], recipes: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         """What `rollout.evaluate` returns of recipes RECIPE [n], and the seconds it took (for statistics only).
 
@@ -99,7 +99,7 @@ class Worker:
         return *found, time.perf_counter() - started
 
     def collect(
-        self, task: CollectTask, maps: Sequence[Scenario], first: int, stop: int
+        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
     ) -> tuple[Experience, np.ndarray, float]:
         """Experience and RESULT [stop - first] of the task's episodes from `first` on, and the seconds it took.
 

@@ -33,8 +33,8 @@ from gridsim.car.reward import reward
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.jit import leaf, njit
+from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
-from gridsim.maps.scenarios import Scenario
 
 _F, _U = np.float32, np.uint64
 _IDLE = 2
@@ -99,7 +99,7 @@ def _collect(setting, packed, layers, bounds, traffic, closing, eye, epsilon, ke
 def collect(
     spec: PolicySpec,
     weights: np.ndarray,
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[Map],
     episodes: np.ndarray,
     epsilons: np.ndarray,
     keys: np.ndarray,

@@ -21,7 +21,8 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE, Limits
 from evolution.episodes.starts import Episodes, lane_starts
 from gridsim.car.ego import End
-from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED, Scenario
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
 from gridsim.traffic.world import FIELDS, LANE, check_worlds
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
@@ -63,7 +64,7 @@ class CurriculumConfig:
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
 
 
-def spread_starts(build: Callable[[int], Scenario], seeds: range, episodes: int, traffic: int = 0) -> Episodes:
+def spread_starts(build: Callable[[int], Map], seeds: range, episodes: int, traffic: int = 0) -> Episodes:
     """Episodes over the maps of `seeds` in turn; the same for every run of a scenario with as much traffic."""
     rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
     used = np.arange(episodes) % len(seeds)
@@ -77,7 +78,7 @@ class Curriculum:
         self,
         config: CurriculumConfig,
         seed: int,
-        build: Callable[[int], Scenario],
+        build: Callable[[int], Map],
         target_m: float,
         time_s: float,
         period_s: float,

@@ -42,9 +42,9 @@ from gridsim.car.ego import (
 )
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
+from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road, freeze
-from gridsim.maps.scenarios import Scenario
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
 from gridsim.sensing.rays import LANES, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
@@ -106,7 +106,7 @@ class Setting(NamedTuple):
     rays: int
 
 
-def settings_on(scenarios: Sequence[Scenario], config: SimConfig) -> list[Setting]:
+def settings_on(scenarios: Sequence[Map], config: SimConfig) -> list[Setting]:
     """The settings of episodes on these maps."""
     k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
@@ -301,7 +301,7 @@ def world_of(worlds: np.ndarray, k: int) -> np.ndarray | None:
 def evaluate(
     spec: PolicySpec,
     genomes: np.ndarray,
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[Map],
     episodes: np.ndarray,
     limits: Limits,
     config: SimConfig,
@@ -355,7 +355,7 @@ def no_traffic(episodes: int) -> np.ndarray:
 def trajectory(
     spec: PolicySpec,
     genome: np.ndarray,
-    scenario: Scenario,
+    scenario: Map,
     start: np.ndarray,
     limits: Limits,
     config: SimConfig,

@@ -9,7 +9,7 @@ import numpy as np
 
 from evolution.episodes.rollout import EPISODE, Limits, no_traffic
 from gridsim.config import TrafficConfig
-from gridsim.maps.scenarios import Scenario, sample_starts
+from gridsim.maps.map import Map, sample_starts
 from gridsim.traffic.world import FIELDS, spawn
 
 
@@ -39,7 +39,7 @@ class Episodes(NamedTuple):
 
 
 def lane_starts(
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[Map],
     maps: np.ndarray,
     rng: np.random.Generator,
     traffic: int = 0,

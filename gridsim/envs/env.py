@@ -33,18 +33,9 @@ from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
+from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
-from gridsim.maps.scenarios import (
-    REGISTRY,
-    TRAINING_SEED,
-    Scenario,
-    build,
-    check_name,
-    default_traffic,
-    is_map_file,
-    map_of,
-    starts_at,
-)
+from gridsim.maps.scenarios import REGISTRY, TRAINING_SEED, build, check_name, default_traffic, is_map_file, map_of
 from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 from gridsim.traffic.world import LANE
 
@@ -109,7 +100,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         num_envs: int = 1,
         *,
         scenario: str = "seamless",
-        maps: int | Sequence[Scenario] = 8,
+        maps: int | Sequence[Map] = 8,
         map_seed: int = TRAINING_SEED,
         traffic: int | None = None,
         observation: Literal["rays", "grid"] = "rays",

@@ -15,8 +15,8 @@ from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
+from gridsim.maps.map import Map
 from gridsim.maps.roads import VISIT_CELL, Road
-from gridsim.maps.scenarios import Scenario
 from gridsim.sensing.rays import LANES, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
@@ -178,7 +178,7 @@ class Simulator:
 
     def __init__(
         self,
-        scenarios: Sequence[Scenario],
+        scenarios: Sequence[Map],
         cars: int,
         config: SimConfig | None = None,
         target: float | None = None,
@@ -216,7 +216,7 @@ class Simulator:
         #: float32 [n, rays]: m/s at which what each ray last met came closer over ground; 0 for the road's edge.
         self.closing = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self._atlas: Atlas | None = None  # maps that cars are on; None before the first reset
-        self._shown: list[Scenario] = []  # what the atlas shows
+        self._shown: list[Map] = []  # what the atlas shows
         self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
         self._order, self._runs = _by_map(self._rows)
 
@@ -370,7 +370,7 @@ def _views(road, constants, fan, cars, worlds, ranges):
         look(road, constants, fan, cars[i], worlds[i], beams, ranges[i], None)
 
 
-def views(scenario: Scenario, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> np.ndarray:
+def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> np.ndarray:
     """Ranges float32 [n, rays] (m) that cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS]."""
     k = constants(config)
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)

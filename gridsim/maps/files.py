@@ -5,7 +5,7 @@ nodes of the clearance field, is what cars and rays meet. Unknown is wall, and s
 picture, unless it is a torus. The world's point (0, 0) is the picture's lower left corner; a file's own coordinates
 are that plus its `origin`.
 
-A file is one map, whatever the seed. It has no lanes: episodes begin at `Scenario.starts`, poses on the ridge of the
+A file is one map, whatever the seed. It has no lanes: episodes begin at `Map.starts`, poses on the ridge of the
 free space, headed along it either way, or those that the file names.
 """
 
@@ -28,6 +28,7 @@ import yaml
 from PIL import Image
 
 from gridsim.config import SimConfig, VehicleConfig
+from gridsim.maps.map import START_SPEED, Map
 from gridsim.maps.network import make_network
 from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
 from gridsim.maps.roads import (
@@ -44,7 +45,7 @@ from gridsim.maps.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.maps.scenarios import FILE_SPEEDS, START_SPEED, Scenario, label
+from gridsim.maps.scenarios import FILE_SPEEDS, label
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -87,7 +88,7 @@ class MapFile:
     speed: tuple[float, float] = FILE_SPEEDS
 
 
-def load_map(name: str, config: SimConfig | None = None) -> Scenario:
+def load_map(name: str, config: SimConfig | None = None) -> Map:
     """The map of a file; the same object as long as the file stays as it is.
 
     Raises: ValueError with one line that says what is wrong with the file.
@@ -361,7 +362,7 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=4)
-def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Scenario:
+def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Map:
     """Build a map. `stamps` tell a file that has changed."""
     path = Path(name)
     file = read_map_file(path)
@@ -381,7 +382,7 @@ def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Scenar
     starts = np.zeros((len(poses), 5), dtype=np.float32)
     starts[:, :3], starts[:, 3] = poses, START_SPEED
     lanes = Lanes.none()
-    return Scenario(
+    return Map(
         name=name,
         seed=0,
         road=make_road(nodes, file.speed, config.sensors.range),

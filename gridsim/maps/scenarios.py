@@ -1,31 +1,23 @@
-"""Scenarios: builders from a seed, in one registry. A scenario is data; another one is one function and one line."""
+"""Scenarios: builders of maps from a seed, in one registry. Another one is one function and one line."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gridsim.config import SimConfig
-from gridsim.jit import njit
+from gridsim.config import FILE_SPEEDS, SimConfig
 from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
 from gridsim.maps.generators.highway import highway_layout
 from gridsim.maps.generators.seamless import roundabout_layout, seamless_layout
-from gridsim.maps.network import Network, make_network, network_of_lanes
+from gridsim.maps.map import Map
+from gridsim.maps.network import make_network
 from gridsim.maps.roads import (
-    CELLS_PER_M,
-    HEADING_BINS,
-    HEADING_WRAP,
-    START_CELLS_PER_M,
     Lanes,
-    Road,
     Strips,
     clearance_nodes,
     clearances,
@@ -36,97 +28,11 @@ from gridsim.maps.roads import (
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
-FILE_SPEEDS = (5.0, 12.0)  # m/s, the interval of a map from a file that names none
-START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight as a share of the interval's two ends together: its middle
-ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One map, ready to drive on.
-
-    Attributes:
-        name: the scenario's name in the registry.
-        seed: the seed it was built from.
-        road: what the kernels read.
-        lanes: directed polylines, for starts, traffic and drivers.
-        strips: exact geometry of the drivable area, for pictures and tests.
-        network: the lanes as traffic reads them.
-        torus: whether leaving on one side means entering on the other.
-        starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
-    """
-
-    name: str
-    seed: int
-    road: Road
-    lanes: Lanes
-    strips: Strips
-    network: Network
-    torus: bool = True
-    starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
-
-    @cached_property
-    def mileage(self) -> np.ndarray:
-        """Metres of lane before each point of `lanes`, all lanes one after another: float64 [points]."""
-        step = np.diff(self.lanes.points.astype(np.float64), axis=0)
-        length = np.hypot(step[:, 0], step[:, 1])
-        length[self.lanes.offsets[1:-1] - 1] = 0.0  # from one lane's end to the next lane's beginning is no road
-        return freeze(np.concatenate([[0.0], np.cumsum(length)]))
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """All of it as plain arrays, to be shared between processes without a copy."""
-        scalars = np.array([float(getattr(self.road, name)) for name in ROAD_FIELDS] + [self.seed, self.torus])
-        return {
-            "name": np.frombuffer(self.name.encode(), dtype=np.uint8),
-            "scalars": scalars,
-            "field": self.road.field,
-            "start_row": self.road.start_row,
-            "start": self.road.start,
-            **vars(self.lanes),
-            **vars(self.strips),
-            "speeds": self.network.speeds,
-            "clear": self.network.clear,
-            "room": self.network.room,
-            "starts": self.starts,
-        }
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Scenario:
-        """The inverse of `arrays`; arrays are used as they are, read-only."""
-        frozen = {key: freeze(value) for key, value in arrays.items()}
-        columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
-        f = np.float32
-        lanes = Lanes(**{f.name: frozen[f.name] for f in fields(Lanes)})
-        return cls(
-            name=frozen["name"].tobytes().decode(),
-            seed=int(seed),
-            road=Road(
-                frozen["field"],
-                frozen["start_row"],
-                frozen["start"],
-                np.uint32(columns),
-                np.uint32(rows),
-                f(width),
-                f(height),
-                f(low),
-                f(high),
-                np.uint32(thin),
-            ),
-            lanes=lanes,
-            strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
-            network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], frozen["room"], width, height),
-            torus=bool(torus),
-            starts=frozen["starts"],
-        )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Copies are read-only, too: kernels would be compiled anew for arrays that can be written to."""
-        return Scenario.from_arrays, (self.arrays(),)
-
-
-@dataclass(frozen=True)
-class ScenarioSpec:
     """A scenario's builder and its driving limitations (the paper's term)."""
 
     summary: str
@@ -136,12 +42,12 @@ class ScenarioSpec:
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
 
-REGISTRY: dict[str, ScenarioSpec] = {
-    "highway": ScenarioSpec("four lanes one way, long easy bends", (15.0, 25.0), 8, False, highway_layout),
-    "curved": ScenarioSpec("one winding two-lane loop without a junction", (6.0, 15.0), 0, False, curved_layout),
-    "seamless": ScenarioSpec("two-lane network of tiles that never ends", (5.0, 12.0), 0, False, seamless_layout),
-    "roundabout": ScenarioSpec("roundabouts joined by short roads", (5.0, 10.0), 4, True, roundabout_layout),
-    "city": ScenarioSpec("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, True, city_layout),
+REGISTRY: dict[str, Scenario] = {
+    "highway": Scenario("four lanes one way, long easy bends", (15.0, 25.0), 8, False, highway_layout),
+    "curved": Scenario("one winding two-lane loop without a junction", (6.0, 15.0), 0, False, curved_layout),
+    "seamless": Scenario("two-lane network of tiles that never ends", (5.0, 12.0), 0, False, seamless_layout),
+    "roundabout": Scenario("roundabouts joined by short roads", (5.0, 10.0), 4, True, roundabout_layout),
+    "city": Scenario("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, True, city_layout),
 }
 
 
@@ -177,7 +83,7 @@ def map_of(name: str, seed: int) -> int:
     return 0 if is_map_file(name) else seed
 
 
-def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
+def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
     Raises: ValueError with one line for an unknown scenario, a seed below 0, or a map's file that is none.
@@ -197,7 +103,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
     lanes = Lanes(**{name: freeze(array) for name, array in vars(lanes).items()})
     road = make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls)
     top = TRAFFIC_PACE * sum(spec.speed_interval)
-    return Scenario(
+    return Map(
         name=name,
         seed=seed,
         road=road,
@@ -205,58 +111,3 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Scenario:
         strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
         network=make_network(lanes, width, height, top, config.traffic, clearances(road, lanes.points)),
     )
-
-
-def blank(config: SimConfig) -> Scenario:
-    """A map of 8 m x 8 m without any road: to compile kernels with, before there are maps."""
-    side = 8
-    lanes, f = Lanes.none(), np.float32
-    return Scenario(
-        name="blank",
-        seed=0,
-        road=Road(
-            field=freeze(np.zeros((side * CELLS_PER_M) ** 2, dtype=np.uint32)),
-            start_row=freeze(np.full((side * START_CELLS_PER_M) ** 2, -1, dtype=np.int32)),
-            start=freeze(np.zeros(HEADING_BINS + HEADING_WRAP, dtype=np.uint8)),
-            columns=np.uint32(side * CELLS_PER_M),
-            rows=np.uint32(side * CELLS_PER_M),
-            width=f(side),
-            height=f(side),
-            speed_low=f(0.0),
-            speed_high=f(1.0),
-            thin=np.uint32(1),
-        ),
-        lanes=lanes,
-        strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
-        network=make_network(lanes, side, side, 1.0, config.traffic),
-    )
-
-
-@njit
-def _starts_at(points, mileage, shares, speed, starts):
-    for k in range(shares.shape[0]):
-        metres = shares[k] * mileage[-1]
-        i = min(np.searchsorted(mileage, metres, side="right"), len(mileage) - 1) - 1
-        part = (metres - mileage[i]) / max(mileage[i + 1] - mileage[i], 1e-9)
-        x, y = points[i, 0], points[i, 1]
-        dx, dy = points[i + 1, 0] - x, points[i + 1, 1] - y
-        starts[k, 0], starts[k, 1] = x + part * dx, y + part * dy
-        starts[k, 2], starts[k, 3], starts[k, 4] = math.atan2(dy, dx), speed, 0.0
-
-
-def starts_at(scenario: Scenario, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
-
-    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it. Of a map
-    without lanes, the starts at these shares of `Scenario.starts`.
-    """
-    if not len(scenario.lanes):
-        return scenario.starts[(np.asarray(shares) * len(scenario.starts)).astype(np.intp)]
-    starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, np.float32(START_SPEED), starts)
-    return starts
-
-
-def sample_starts(scenario: Scenario, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts float32 [count, 5] uniformly over the lanes, as `starts_at` gives them."""
-    return starts_at(scenario, rng.random(count))

@@ -19,9 +19,9 @@ from gridsim.car.ego import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End,
 from gridsim.car.vehicle import act, path_curvature
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
+from gridsim.maps.map import Map
 from gridsim.maps.network import lane_length, turned, wrapped
 from gridsim.maps.roads import VISIT_CELL, freeze
-from gridsim.maps.scenarios import Scenario
 from gridsim.reference.routes import ReferenceConfig, Route, plan
 from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, follow, idm
 from gridsim.traffic.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
@@ -132,7 +132,7 @@ def _find_meetings(network, enter, meet):
                     meet[c] = enter[back]
 
 
-def conflicts(scenario: Scenario, sim: SimConfig) -> Conflicts:
+def conflicts(scenario: Map, sim: SimConfig) -> Conflicts:
     """Where the lanes of a map meet."""
     network, vehicle = scenario.network, sim.vehicle
     enter, meet = np.zeros_like(network.clear), np.zeros_like(network.clear)
@@ -397,9 +397,7 @@ def _drive(
 class ReferenceDriver:
     """Drives a batch of cars, each on a route of its own: `reset`, then `act` once each control period."""
 
-    def __init__(
-        self, scenarios: Sequence[Scenario], sim: SimConfig | None = None, config: ReferenceConfig | None = None
-    ):
+    def __init__(self, scenarios: Sequence[Map], sim: SimConfig | None = None, config: ReferenceConfig | None = None):
         self.scenarios = scenarios
         self.sim, self.config = sim or SimConfig(), config or ReferenceConfig()
         self._constants: Constants = constants(self.sim)
@@ -450,7 +448,7 @@ class ReferenceDriver:
 
     def drive(
         self,
-        scenario: Scenario,
+        scenario: Map,
         start: np.ndarray,
         world: np.ndarray,
         seed: int,

@@ -16,7 +16,7 @@ import numpy as np
 
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
 from gridsim.config import SimConfig, VehicleConfig
-from gridsim.maps.scenarios import Scenario
+from gridsim.maps.map import Map
 from gridsim.reference.routes import ReferenceConfig, profile, unwrapped
 
 APART = 3.5  # m beside the recorded path, a lane's width, from which on two drives are on two paths
@@ -170,7 +170,7 @@ def poses_of(states: np.ndarray) -> np.ndarray:
     return np.stack([states[:, X], states[:, Y], heading, states[:, SPEED], states[:, STEERING]], axis=1)
 
 
-def driven(poses: np.ndarray, scenario: Scenario) -> Driven:
+def driven(poses: np.ndarray, scenario: Map) -> Driven:
     """A drive's path from its poses [n, 5] at the control steps, as `poses_of` gives them.
 
     What was reversed, and as many metres after it, is left out: a reference only drives forward. So is standing, where
@@ -195,7 +195,7 @@ def driven(poses: np.ndarray, scenario: Scenario) -> Driven:
 
 
 def error_series(
-    path: Driven, scenario: Scenario, config: ReferenceConfig | None = None, sim: SimConfig | None = None
+    path: Driven, scenario: Map, config: ReferenceConfig | None = None, sim: SimConfig | None = None
 ) -> Series:
     """A drive beside the reference driver's profile along its path.
 
@@ -215,7 +215,7 @@ def error_series(
     return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
 
 
-def error_series_beside(path: Driven, recorded: Driven, scenario: Scenario, row: int = 0) -> tuple[Series, float]:
+def error_series_beside(path: Driven, recorded: Driven, scenario: Map, row: int = 0) -> tuple[Series, float]:
     """A drive beside a recorded one of which it began at point `row`, as far as it follows it.
 
     Each of the agent's places is compared with the recorded path's nearest further on. They part where the agent is

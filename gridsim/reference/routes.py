@@ -15,8 +15,8 @@ import numpy as np
 
 from gridsim.config import SimConfig
 from gridsim.jit import njit
+from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
-from gridsim.maps.scenarios import Scenario
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def unwrapped(points: np.ndarray, width: float, height: float) -> np.ndarray:
     return np.concatenate([points[:1], points[0] + np.cumsum(step, axis=0)])
 
 
-def locate(scenario: Scenario, start: np.ndarray) -> tuple[int, float]:
+def locate(scenario: Map, start: np.ndarray) -> tuple[int, float]:
     """The lane that a start (x, y, heading, ...) is on, and the m along it: nearest in place and heading."""
     lanes = scenario.lanes
     sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
@@ -165,7 +165,7 @@ def locate(scenario: Scenario, start: np.ndarray) -> tuple[int, float]:
     return lane, float((point - lanes.offsets[lane] + part[point]) * lanes.steps[lane])
 
 
-def _abreast(scenario: Scenario, lane: int) -> list[int]:
+def _abreast(scenario: Map, lane: int) -> list[int]:
     """A lane and those beside it, from left to right."""
     while scenario.lanes.left[lane] >= 0:
         lane = int(scenario.lanes.left[lane])
@@ -175,9 +175,7 @@ def _abreast(scenario: Scenario, lane: int) -> list[int]:
     return row
 
 
-def plan(
-    scenario: Scenario, start: np.ndarray, length: float, seed: int, config: ReferenceConfig | None = None
-) -> Route:
+def plan(scenario: Map, start: np.ndarray, length: float, seed: int, config: ReferenceConfig | None = None) -> Route:
     """A route of so many m or more from a start float32 [5] on, with random turns at junctions.
 
     No scenario has a loop of lanes so short that what is driven again counts nothing, so that any turn will do.

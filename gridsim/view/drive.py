@@ -21,7 +21,8 @@ from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, 
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.scenarios import Scenario, check_name
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import check_name
 from gridsim.traffic.world import LANE
 from gridsim.view.render import Renderer, Window, between
 
@@ -76,12 +77,12 @@ def unhurried(config: SimConfig | None = None) -> SimConfig:
     return dataclasses.replace(config, episode=dataclasses.replace(config.episode, patience=_ENDLESS))
 
 
-def _simulator(scenario: Scenario, config: SimConfig | None, traffic: int) -> Simulator:
+def _simulator(scenario: Map, config: SimConfig | None, traffic: int) -> Simulator:
     """One car among so many others, whose episode ends with a collision and with nothing else."""
     return Simulator([scenario], 1, unhurried(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
-def _key(scenario: Scenario, episode: int) -> int:
+def _key(scenario: Map, episode: int) -> int:
     """What the traffic of an episode is spawned from."""
     return int(np.random.SeedSequence([scenario.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
 
@@ -112,7 +113,7 @@ def action_for(keys: set[str], speed: float) -> Action:
 class Recorder:
     """Writes a drive to a new file, row by row, so that whatever ends it, what was driven is there."""
 
-    def __init__(self, path: str | os.PathLike[str], scenario: Scenario, period: float, traffic: int = 0):
+    def __init__(self, path: str | os.PathLike[str], scenario: Map, period: float, traffic: int = 0):
         """Make the file. Raises: DriveError with one line if it is there already or cannot be made."""
         self._map = (traffic, scenario.name, scenario.seed)
         self._period = period
@@ -214,7 +215,7 @@ def _whole(row: Sequence[str], column: int, most: int) -> int:
     return int(text)
 
 
-def replay(drive: Drive, scenario: Scenario, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
+def replay(drive: Drive, scenario: Map, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
     """Drive a recorded drive again, by its actions alone.
 
     Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
@@ -243,7 +244,7 @@ def replay(drive: Drive, scenario: Scenario, config: SimConfig | None = None) ->
 
 
 def drive(
-    scenario: Scenario,
+    scenario: Map,
     start: np.ndarray,
     window: Window,
     renderer: Renderer,

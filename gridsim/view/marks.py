@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
-from gridsim.maps.scenarios import Scenario
 
 STEP = 1.0  # m between the points at which lanes are looked at
 NEAREST, FARTHEST = 2.2, 4.6  # m between the centre lines of neighbours
@@ -21,7 +21,7 @@ CLAIM = 0.5  # m, side of the cells by which a line is known to be marked alread
 SHORTEST = 5  # points of a line worth marking
 
 
-def _samples(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _samples(scenario: Map) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [n, 2] on all lanes every STEP m, on the torus, their directions [n, 2], and lane numbers [n]."""
     lanes, mileage = scenario.lanes, scenario.mileage
     at = np.arange(STEP / 2, mileage[-1], STEP)
@@ -35,7 +35,7 @@ def _samples(scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return found, direction, lane
 
 
-def lane_marks(scenario: Scenario) -> np.ndarray:
+def lane_marks(scenario: Map) -> np.ndarray:
     """Dashes float32 [n, 6]: centre x, y (m), direction (cosine, sine), half length (m), 1 between opposite lanes."""
     if not len(scenario.lanes) or scenario.mileage[-1] < STEP:
         return freeze(np.zeros((0, 6), dtype=np.float32))

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from gridsim.jit import leaf, njit
+from gridsim.maps.map import Map
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, freeze
-from gridsim.maps.scenarios import Scenario
 
 GROUND = (226, 231, 218)
 GROUND_OTHER = (220, 226, 211)  # of every other square, so that the ground is seen to move
@@ -103,7 +103,7 @@ def draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels
                         image[j, i, c] = np.uint8(value + half)
 
 
-def smoothed(scenario: Scenario) -> np.ndarray:
+def smoothed(scenario: Map) -> np.ndarray:
     """The map's clearance field without the dips where strips meet, away from any edge: packed as in `Road`.
 
     Such a dip, down to a point of clearance 0 in the middle of a junction, would be drawn as an edge.

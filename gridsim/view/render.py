@@ -21,8 +21,8 @@ import numpy as np
 
 from gridsim.car.ego import COS, SIN, STEERING, X, Y
 from gridsim.config import SimConfig, constants
+from gridsim.maps.map import Map
 from gridsim.maps.roads import CELLS_PER_M, freeze
-from gridsim.maps.scenarios import Scenario
 from gridsim.view import paint
 from gridsim.view.marks import lane_marks
 
@@ -46,7 +46,7 @@ class Renderer:
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: Map,
         size: tuple[int, int] = (640, 480),
         metres: float = 52.0,
         follow: bool = True,
@@ -315,7 +315,7 @@ def _glyphs(text: str, pixels: int) -> np.ndarray:
     return rgba.reshape(surface.get_height(), surface.get_width(), 4)[:, :, 3]
 
 
-def between(before: np.ndarray, after: np.ndarray, part: float, scenario: Scenario) -> np.ndarray:
+def between(before: np.ndarray, after: np.ndarray, part: float, scenario: Map) -> np.ndarray:
     """A state float32 [FIELDS] between two, or boxes [n, 4 or more] (x, y, cosine, sine): for pictures, not physics.
 
     Args: part in [0, 1] of the way from the first to the second, over the torus's edge where that is shorter.

@@ -1,0 +1,165 @@
+"""A map: road, lanes and traffic's network as arrays, ready to drive on, and where episodes begin on it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from gridsim.config import SimConfig
+from gridsim.jit import njit
+from gridsim.maps.network import Network, make_network, network_of_lanes
+from gridsim.maps.roads import (
+    CELLS_PER_M,
+    HEADING_BINS,
+    HEADING_WRAP,
+    START_CELLS_PER_M,
+    Lanes,
+    Road,
+    Strips,
+    freeze,
+)
+
+START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
+ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
+
+
+@dataclass(frozen=True)
+class Map:
+    """One map, ready to drive on.
+
+    Attributes:
+        name: the scenario's name in the registry.
+        seed: the seed it was built from.
+        road: what the kernels read.
+        lanes: directed polylines, for starts, traffic and drivers.
+        strips: exact geometry of the drivable area, for pictures and tests.
+        network: the lanes as traffic reads them.
+        torus: whether leaving on one side means entering on the other.
+        starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
+    """
+
+    name: str
+    seed: int
+    road: Road
+    lanes: Lanes
+    strips: Strips
+    network: Network
+    torus: bool = True
+    starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
+
+    @cached_property
+    def mileage(self) -> np.ndarray:
+        """Metres of lane before each point of `lanes`, all lanes one after another: float64 [points]."""
+        step = np.diff(self.lanes.points.astype(np.float64), axis=0)
+        length = np.hypot(step[:, 0], step[:, 1])
+        length[self.lanes.offsets[1:-1] - 1] = 0.0  # from one lane's end to the next lane's beginning is no road
+        return freeze(np.concatenate([[0.0], np.cumsum(length)]))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All of it as plain arrays, to be shared between processes without a copy."""
+        scalars = np.array([float(getattr(self.road, name)) for name in ROAD_FIELDS] + [self.seed, self.torus])
+        return {
+            "name": np.frombuffer(self.name.encode(), dtype=np.uint8),
+            "scalars": scalars,
+            "field": self.road.field,
+            "start_row": self.road.start_row,
+            "start": self.road.start,
+            **vars(self.lanes),
+            **vars(self.strips),
+            "speeds": self.network.speeds,
+            "clear": self.network.clear,
+            "room": self.network.room,
+            "starts": self.starts,
+        }
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Map:
+        """The inverse of `arrays`; arrays are used as they are, read-only."""
+        frozen = {key: freeze(value) for key, value in arrays.items()}
+        columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
+        f = np.float32
+        lanes = Lanes(**{f.name: frozen[f.name] for f in fields(Lanes)})
+        return cls(
+            name=frozen["name"].tobytes().decode(),
+            seed=int(seed),
+            road=Road(
+                frozen["field"],
+                frozen["start_row"],
+                frozen["start"],
+                np.uint32(columns),
+                np.uint32(rows),
+                f(width),
+                f(height),
+                f(low),
+                f(high),
+                np.uint32(thin),
+            ),
+            lanes=lanes,
+            strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
+            network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], frozen["room"], width, height),
+            torus=bool(torus),
+            starts=frozen["starts"],
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies are read-only, too: kernels would be compiled anew for arrays that can be written to."""
+        return Map.from_arrays, (self.arrays(),)
+
+
+def blank(config: SimConfig) -> Map:
+    """A map of 8 m x 8 m without any road: to compile kernels with, before there are maps."""
+    side = 8
+    lanes, f = Lanes.none(), np.float32
+    return Map(
+        name="blank",
+        seed=0,
+        road=Road(
+            field=freeze(np.zeros((side * CELLS_PER_M) ** 2, dtype=np.uint32)),
+            start_row=freeze(np.full((side * START_CELLS_PER_M) ** 2, -1, dtype=np.int32)),
+            start=freeze(np.zeros(HEADING_BINS + HEADING_WRAP, dtype=np.uint8)),
+            columns=np.uint32(side * CELLS_PER_M),
+            rows=np.uint32(side * CELLS_PER_M),
+            width=f(side),
+            height=f(side),
+            speed_low=f(0.0),
+            speed_high=f(1.0),
+            thin=np.uint32(1),
+        ),
+        lanes=lanes,
+        strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
+        network=make_network(lanes, side, side, 1.0, config.traffic),
+    )
+
+
+@njit
+def _starts_at(points, mileage, shares, speed, starts):
+    for k in range(shares.shape[0]):
+        metres = shares[k] * mileage[-1]
+        i = min(np.searchsorted(mileage, metres, side="right"), len(mileage) - 1) - 1
+        part = (metres - mileage[i]) / max(mileage[i + 1] - mileage[i], 1e-9)
+        x, y = points[i, 0], points[i, 1]
+        dx, dy = points[i + 1, 0] - x, points[i + 1, 1] - y
+        starts[k, 0], starts[k, 1] = x + part * dx, y + part * dy
+        starts[k, 2], starts[k, 3], starts[k, 4] = math.atan2(dy, dx), speed, 0.0
+
+
+def starts_at(scenario: Map, shares: np.ndarray) -> np.ndarray:
+    """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
+
+    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it. Of a map
+    without lanes, the starts at these shares of `Map.starts`.
+    """
+    if not len(scenario.lanes):
+        return scenario.starts[(np.asarray(shares) * len(scenario.starts)).astype(np.intp)]
+    starts = np.empty((len(shares), 5), dtype=np.float32)
+    _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, np.float32(START_SPEED), starts)
+    return starts
+
+
+def sample_starts(scenario: Map, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts float32 [count, 5] uniformly over the lanes, as `starts_at` gives them."""
+    return starts_at(scenario, rng.random(count))
