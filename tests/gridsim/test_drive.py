@@ -202,7 +202,7 @@ def start_driving(display, folder, *arguments):
     process = subprocess.Popen(
         [*COMMAND, "--scenario", "seamless", "--seed", "11", "--size", "320x240", *arguments],
         cwd=folder,
-        env={**environment, "PYTHONPATH": str(Path(__file__).parents[1])},
+        env={**environment, "PYTHONPATH": str(Path(__file__).parents[2])},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -288,7 +288,7 @@ def refused(folder, *arguments, **environment):
     done = subprocess.run(
         [*COMMAND, *arguments],
         cwd=folder,
-        env={**bare, "PYTHONPATH": str(Path(__file__).parents[1]), **environment},
+        env={**bare, "PYTHONPATH": str(Path(__file__).parents[2]), **environment},
         capture_output=True,
         text=True,
         timeout=120,

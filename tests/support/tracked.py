@@ -51,7 +51,7 @@ def tracker(uri, **options):
 
 def with_path(**more):
     """An environment in which scripts find the packages, whatever the working directory."""
-    root = str(Path(tracking.__file__).resolve().parents[1])
+    root = str(Path(tracking.__file__).resolve().parents[2])
     return {**os.environ, "PYTHONPATH": root, **more}
 
 

@@ -35,7 +35,7 @@ from gridsim.view.drive import DriveError, Recorder
 INTERVAL = REGISTRY["seamless"].speed_interval
 TOP = top_speed(INTERVAL, ReferenceConfig())
 NOBODY = np.zeros((0, FIELDS), dtype=np.float32)
-CHAMPION = Path(__file__).parents[1] / "benchmarks" / "champion.npz"
+CHAMPION = Path(__file__).parents[2] / "benchmarks" / "champion.npz"
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ from gridsim.maps.scenarios import build
 from gridsim.view.drive import Recorder, pose, unhurried
 from gridsim.view.render import Renderer
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SMALL = ["--workers", "0", "--population", "48", "--generations", "4", "--seed", "5"]
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import wait_until
+from commands import importable, wait_until
 from test_pool import (
     MAPS,
     Answering,
@@ -103,7 +103,7 @@ class Unfit(Answering):
 def _stand_ins_can_be_imported() -> Iterator[None]:
     """By the workers too, which know nothing of pytest's search path."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        patch.setenv("PYTHONPATH", importable(__file__))
         yield
 
 
@@ -422,7 +422,7 @@ def test_workers_that_cannot_start_are_given_up() -> None:
 def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
     cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    address, _ = cluster(2, PYTHONPATH=str(Path(__file__).parent))
+    address, _ = cluster(2, PYTHONPATH=importable(__file__))
     for name in (address, "auto"):
         monkeypatch.setenv("RAY_ADDRESS", address)
         with contextlib.closing(RayPool(4, never_built, name, worker_factory=Answering)) as pool:
@@ -446,7 +446,7 @@ def test_a_cluster_is_told_how_a_run_is_doing(
     quick = {"RAY_metrics_report_interval_ms": "500"}
     for name, value in quick.items():
         monkeypatch.setenv(name, value)
-    address, _ = cluster(2, PYTHONPATH=str(Path(__file__).parent), **quick)
+    address, _ = cluster(2, PYTHONPATH=importable(__file__), **quick)
     with contextlib.closing(RayPool(1, never_built, address, worker_factory=Stepping, run="a run")) as pool:
         pool.evaluate(make_task(), make_recipes(512))
         os.kill(pool.pids()[0], signal.SIGKILL)

@@ -115,3 +115,9 @@ def end(node: subprocess.Popen) -> None:
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.kill()
     node.wait()
+
+
+def importable(test):
+    """A PYTHONPATH with which workers can import what is defined in a test's file (`__file__`)."""
+    folders = [Path(test).parent, Path(__file__).parent, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return os.pathsep.join(map(str, folders))

@@ -335,9 +335,10 @@ def test_git_commit(tmp_path, monkeypatch):
         return done.stdout.strip()
 
     for place in ("repository", "repository/.venv/site-packages", "outside"):
-        (tmp_path / place / "cluster").mkdir(parents=True)
-        (tmp_path / place / "cluster" / "__init__.py").touch()
-        shutil.copy(cluster.tracking.commit.__file__, tmp_path / place / "cluster")
+        (tmp_path / place / "cluster" / "tracking").mkdir(parents=True)
+        for folder in ("cluster", "cluster/tracking"):
+            (tmp_path / place / folder / "__init__.py").touch()
+        shutil.copy(cluster.tracking.commit.__file__, tmp_path / place / "cluster" / "tracking")
     assert told(tmp_path / "outside") == "unknown"
     git("init")
     assert told(tmp_path / "repository") == "unknown"

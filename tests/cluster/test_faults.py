@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import BIN, all_in_mlflow, end, finish, ray_workers, rows, start, summary, wait_until
+from commands import BIN, all_in_mlflow, end, finish, importable, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
 from cluster.runs.settings import EvolveSettings
@@ -41,7 +41,7 @@ SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5"]
 @pytest.fixture(scope="module", autouse=True)
 def _stand_ins_can_be_imported() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]))
+        patch.setenv("PYTHONPATH", importable(__file__))
         yield
 
 
