@@ -25,8 +25,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from cluster.commands import cli
-from cluster.commands import common as command
+from cluster.commands import cli, common
 from cluster.runs.settings import DqnSettings, EvolveSettings
 from cluster.workers.kernels import everything_by_default
 from gridsim.maps.scenarios import REGISTRY
@@ -236,7 +235,7 @@ def test_the_guides_commands_are_read_by_the_real_parser() -> None:
     commands = re.findall(r"gridsim-evolve ([^`\n]*)", text.replace("\n", " \n"))
     assert len(commands) >= 3
     for line in commands:
-        command.parse(cli.EvolveFlags, "gridsim-evolve", shlex.split(line.replace("$WORKERS", "8")))
+        common.parse(cli.EvolveFlags, "gridsim-evolve", shlex.split(line.replace("$WORKERS", "8")))
     for option in re.findall(r"--file (\S+)", text):
         assert (ROOT / option).is_file()
 

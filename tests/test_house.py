@@ -1,9 +1,11 @@
-"""The house rules: who may import whom, what sits behind one file, and what a worker's process may carry."""
+"""The house rules: who may import whom, what sits behind one file, how large a file and a folder may be."""
 
 import ast
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,8 @@ BEHIND = {
 NOT_IN = {"gridsim": {"ray", "mlflow", "torch", "tyro", "rich"}, "evolution": {"ray", "mlflow", "tyro", "rich"}}
 # Elsewhere torch is imported inside functions only: it costs seconds, and 200 MB in each worker.
 TORCH_AT_IMPORT = {"evolution/dqn/learner.py"}
+
+MOST_MODULES, MOST_LINES = 14, 500  # of a folder, and of a file
 
 
 def imported(tree: ast.Module) -> Iterator[tuple[str, int, bool]]:
@@ -64,6 +68,43 @@ def test_package_keeps_the_rules(root: Path, package: str) -> None:
     files = sorted((root / package).rglob("*.py"))
     assert files, f"{package}/ is missing or empty"
     assert [b for f in files for b in breaches(f.relative_to(root).as_posix(), f.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize("package", RANK)
+def test_files_and_folders_stay_small(root: Path, package: str) -> None:
+    files = sorted((root / package).rglob("*.py"))
+    assert [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > MOST_LINES] == []
+    modules = Counter(f.parent.relative_to(root).as_posix() for f in files if f.name != "__init__.py")
+    assert [folder for folder, count in modules.items() if count > MOST_MODULES] == []
+
+
+def own_imports(root: Path) -> dict[str, set[str]]:
+    """For each module those of the project's that it imports, at once or later."""
+    files = [f for package in RANK for f in (root / package).rglob("*.py")]
+    names = {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
+    found: dict[str, set[str]] = {}
+    for name, file in names.items():
+        asked: set[str] = set()
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                asked |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                asked |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        found[name] = (asked & names.keys()) - {name}
+    return found
+
+
+def test_no_files_import_each_other_in_a_circle(root: Path) -> None:
+    TopologicalSorter(own_imports(root)).prepare()  # raises CycleError, which names them
+
+
+def test_a_circle_is_found(tmp_path: Path) -> None:
+    for package in RANK:
+        (tmp_path / package).mkdir()
+    (tmp_path / "gridsim" / "a.py").write_text("def f():\n    from gridsim import b")
+    (tmp_path / "gridsim" / "b.py").write_text("from gridsim.a import f")
+    with pytest.raises(CycleError):
+        TopologicalSorter(own_imports(tmp_path)).prepare()
 
 
 @pytest.mark.parametrize(

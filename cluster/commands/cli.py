@@ -271,7 +271,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         flags, run = _prepare(kind, arguments)
         from cluster.runs.run import is_finished, make_tracker
         from cluster.training.trainer import Maps
-        from cluster.workers import kernels as warm
+        from cluster.workers import kernels
         from cluster.workers.ray_pool import RayPool, check_address
         from gridsim.config import SimConfig
 
@@ -304,7 +304,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         with stoppable():
             maps = Maps(run.settings.scenario, SimConfig())
             closing.callback(maps.close)
-            warming = warm.begin(run.settings)
+            warming = kernels.begin(run.settings)
             closing.callback(warming.stop)
             pool: WorkerPool = SerialPool(maps.build)
             if flags.workers:
@@ -355,10 +355,10 @@ def _run(
 ) -> str:  # fmt: skip
     """Learn and finish. Returns the closing words."""
     from cluster.commands import progress
-    from cluster.report import pictures as report
+    from cluster.report import pictures
     from cluster.runs.champion import load_champion
     from cluster.runs.run import Session
-    from cluster.workers import kernels as warm
+    from cluster.workers import kernels
 
     initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
     session = Session(run, pool, maps, tracker, started, initial)
@@ -367,7 +367,7 @@ def _run(
         with console.status("compiling the simulator for this machine, once (some 10 s)"):
             warming.wait()
     maps.ahead(session.learning.curriculum.map_seeds[:3])
-    warm.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
+    kernels.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
     run.write_config()
     with progress.Progress(console, session, typed(run.path)) as bar:
         session.on_row = bar.row
@@ -376,7 +376,7 @@ def _run(
         summary = session.complete(flags.workers, bar.note)
     if session.lost:
         print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
-    console.print(report.held_out_table("The champion on held-out drives", summary["held_out"]))
+    console.print(pictures.held_out_table("The champion on held-out drives", summary["held_out"]))
     found = "solved" if summary["solved"] else "the best so far"
     name = session.learning.step_name
     return (

@@ -303,10 +303,10 @@ class Results:
 
     def write(self) -> None:
         """Write tables and pictures."""
-        from cluster.report import pictures as report
+        from cluster.report import pictures
 
         self.write_tables()
-        report.comparison(self.groups, self.path / PICTURE)
+        pictures.comparison(self.groups, self.path / PICTURE)
         drives = {}
         for learner in ("evolution", "dqn"):
             runs = self._on_seamless(learner)
@@ -316,7 +316,7 @@ class Results:
         if drives:
             compared = {group.learner for group in self.groups if group.scenario == "seamless"}
             missing = [name for learner, name in tables.NAMES.items() if learner in compared - set(drives)]
-            report.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, _route_title(drives, missing))
+            pictures.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, _route_title(drives, missing))
 
     def _on_seamless(self, learner: str) -> list[Run]:
         """The learner's runs there: the one whose velocity error is the median first."""

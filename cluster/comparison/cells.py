@@ -17,7 +17,7 @@ from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, m
 from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
 from cluster.tracking.mlflow_run import Status
 from cluster.training.trainer import Maps
-from cluster.workers import kernels as warm
+from cluster.workers import kernels
 from cluster.workers.pool import PoolError, SerialPool, WorkerPool
 from evolution.episodes.curriculum import CrashError
 from gridsim.config import SimConfig
@@ -29,7 +29,7 @@ EVALUATIONS = 10  # of the DQN at least, since a budget of car-steps is looked a
 
 @dataclass
 class Cells:
-    """Executes cells: an `experiment.Execute`.
+    """Executes cells: an `plan.Execute`.
 
     Attributes:
         workers, address, tracking_uri, experiment: as the command has them.
@@ -81,7 +81,7 @@ class Cells:
     def _train(self, cell: Cell, run: RunFolder) -> dict[str, Any]:
         settings = run.settings
         self._maps = maps = Maps(settings.scenario, SimConfig())
-        warming = warm.begin(settings)
+        warming = kernels.begin(settings)
         tracker = make_tracker(run, self.tracking_uri, self.experiment, self.parent_id)
         status: Status = "KILLED"
         try:
@@ -96,7 +96,7 @@ class Cells:
             if warming.processes:
                 self.note("compiling the simulator for this machine, once")
             warming.wait()
-            warm.compile_kernels(settings.policy, settings.traffic, settings.command)
+            kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
             run.path.mkdir(parents=True, exist_ok=True)
             run.write_config()
             session.process_started = time.perf_counter()  # a budget is of learning, not of what is loaded for it

@@ -29,7 +29,7 @@ from cluster.runs import checkpoint
 from cluster.runs.champion import Champion
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
 from cluster.runs.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
-from cluster.tracking import description as tracking_run
+from cluster.tracking import description
 from cluster.tracking.address import TrackingError
 from cluster.tracking.tracker import Tracker
 from cluster.training.evolution import Evolution
@@ -168,7 +168,7 @@ def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init
     """A new run's folder, checked but not yet made. Raises RunError."""
     if not name:
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        name = f"{tracking_run.what(settings)}-{stamp}"
+        name = f"{description.what(settings)}-{stamp}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
@@ -238,7 +238,7 @@ class Session:
     def __post_init__(self) -> None:
         self.learning = new_learning(self.run.settings, self.pool, self.maps, self.initial, self.on_progress)
         self._digest = self.run.digest()
-        self._bests = tracking_run.Bests()
+        self._bests = description.Bests()
         if self.run.saved is not None:
             self.learning.restore(*self.run.saved)
 
@@ -305,7 +305,7 @@ class Session:
 
         Returns: the summary.
         """
-        from cluster.report import pictures as report
+        from cluster.report import pictures
 
         learning, path = self.learning, self.run.path
         learning.conclude()
@@ -321,12 +321,12 @@ class Session:
         scenario, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
         with self._filmed(seed, start, world, f"{champion.scenario}, held-out map {scenario.seed:,}"):
             figures = learning.held_out()
-            self.tracker.log_model(path, tracking_run.torch_model(champion, settings, figures))  # while it is drawn
-            report.curves(learning.history, path / "curves.png", learning.step_name)
+            self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # while it is drawn
+            pictures.curves(learning.history, path / "curves.png", learning.step_name)
             result, states, _ = drive_trajectory(
                 learning.spec, champion.genome, scenario, start, learning.curriculum.goal_limits(), learning.sim, world
             )
-            report.trajectory(
+            pictures.trajectory(
                 scenario, states, path / "trajectory.png",
                 f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
             )  # fmt: skip
@@ -348,7 +348,7 @@ class Session:
             "lost_chunks": learning.lost_chunks,
             "held_out": figures,
         }
-        self.tracker.log_summary(tracking_run.held_out_metrics(figures))
+        self.tracker.log_summary(description.held_out_metrics(figures))
         write_summary(self.run.path, summary)
         return summary
 
@@ -362,7 +362,7 @@ class Session:
             with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
                 summary["mlflow_run_id"] = self.tracker.wait_ready(30.0)
         write_summary(self.run.path, summary)
-        self.tracker.describe(tracking_run.describe(self.run, summary))
+        self.tracker.describe(description.describe(self.run, summary))
         self.tracker.log_artifacts(self.run.path)
         return summary
 
@@ -398,11 +398,11 @@ class Session:
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:
     """The run's tracker, not yet started; `parent_id` is MLflow's run that it belongs to. `more` is the Tracker's."""
     known = run.saved[1]["tracking"] if run.saved else {}
-    tags = tracking_run.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
+    tags = description.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(
-        uri, experiment, tracking_run.title(run.name, run.settings), tracking_run.params(run.settings), tags,
+        uri, experiment, description.title(run.name, run.settings), description.params(run.settings), tags,
         run_id=known.get("run_id") if known.get("uri") == uri else None,
-        key=run.tracking_key, start=False, note=tracking_run.describe(run), **more,
+        key=run.tracking_key, start=False, note=description.describe(run), **more,
     )  # fmt: skip
 
 

@@ -85,7 +85,7 @@ class Identity:
     """Which run is meant, and what a new one begins with.
 
     Attributes:
-        uri: what `tracking_address.check_uri` returned.
+        uri: what `address.check_uri` returned.
         experiment: name of MLflow's experiment.
         name: of the run.
         params, tags: its parameters and tags.

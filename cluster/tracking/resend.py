@@ -13,7 +13,7 @@ from cluster.comparison.results import ExperimentError, part, read_json
 from cluster.runs.champion import load_champion
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import CHAMPION, NOT_LOGGED, SUMMARY, RunFolder, make_tracker, write_summary
-from cluster.tracking import description as tracking_run
+from cluster.tracking import description
 from cluster.tracking.address import TrackingError, check_uri
 
 WAIT_S = 60.0  # for MLflow to be there, and then for it to have everything
@@ -42,16 +42,16 @@ def _send(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
     path = run.path / SUMMARY
     summary = read_json(path)
     held_out = part(summary, "held_out", path)
-    model = tracking_run.torch_model(load_champion(run.path / CHAMPION), run.settings, held_out)
-    note = tracking_run.describe(run, summary)
+    model = description.torch_model(load_champion(run.path / CHAMPION), run.settings, held_out)
+    note = description.describe(run, summary)
     history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
     ended = path.stat().st_mtime
     tracker = make_tracker(run, uri, experiment, late=True, started=_ms(ended - summary["wall_s"]))
-    bests, age, last = tracking_run.Bests(), time.time() - ended, history[-1]["wall_s"]
+    bests, age, last = description.Bests(), time.time() - ended, history[-1]["wall_s"]
     for step, row in enumerate(history):
         metrics = {name: value for name, value in row.items() if name not in NOT_LOGGED}
         tracker.log_row(step, metrics | bests(row), age + last - row["wall_s"])
-    tracker.log_summary(tracking_run.held_out_metrics(held_out), ago_s=age)
+    tracker.log_summary(description.held_out_metrics(held_out), ago_s=age)
     try:
         run_id = tracker.wait_ready(WAIT_S)
     except TrackingError:

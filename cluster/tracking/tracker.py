@@ -4,7 +4,7 @@ MLflow takes two seconds to import and to open its store, and milliseconds a row
 thread that is fed through a queue. What cannot be logged is kept, tried again, and in the end reported; it never stops
 a run. Every row is logged once: a resumed run asks MLflow what it has, and a request whose answer was lost is
 repeated with the same timestamps, which MLflow recognises. Nothing is kept for MLflow alone: the checkpoint holds the
-history and the run's folder the files, so that whoever opens the run again can send what is missing (`late.send`).
+history and the run's folder the files, so that whoever opens the run again can send what is missing (`resend.send`).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Tracker:
 
     On resume hand over the whole history: what MLflow has is skipped. What a resumed run says differently (a larger
     number of generations, another commit) is added as tag `resumed/<name>`, as MLflow lets no parameter change. With
-    `late` nothing but what is missing is logged (`tracking.Identity`).
+    `late` nothing but what is missing is logged (`mlflow_run.Identity`).
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class Tracker:
     def log_artifacts(self, folder: str | os.PathLike[str]) -> None:
         """Queue every file under `folder` but hidden ones; they have to stay as they are until `close` returns.
 
-        A model in it (`tracking.MODEL`) is left to `log_model`.
+        A model in it (`mlflow_run.MODEL`) is left to `log_model`.
         """
         folder = Path(folder).resolve()
         found = []

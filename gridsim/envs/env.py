@@ -1,7 +1,6 @@
 """Gymnasium: the native vector environment, and the single environment, which is the same thing with one car.
 
-Importing this file registers an id for each scenario, `GridSim/Seamless-v0` and so on; Gymnasium imports it by itself
-for `gymnasium.make("gridsim.envs.env:GridSim/Seamless-v0")`. (It reads no plugins' entry points since its 1.0.)
+`import gridsim` registers an id for each scenario, `GridSim/Seamless-v0` and so on.
 
 Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s, and with
 `motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s, and with
@@ -35,7 +34,7 @@ from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
-from gridsim.maps.scenarios import REGISTRY, TRAINING_SEED, build, check_name, default_traffic, is_map_file, map_of
+from gridsim.maps.scenarios import TRAINING_SEED, build, check_name, default_traffic, is_map_file, map_of
 from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 from gridsim.traffic.world import LANE
 
@@ -474,17 +473,3 @@ class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
     @staticmethod
     def _own(info: dict[str, Any]) -> dict[str, Any]:
         return {key: value[0].item() for key, value in info.items() if not key.startswith("_")}
-
-
-def env_id(scenario: str) -> str:
-    """Gymnasium's id of a scenario: `GridSim/Seamless-v0`."""
-    return f"GridSim/{''.join(part.capitalize() for part in scenario.split('_'))}-v0"
-
-
-for _name in REGISTRY:
-    gymnasium.register(
-        id=env_id(_name),
-        entry_point="gridsim.envs.env:GridSimEnv",
-        vector_entry_point="gridsim.envs.env:GridSimVectorEnv",
-        kwargs={"scenario": _name},
-    )

@@ -18,7 +18,7 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, ranges, closing):
     """Shorten ranges (m) to the first box of a world that each ray meets: slab test (Kay and Kajiya 1986).
 
-    Args: fan of `sensors.fan`; sides of the torus, m; the sensor's position (m), heading and speed (m/s) along it;
+    Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading and speed (m/s) along it;
     world of `world`.
     Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the relative speed (m/s) at which a car that
     a ray has met and the sensor come closer along it, as a radar tells; 0 where that is the road's edge.

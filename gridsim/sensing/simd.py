@@ -1,4 +1,4 @@
-"""Vector code for `sensors.march`: 32 rays in lockstep, emitted as LLVM vectors.
+"""Vector code for `rays.march`: 32 rays in lockstep, emitted as LLVM vectors.
 
 The arithmetic of the plain kernel in `sensors`; tests hold one against the other. The lanes go in lockstep: one that
 has arrived goes on refining while others march, which the plain kernel's do not. LLVM turns the vectors of 32

@@ -92,8 +92,9 @@ def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path):
     code = "import conftest, os, pathlib, gridsim.jit as jit; print(pathlib.Path.home(), jit.CACHE_FOLDER, *os.environ)"
     shell = {"HOME": str(tmp_path), "RAY_ADDRESS": "x", "RAY_AUTH_MODE": "token", "MLFLOW_TRACKING_URI": "x"}
     env = {name: value for name, value in os.environ.items() if name not in ("XDG_CACHE_HOME", "GRIDSIM_CACHE_DIR")}
+    env["PYTHONPATH"] = f"{root / 'tests'}{os.pathsep}{root / 'tests/support'}"
     home, cache, *names = subprocess.run(
-        [sys.executable, "-c", code], cwd=root / "tests", env=env | shell, check=True, capture_output=True, text=True
+        [sys.executable, "-c", code], cwd=root, env=env | shell, check=True, capture_output=True, text=True
     ).stdout.split()
     assert not Path(home).is_relative_to(tmp_path)
     assert Path(cache).is_relative_to(tmp_path / ".cache"), "kernels are compiled once for all sessions"

@@ -13,7 +13,7 @@ from rich.console import Console
 from cluster.commands.compare import Results, _route_title
 from cluster.comparison import tables
 from cluster.comparison.plan import Budget, Plan
-from cluster.report import pictures as report
+from cluster.report import pictures
 from cluster.training.evolution import COLUMNS
 from gridsim.maps.scenarios import REGISTRY
 
@@ -104,8 +104,8 @@ def test_picture_shows_who_was_compared(tmp_path):
         return (np.abs(pixels - wanted).max(axis=2) < 6).sum() > 500
 
     groups = experiment_of(2)
-    report.comparison(groups, tmp_path / "two.png")
-    report.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
+    pictures.comparison(groups, tmp_path / "two.png")
+    pictures.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
     assert has(tmp_path / "two.png", evolution)
     assert has(tmp_path / "two.png", dqn)
@@ -119,9 +119,9 @@ def test_the_route_tells_who_is_not_drawn():
 
 
 def test_curves_call_each_figure_by_one_name(tmp_path, monkeypatch):
-    figure, axes = report._figure(15, 3.8, 4)
-    monkeypatch.setattr(report, "_figure", lambda *shape: (figure, axes))
-    report.curves([dict.fromkeys(COLUMNS, 0.5)] * 2, tmp_path / "curves.png", "generation")
+    figure, axes = pictures._figure(15, 3.8, 4)
+    monkeypatch.setattr(pictures, "_figure", lambda *shape: (figure, axes))
+    pictures.curves([dict.fromkeys(COLUMNS, 0.5)] * 2, tmp_path / "curves.png", "generation")
     assert [[text.get_text() for text in axis.get_legend().get_texts()] for axis in axes] == [
         ["leader", "members, mean", "members, standard deviation"],
         ["members, episode length", "leader", "members, mean"],

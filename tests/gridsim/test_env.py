@@ -1,6 +1,8 @@
 """The Gymnasium environments: exact seeding, how episodes end, wrappers, and errors that can be read."""
 
 import re
+import subprocess
+import sys
 from typing import Any
 
 import gymnasium
@@ -14,17 +16,18 @@ from gymnasium.wrappers.vector import FlattenObservation as FlattenAll
 
 from evolution.episodes.rollout import EPISODE, Limits, evaluate
 from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size
+from gridsim import ENVIRONMENTS
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map, sample_starts, starts_at
 from gridsim.maps.roads import clearance, freeze
 from gridsim.maps.scenarios import REGISTRY, build
 
 SPEC = PolicySpec.parse("mlp:6,7")
-IDS = [env_id(name) for name in REGISTRY]
+IDS = list(ENVIRONMENTS)
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +80,14 @@ def test_make_vec_gives_the_native_environment(name: str) -> None:
     assert rewards.shape == (3,)
 
 
-def test_an_id_is_the_scenario_in_camel_case() -> None:
-    assert env_id("seamless") == "GridSim/Seamless-v0"
-    assert env_id("one_two") == "GridSim/OneTwo-v0"
+def test_every_scenario_has_an_id() -> None:
+    assert list(ENVIRONMENTS.values()) == list(REGISTRY)
+
+
+def test_importing_gridsim_registers_and_loads_no_numba() -> None:
+    code = "import sys, gridsim, gymnasium; print('GridSim/City-v0' in gymnasium.registry, 'numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == ["True", "False"]
 
 
 def test_observations_are_ranges_and_speed(maps: list[Map]) -> None:

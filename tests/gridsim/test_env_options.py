@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from gridsim.car.ego import DISTANCE, SPEED
 from gridsim.car.vehicle import Action
-from gridsim.envs.env import GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.simulator import views
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import REGISTRY
@@ -34,12 +34,13 @@ def test_gymnasiums_checker_passes(
     options: dict[str, Any] = {"observation": observation, "frames": frames, "actions": actions}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(gymnasium.make(env_id(name), maps=maps[name][:1], **options).unwrapped)
+        check_env(gymnasium.make(f"GridSim/{name.capitalize()}-v0", maps=maps[name][:1], **options).unwrapped)
 
 
 @pytest.mark.parametrize(("observation", "frames"), SENSING)
 def test_spaces_are_those_of_the_options(observation: str, frames: int) -> None:
-    env = gymnasium.make_vec(env_id("city"), num_envs=2, observation=observation, frames=frames, actions="continuous")
+    options: Any = {"observation": observation, "frames": frames, "actions": "continuous"}
+    env = gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options)
     shape = {"rays": (32,), "grid": (CELLS, CELLS) if frames == 1 else (frames, CELLS, CELLS)}[observation]
     assert env.single_observation_space.shape == shape
     assert env.single_observation_space.dtype == (np.float32 if observation == "rays" else np.uint8)
@@ -53,7 +54,7 @@ def test_spaces_are_those_of_the_options(observation: str, frames: int) -> None:
 def test_traffic_is_the_scenarios_unless_given() -> None:
     for name, spec in REGISTRY.items():
         assert GridSimVectorEnv(1, scenario=name, maps=1).simulator.state.worlds.shape[1] == spec.traffic
-    assert gymnasium.make(env_id("city"), maps=1, traffic=2).unwrapped.cars.traffic == 2  # type: ignore[attr-defined]
+    assert gymnasium.make("GridSim/City-v0", maps=1, traffic=2).unwrapped.cars.traffic == 2  # type: ignore[attr-defined]
 
 
 # --- seeds

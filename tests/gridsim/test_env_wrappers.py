@@ -14,7 +14,7 @@ from gymnasium.wrappers import FlattenObservation, FrameStackObservation, Record
 from gymnasium.wrappers import vector as wrappers
 
 from gridsim.car.vehicle import Action
-from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv, env_id
+from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
 from gridsim.maps.map import Map
 from gridsim.view.render import NoDisplayError
 
@@ -89,7 +89,7 @@ def film(path: Path) -> tuple[int, float]:
 
 
 def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path) -> None:
-    env: Any = gymnasium.make(env_id("city"), maps=1, render_mode="rgb_array", max_episode_steps=12)
+    env: Any = gymnasium.make("GridSim/City-v0", maps=1, render_mode="rgb_array", max_episode_steps=12)
     env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
     steps = []
     for seed in (0, None):
@@ -105,7 +105,8 @@ def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_pa
 
 
 def test_record_video_works_on_the_vector_environment(tmp_path: Path) -> None:
-    env: Any = gymnasium.make_vec(env_id("highway"), num_envs=2, maps=1, render_mode="rgb_array", max_episode_steps=6)
+    options: Any = {"maps": 1, "render_mode": "rgb_array", "max_episode_steps": 6}
+    env: Any = gymnasium.make_vec("GridSim/Highway-v0", num_envs=2, **options)
     env = wrappers.RecordVideo(env, str(tmp_path / "films"), video_aspect_ratio=(2, 1), episode_trigger=lambda _: True)
     env.reset(seed=0)
     for _ in range(6 + 1 + 4):  # an episode, the step that begins the next one, and some of that one
@@ -122,9 +123,9 @@ def test_record_video_works_on_the_vector_environment(tmp_path: Path) -> None:
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 def test_wrappers_of_a_single_environment(observation: str, frames: int, actions: str) -> None:
     options: dict[str, Any] = {"maps": 1, "observation": observation, "frames": frames, "actions": actions}
-    plain = gymnasium.make(env_id("city"), **options)
+    plain = gymnasium.make("GridSim/City-v0", **options)
     env: Any = RecordEpisodeStatistics(
-        FrameStackObservation(FlattenObservation(gymnasium.make(env_id("city"), **options)), 3)
+        FrameStackObservation(FlattenObservation(gymnasium.make("GridSim/City-v0", **options)), 3)
     )
     first, _ = plain.reset(seed=2)
     seen, _ = env.reset(seed=2)
@@ -150,7 +151,7 @@ def side_by_side(
 
     `inner` turns the actions that the wrapped one is given into those of the plain one.
     """
-    made: list[Any] = [gymnasium.make_vec(env_id("city"), num_envs=3, maps=1, **options) for _ in range(2)]
+    made: list[Any] = [gymnasium.make_vec("GridSim/City-v0", num_envs=3, maps=1, **options) for _ in range(2)]
     env, plain = wrap(made[0]), made[1]
     theirs, ours = [plain.reset(seed=3)], [env.reset(seed=3)]
     for row in drive(made[1].unwrapped, steps, seed=4):
@@ -206,7 +207,7 @@ def test_vector_wrappers_of_actions() -> None:
         for mine, plain in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(mine[0], plain[0], atol=1e-3)
     # Beyond the limits it is clipped, and not refused.
-    env = wrappers.ClipAction(gymnasium.make_vec(env_id("city"), num_envs=2, maps=1, **continuous))
+    env = wrappers.ClipAction(gymnasium.make_vec("GridSim/City-v0", num_envs=2, maps=1, **continuous))
     env.reset(seed=0)
     *_, info = env.step(np.array([[7.0, 0.0], [1.0, 0.0]], dtype=np.float32))
     np.testing.assert_allclose(info["speed_mps"], 0.3, atol=1e-6)
@@ -247,7 +248,7 @@ def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
 
 def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Map]]) -> None:
     """Gymnasium copies what it is given; a kernel takes arrays that can be written to for another type."""
-    spec = gymnasium.make(env_id("city"), maps=maps["city"][:1]).spec
+    spec = gymnasium.make("GridSim/City-v0", maps=maps["city"][:1]).spec
     assert spec is not None
     copied = spec.make().unwrapped.cars.simulator.scenarios[0]  # type: ignore[attr-defined]
     assert copied.seed == maps["city"][0].seed

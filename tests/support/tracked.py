@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from cluster.tracking import mlflow_run as tracking
+from cluster.tracking import mlflow_run
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.tracker import Tracker
 
@@ -24,7 +24,7 @@ def row(step):
 
 def client(uri):
     """MLflow's own."""
-    tracking.quiet()
+    mlflow_run.quiet()
     from mlflow.tracking import MlflowClient
 
     return MlflowClient(tracking_uri=uri)
@@ -51,7 +51,7 @@ def tracker(uri, **options):
 
 def with_path(**more):
     """An environment in which scripts find the packages, whatever the working directory."""
-    root = str(Path(tracking.__file__).resolve().parents[2])
+    root = str(Path(mlflow_run.__file__).resolve().parents[2])
     return {**os.environ, "PYTHONPATH": root, **more}
 
 
