@@ -14,7 +14,7 @@ import pytest
 RANK = {"gridsim": 0, "evolution": 1, "cluster": 2}
 # The only files that may import these, anywhere in them.
 BEHIND = {
-    "ray": {"cluster/workers/ray_pool.py"},
+    "ray": {"cluster/workers/ray_pool.py", "cluster/workers/ray_session.py"},
     "mlflow": {"cluster/tracking/mlflow_run.py"},
     "pygame": {"gridsim/view/render.py", "gridsim/view/drive.py"},
 }

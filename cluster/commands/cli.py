@@ -272,7 +272,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         from cluster.runs.run import is_finished, make_tracker
         from cluster.training.trainer import Maps
         from cluster.workers import kernels
-        from cluster.workers.ray_pool import RayPool, check_address
+        from cluster.workers.ray_pool import RayPool
+        from cluster.workers.ray_session import check_address
         from gridsim.config import SimConfig
 
         if is_finished(run):

@@ -1,9 +1,9 @@
-"""A pool of Ray actors, on a Ray of its own or on an existing cluster. The only file that imports Ray.
+"""A pool of Ray actors, on a Ray of its own or on an existing cluster.
 
 What differs from Ray's own habits, and why:
 
 * A Ray of our own goes without dashboard server, autoscaler monitor and log monitor, none of which a run uses: they
-  cost a second at the start, another one at the end, and 1.5 core-seconds of the workers' time (`_lean_head`).
+  cost a second at the start, another one at the end, and 1.5 core-seconds of the workers' time (`ray_session`).
 * Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the kernel
   kills Ray's processes when their parent *thread* dies, and so they die with us whatever kills us.
 * Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
@@ -14,7 +14,6 @@ What differs from Ray's own habits, and why:
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import logging
 import os
@@ -28,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from cluster.workers import shipping
 from cluster.workers.actor import Actor, Name, Shared
 from cluster.workers.dispatch import BACKOFF_S, MAX_KILLS, Dispatch
 from cluster.workers.pool import (
@@ -54,23 +52,16 @@ from cluster.workers.pool import (
     new_outcome,
 )
 from cluster.workers.ray_address import (
-    AUTH_ENVIRONMENT,
     ENVIRONMENT,
-    LEAN,
-    OWN_ENVIRONMENT,
     STORE_BYTES,
-    TOKEN,
     abandon,
     end_at_once,
-    environment,
-    has_token,
-    lean_head,
     no_interrupt,
-    probe,
     store_bytes,
 )
 from cluster.workers.ray_errors import failed_as_it_began, is_to_blame, reason
 from cluster.workers.ray_metrics import RunMetrics
+from cluster.workers.ray_session import capacity, check_address, forget_token, join, start_own
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import Limits
 
@@ -227,7 +218,7 @@ class RayPool:
             if self.pids():
                 nobody_since = time.monotonic()
             elif time.monotonic() - nobody_since > self._patience_s:
-                why = _capacity() + self._last_words
+                why = capacity() + self._last_words
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
         if whole > 0.0:
@@ -338,7 +329,7 @@ class RayPool:
                 for slot in self._slots:
                     self._kill(slot)
                 ray.shutdown(wait_for_processes=True)
-                _forget_token()
+                forget_token()
                 if self._session and not self._troubled:
                     shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never clears up its logs
             self._slots = []
@@ -363,9 +354,9 @@ class RayPool:
             if self.address is None:
                 store = store_bytes()
                 map_bytes = store * MAP_BYTES // STORE_BYTES
-                self._session = _start_own(self._asked, store)
+                self._session = start_own(self._asked, store)
             else:
-                _join(self.address)
+                join(self.address)
             self._connected = True
             end_at_once()
             self._shared = Shared(ray.put, self._build_map, map_bytes)
@@ -430,86 +421,3 @@ class RayPool:
 
     def _logs(self) -> str:
         return f" (logs: {self._session}/logs)" if self._session else ""
-
-
-def check_address(address: str) -> str:
-    """The `host:port` of the Ray cluster meant by `address` (`host:port`, or `auto`: RAY_ADDRESS, else this machine's).
-
-    Raises PoolError, one line, within 3 s where no Ray answers or it would not let us in. (Ray itself would try for
-    20 s to minutes, and print a warning for each second.)
-    """
-    if address == "auto":
-        address = os.environ.get("RAY_ADDRESS") or "auto"
-    if address == "auto":
-        logging.getLogger("ray").setLevel(logging.CRITICAL)
-        services = importlib.import_module("ray._private.services")
-        try:
-            address = services.canonicalize_bootstrap_address("auto")
-        except ConnectionError:
-            raise PoolError(
-                "no Ray cluster runs on this machine; start one with `ray start --head`, or give its host:port"
-            ) from None
-    probe(address)
-    return address
-
-
-def _start_own(workers: int, store_bytes: int) -> str:
-    """Start Ray on this machine with one CPU for each worker; returns the folder of its logs."""
-    import ray
-
-    if not any(name in os.environ for name in AUTH_ENVIRONMENT):
-        # Ray listens on all interfaces and lets in who has its token. One of our own need not outlive the run in
-        # ~/.ray, where it would change what `ray start` does from then on.
-        os.environ["RAY_AUTH_TOKEN"] = TOKEN
-    with environment(OWN_ENVIRONMENT), _lean_head():
-        context: Any = ray.init(
-            address="local",  # whatever RAY_ADDRESS says
-            num_cpus=workers,
-            num_gpus=0,
-            object_store_memory=store_bytes,
-            include_dashboard=False,
-            log_to_driver=False,
-            logging_level=logging.CRITICAL,
-        )
-    return context.address_info["session_dir"]
-
-
-def _join(address: str) -> None:
-    """Connect to a cluster that was found to let us in."""
-    import ray
-
-    if has_token(address.rpartition(":")[0]):
-        with contextlib.suppress(ImportError, AttributeError):  # what Ray does where it is asked to find the cluster
-            setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
-            setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
-    with environment(shipping.ENVIRONMENT):
-        env = shipping.runtime_env()
-        ray.init(address=address, runtime_env=env, log_to_driver=False, logging_level=logging.CRITICAL)
-
-
-def _lean_head() -> contextlib.AbstractContextManager[None]:
-    """Start Ray's head without the helpers that a run has no use for; with them where this version is another."""
-    with contextlib.suppress(ImportError, AttributeError, TypeError):
-        node, parameter = (importlib.import_module(f"ray._private.{name}") for name in ("node", "parameter"))
-        parameter.RayParams(**LEAN)
-        return lean_head(node.Node, parameter)
-    return contextlib.nullcontext()
-
-
-def _forget_token() -> None:
-    """Leave Ray and the environment as they were: with our token, a cluster that is joined next could not call us."""
-    if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
-        del os.environ["RAY_AUTH_TOKEN"]
-        os.environ.pop("RAY_AUTH_MODE", None)  # Ray's own doing
-        with contextlib.suppress(ImportError, AttributeError):
-            raylet = importlib.import_module("ray._raylet")
-            raylet.Config.initialize("")
-            raylet.AuthenticationTokenLoader.instance().reset_cache()
-
-
-def _capacity() -> str:
-    """What the cluster has to offer, in words."""
-    import ray
-
-    free, total = ray.available_resources().get("CPU", 0), ray.cluster_resources().get("CPU", 0)
-    return f"Ray has {total:g} CPUs, {free:g} of them free, and a worker needs 1"

@@ -27,7 +27,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gridsim.config import SimConfig, VehicleConfig
+from gridsim.config import FILE_SPEEDS, SimConfig, VehicleConfig
 from gridsim.maps.map import START_SPEED, Map
 from gridsim.maps.network import make_network
 from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
@@ -45,7 +45,6 @@ from gridsim.maps.roads import (
     make_road,
     power_of_two,
 )
-from gridsim.maps.scenarios import FILE_SPEEDS, label
 
 PIXELS_PER_M = 16.0  # of a picture without a scale of its own
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -105,8 +104,8 @@ def short_lap(name: str, config: SimConfig) -> str:
     if length > 1.05 * revisit:  # it is an estimate
         return ""
     return (
-        f"{label(name)} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts nothing: "
-        "cars end idle in their second lap. Make the road longer, or its resolution larger"
+        f"{Path(name).stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
+        "nothing: cars end idle in their second lap. Make the road longer, or its resolution larger"
     )
 
 

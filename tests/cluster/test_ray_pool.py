@@ -31,7 +31,8 @@ from test_pool import (
 )
 
 from cluster.workers.pool import PoolError, SerialPool
-from cluster.workers.ray_pool import RayPool, check_address
+from cluster.workers.ray_pool import RayPool
+from cluster.workers.ray_session import check_address
 from cluster.workers.worker import CollectTask, Task
 from evolution.dqn.experience import Experience, to_bytes
 from evolution.search.breeding import RECIPE

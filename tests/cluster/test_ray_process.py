@@ -19,7 +19,8 @@ from test_pool import Answering, Evaluated, never_built
 from test_ray_pool import gone
 
 from cluster.workers.pool import PoolError
-from cluster.workers.ray_pool import RayPool, check_address
+from cluster.workers.ray_pool import RayPool
+from cluster.workers.ray_session import check_address
 from cluster.workers.worker import Task
 from gridsim.maps.map import Map
 
