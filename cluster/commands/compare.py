@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING
 import tyro
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
+from rich.progress import Progress as Live
 from rich.table import Table
 
 from cluster.commands.common import (
@@ -34,6 +33,7 @@ from cluster.commands.common import (
     typed,
     warn_of_crowd,
 )
+from cluster.commands.progress import Line, clock
 from cluster.comparison import plan as experiment
 from cluster.comparison import tables
 from cluster.comparison.plan import Budget, Cell, CellError, ComparisonFolder, Plan
@@ -407,24 +407,16 @@ def _existing(console: Console, flags: CompareFlags) -> int:
 
 
 class Progress:
-    """Shows which run is trained, what it says, and ETA: a bar on a terminal, plain lines elsewhere."""
+    """Shows which run is trained, what it says, and ETA: a line on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console, path: Path, cells: Sequence[Cell], left: Sequence[Cell], budget: Budget):
         self._console, self._budget = console, budget
         self._total, self._left = len(cells), len(left)
         self._ends: list[float] = []
         self._started = time.perf_counter()
-        self._head = ""
-        self._bar = Bar(
-            TextColumn("[bold]run {task.completed:.0f}/{task.total:.0f}"),
-            BarColumn(bar_width=20),
-            TextColumn("{task.fields[text]}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not console.is_terminal,
-            transient=True,
-        )
-        self._task = self._bar.add_task("compare", total=self._total, completed=self._total - self._left, text="")
+        self._name = ""
+        self._bar = Live(Line(), console=console, disable=not console.is_terminal, transient=True)
+        self._task = self._bar.add_task("compare", total=None, head="", facts="", rest="")
         there = f", {self._total - self._left} of them finished" if self._left < self._total else ""
         console.print(f"comparing {self._total} runs{there} -> {typed(path)}", soft_wrap=True)
 
@@ -437,12 +429,13 @@ class Progress:
 
     def begin(self, cell: Cell) -> None:
         """A run begins, or goes on."""
-        self._head = f"{cell.name}  ETA {self._eta()}"
+        self._name = cell.name
         self.note("starting")
 
-    def note(self, text: str) -> None:
-        """What it says."""
-        self._bar.update(self._task, text=f"{self._head}  [dim]{text[:70]}")
+    def note(self, text: str, more: str = "") -> None:
+        """What it says, and more where there is room."""
+        head = f"run {self._total - self._left}/{self._total}"
+        self._bar.update(self._task, head=head, facts=f"ETA {self._eta()}  {text}", rest=f"{self._name}  {more}")
 
     def done(self, cell: Cell, run: Run) -> None:
         """It is trained and measured."""
@@ -468,7 +461,6 @@ class Progress:
     def _next(self) -> None:
         self._left -= 1
         self._ends.append(time.perf_counter())
-        self._bar.update(self._task, completed=self._total - self._left)
 
     def _eta(self) -> str:
         """From the runs so far; before there are any, from a budget of wall time."""
@@ -477,7 +469,6 @@ class Progress:
         elif self._budget.wall_s:
             seconds = self._budget.wall_s * self._left
         else:
-            return "unknown"
-        minutes, rest = divmod(round(seconds), 60)
-        hours, minutes = divmod(minutes, 60)
-        return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+            return "-:--"
+        begun = self._ends[-1] if self._ends else self._started
+        return clock(max(seconds - (time.perf_counter() - begun), 0.0))

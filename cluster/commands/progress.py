@@ -1,4 +1,4 @@
-"""Live progress of a run: a bar on a terminal, plain lines elsewhere."""
+"""Live progress of a run: a line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -7,39 +7,50 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bar
+from rich.progress import Progress as Live
+from rich.progress import ProgressColumn, Task
+from rich.text import Text
 
 if TYPE_CHECKING:
     from cluster.runs.run import Session
+    from cluster.training.trainer import Learning
 
 LINE_S = 5.0  # between lines where there is no terminal
-WINDOW = 10  # steps that the ETA is taken from
+WINDOW_S = 10.0  # that the ETA is taken from, at least
+BAR = 10  # characters
+
+
+class Line(ProgressColumn):
+    """One line of the fields `head`, `facts` and `rest`. A terminal that is too narrow cuts off the rest first.
+
+    A bar and the time stand between facts and rest where the task has a total.
+    """
+
+    def render(self, task: Task) -> Text:
+        line = Text(no_wrap=True, overflow="ellipsis").append(task.fields["head"], "bold")
+        line.append(f"  {task.fields['facts']}  ")
+        if task.total:
+            done = round(BAR * min(task.completed / task.total, 1.0))
+            line.append("━" * done, "bar.complete").append("━" * (BAR - done), "bar.back")
+            line.append(f"  {clock(task.elapsed or 0.0)}  ", "progress.elapsed")
+        return line.append(task.fields["rest"])
 
 
 class Progress:
-    """Shows how far a run is, distance, speed, car-steps per second and ETA."""
+    """Shows how far a run is, its success and ETA, then distance, speed and car-steps per second."""
 
     def __init__(self, console: Console, session: Session, folder: str):
         self._console, self._learning = console, session.learning
         self._live = console.is_terminal
         done, total, _ = self._learning.way()
-        self._ends: deque[tuple[float, float]] = deque([(time.perf_counter(), done)], WINDOW + 1)
+        self._ends: deque[tuple[float, float, float]] = deque()  # of steps: when, how far, car-steps
         self._printed = 0.0
-        self._text = ""
-        self._bar = Bar(
-            TextColumn("[bold]{task.fields[way]}"),
-            BarColumn(bar_width=20),
-            TaskProgressColumn(show_speed=False),
-            TextColumn("{task.fields[text]}"),
-            TimeElapsedColumn(),
-            console=console,
-            disable=not self._live,
-            transient=True,
-        )
+        self._facts, self._text = "success 0%  ETA -:--", ""
+        self._bar = Live(Line(), console=console, disable=not self._live, transient=True)
         self._task = self._bar.add_task(
-            "learn", total=total or None, completed=int(done), text="starting the workers", way=self._way()
-        )
+            "learn", total=total or None, completed=int(done), head=way(self._learning), facts=self._facts,
+            rest="starting the workers",
+        )  # fmt: skip
         settings = session.run.settings
         verb = "continuing" if done else self._learning.verb
         console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}")
@@ -51,44 +62,51 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def _way(self) -> str:
-        """How far it is, in words."""
-        done, total, unit = self._learning.way()
-        of = f"/{total:g}" if total else ""
-        return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{unit} {done:.0f}{of}"
-
     def row(self, step: int, row: dict[str, float]) -> None:
         """So many steps are done."""
-        now = time.perf_counter()
-        way, total, _ = self._learning.way()
-        self._ends.append((now, way))
-        begun, first = self._ends[0]
-        champion = row["validation/success_rate"]
-        self._text = self._learning.describe(row) + f"  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
-        self._text += f"  champion {champion:.0%}" if champion else ""
-        ends = [(now - begun) / max(way - first, 1e-9) * max(total - way, 0.0)] if total else []
-        if limit := self._learning.settings.car_steps:
-            ends.append(max(limit - row["car_steps"], 0.0) / row["car_steps_per_s"])
-        if ends:
-            self._text += f"  ETA {_clock(min(ends))} at most"
-        self._bar.update(self._task, completed=int(way), text=self._text, way=self._way())
+        self._facts = f"success {row['validation/success_rate']:.0%}  ETA {self._eta(row['car_steps'])}"
+        self._text = f"{self._learning.describe(row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
+        head, now = way(self._learning), time.perf_counter()
+        done = int(self._learning.way()[0])
+        self._bar.update(self._task, completed=done, head=head, facts=self._facts, rest=self._text)
         if not self._live and (now - self._printed > LINE_S or self._learning.done()):
             self._printed = now
-            self._console.print(f"{self._way()}  {self._text}", soft_wrap=True)
+            self._console.print(f"{head}  {self._facts}  {self._text}", soft_wrap=True)
+
+    def _eta(self, car_steps: float) -> str:
+        """When the first of the run's bounds is reached, as the latest steps went. It may be solved before."""
+        now, (done, total, _) = time.perf_counter(), self._learning.way()
+        self._ends.append((now, done, car_steps))
+        while len(self._ends) > 2 and now - self._ends[1][0] >= WINDOW_S:
+            self._ends.popleft()
+        begun, *before = self._ends[0]
+        bounds = zip((total, self._learning.settings.car_steps), (done, car_steps), before, strict=True)
+        ends = [(bound - here) / (here - there) for bound, here, there in bounds if bound and here > there]
+        if not ends or now - begun < WINDOW_S:
+            return "-:--"
+        return f"{clock(max(min(ends), 0.0) * (now - begun))} at most"
 
     def members(self, stage: str, done: int, total: int) -> None:
         """Part of a step is done."""
         if self._live:
-            self._bar.update(self._task, text=f"{self._text}  [dim]{stage} {done}/{total}")
+            self._bar.update(self._task, rest=f"{stage} {done:{len(str(total))}}/{total}  {self._text}")
 
     def note(self, text: str) -> None:
         """What happens after the last step."""
-        self._bar.update(self._task, text=text)
+        self._bar.update(self._task, rest=text)
         if not self._live:
             self._console.print(text)
 
 
-def _clock(seconds: float) -> str:
+def way(learning: Learning, bound: bool = True) -> str:
+    """How far a run is, in words: what is done, not which step is the next."""
+    done, total, unit = learning.way()
+    of = f"/{total:g}" if total and bound else ""
+    return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{done:.0f}{of} {unit}"
+
+
+def clock(seconds: float) -> str:
+    """Minutes and seconds, and hours where there are some."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -49,7 +49,8 @@ class WatchFlags:
     output: str = ""
     """Write a film, .mp4 or .gif, in place of the window."""
     generation: int | None = None
-    """Watch this generation's elite (of a DQN: this evaluation's network; 0 is the first), not the champion."""
+    """Watch this generation's elite (of a DQN: this evaluation's network), not the champion; 0 is the first, as in
+    history.csv and MLflow."""
     follow: bool = False
     """Watch the newest elite, while the run is still going."""
     scenario: str = ""

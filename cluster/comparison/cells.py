@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from cluster.commands.progress import way
 from cluster.comparison.plan import COMPARISON, Cell, CellError
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_tracker, new_run, open_run
@@ -24,7 +25,7 @@ from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 
 UNBOUND = MAX_STEPS  # generations or car-steps, where a budget is what ends a run
-EVALUATIONS = 10  # of the DQN at least, since a budget of car-steps is looked at after each
+EVALUATIONS = 10  # of the DQN at least
 
 
 @dataclass
@@ -34,7 +35,7 @@ class Cells:
     Attributes:
         workers, address, tracking_uri, experiment: as the command has them.
         parent_id: MLflow's run that the cells belong to, or "".
-        note: told how far a run is.
+        note: told how far a run is, and perhaps more of it.
         patience: as the command has it.
     """
 
@@ -43,7 +44,7 @@ class Cells:
     tracking_uri: str
     experiment: str
     parent_id: str = ""
-    note: Callable[[str], None] = lambda text: None
+    note: Callable[..., None] = lambda text, more="": None
     patience: float = 0.0
     _pool: WorkerPool | None = None
     _maps: Maps | None = field(default=None, init=False)
@@ -89,7 +90,10 @@ class Cells:
             session = Session(
                 run, pool, maps, tracker, time.perf_counter(), film=False,
                 wall_limit_s=cell.plan.budget.wall_s or math.inf,
-                on_row=lambda _, row: self.note(session.learning.describe(row)),
+                on_row=lambda _, row: self.note(
+                    f"{way(session.learning, bound=False)}  success {row['validation/success_rate']:.0%}",
+                    session.learning.describe(row),
+                ),
             )  # fmt: skip
             session.learning.warn = lambda text: print(f"{cell.name}: warning: {text}", file=sys.stderr, flush=True)
             maps.ahead(session.learning.curriculum.map_seeds[:3])

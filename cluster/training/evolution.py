@@ -161,12 +161,12 @@ class Evolution(Learning):
         s = self.settings
         if s.car_steps and not s.generations:
             return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
-        return self.generation, s.generations, "generation"
+        return self.generation, s.generations, "generations"
 
     def describe(self, row: dict[str, float]) -> str:
-        generation = f"generation {self.generation}  " if self.way()[2] != "generation" else ""
+        done = f"{self.generation} generations  " if self.way()[2] != "generations" else ""
         return (
-            f"{generation}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
+            f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
             f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"
         )
 

@@ -1,0 +1,96 @@
+"""The live line, as terminals of several widths show it."""
+
+import io
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from cluster.commands import compare, progress
+from cluster.commands.progress import Progress
+from cluster.comparison.plan import Budget, Plan
+
+ROW = {"validation/success_rate": 0.37, "car_steps_per_s": 1_234_567.0, "car_steps": 12_300_000.0}
+WORDS = "240 generations  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"
+WIDTHS = [60, 80, 120]
+
+
+def learning(way=(12.3, 30.0, "M car-steps")):
+    found: Any = SimpleNamespace(verb="evolving", describe=lambda row: WORDS, done=lambda: False)
+    found.way = lambda: way
+    found.settings = SimpleNamespace(policy="mlp:4", scenario="curved", seed=0, car_steps=30_000_000)
+    return found
+
+
+def begun(learner, width, terminal=True):
+    console = Console(width=width, force_terminal=terminal, color_system=None, file=io.StringIO())
+    session: Any = SimpleNamespace(learning=learner, run=SimpleNamespace(settings=learner.settings))
+    return Progress(console, session, "runs/x"), console
+
+
+def drawn(bar, width):
+    """The live line as such a terminal shows it."""
+    file = io.StringIO()
+    Console(width=width, force_terminal=True, color_system=None, file=file).print(bar.get_renderable())
+    (line,) = file.getvalue().splitlines()
+    assert len(line) <= width
+    return line
+
+
+def after(monkeypatch, seconds):
+    """Let so many seconds pass."""
+    now = time.perf_counter()
+    monkeypatch.setattr(progress.time, "perf_counter", lambda: now + seconds)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(
+    ("way", "counter"),
+    [((12.3, 30.0, "M car-steps"), "12.3/30 M car-steps"), ((240, 1200, "generations"), "240/1200 generations")],
+)
+def test_counter_success_and_eta_are_always_there(way, counter, width, monkeypatch):
+    learner = learning(way)
+    shown, _ = begun(learner, width)
+    assert drawn(shown._bar, width).startswith(f"{counter}  success 0%  ETA -:--  ")
+    shown.row(1, ROW)
+    learner.way = lambda: (way[0] * 1.5, *way[1:])
+    after(monkeypatch, 3700.0)
+    shown.row(2, {**ROW, "car_steps": 12_300_000.0 * 1.5})
+    shown.members("validate", 3, 128)
+    line = drawn(shown._bar, width)
+    assert line.startswith(f"{progress.way(learner)}  success 37%  ETA 1:")
+    assert " at most  " in line
+    assert ("validate   3/128  240 generations" in line) == (width >= 120)
+
+
+def test_there_is_no_eta_before_it_means_something(monkeypatch):
+    """The first step takes as long as all that is started for it."""
+    learner = learning()
+    shown, console = begun(learner, 120, terminal=False)
+    after(monkeypatch, 60.0)
+    shown.row(1, {**ROW, "car_steps_per_s": 500.0, "car_steps": 300_000.0})
+    after(monkeypatch, 1.0)
+    shown.row(2, {**ROW, "car_steps": 1_300_000.0})
+    assert "ETA -:--" in drawn(shown._bar, 120)
+    after(monkeypatch, 10.5)
+    shown.row(3, {**ROW, "car_steps": 4_000_000.0})
+    assert "ETA 1:" in drawn(shown._bar, 120)
+    assert "\n12.3/30 M car-steps  success 37%  ETA -:--  240 generations" in console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_comparison_shows_the_same(width):
+    plan = Plan(("roundabout",), ("two-parents",), 3, Budget(wall_s=3700.0))
+    cells = plan.cells(Path("runs/c"))
+    console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+    shown = compare.Progress(console, Path("runs/c"), cells, cells, plan.budget)
+    shown.begin(cells[0])
+    learner = learning((12, 10**15, "generations"))
+    shown.note(f"{progress.way(learner, bound=False)}  success 37%", learner.describe(ROW))
+    line = drawn(shown._bar, width)
+    assert line.startswith("run 0/3  ETA 3:0")
+    assert "  12 generations  success 37%  " in line
+    assert ("roundabout-two-parents-s0" in line) == (width >= 80)
