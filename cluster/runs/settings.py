@@ -57,7 +57,7 @@ class RunSettings:
     policy: str = ""
     """Network; by default one that suits the observation."""
     car_steps: int = 0
-    """Car-steps at most, checked after each generation or evaluation; 0: any number."""
+    """Car-steps at most, checked after each generation; 0: any number."""
     until: float = 0.985
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
@@ -250,9 +250,9 @@ class DqnSettings(RunSettings):
     stand, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
     layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
-    """Car-steps at most, checked after each evaluation; 0: any number."""
+    """Car-steps at most, but for the last batch (some 33,000) and the evaluation after it; 0: any number."""
     episodes: int = 0
-    """Training episodes at most, checked after each evaluation; 0: any number."""
+    """Training episodes at most, but for those of the last batch; 0: any number."""
     converged: float = 0.01
     """Stop when the Q values of fixed observations change by less than this share of their spread from one evaluation
     to the next, three times in a row; 0: never."""

@@ -81,7 +81,7 @@ class Dqn(Learning):
         self.outcomes.clear()
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
         steps, distance, episodes, reward, speeds = 0, 0.0, 0, 0.0, 0.0
-        while steps < self.settings.evaluate_every and not (steps and self.out_of_time()):
+        while steps < self.settings.evaluate_every and not (steps and (self.out_of_time() or self.done())):
             results, rewards = self._collect()
             n = int(results["steps"].sum())
             steps += n
@@ -233,7 +233,7 @@ class Dqn(Learning):
     def way(self) -> tuple[float, float, str]:
         s = self.settings
         if s.episodes and not s.car_steps:
-            return self.episodes, s.episodes, "episode"
+            return self.episodes, s.episodes, "episodes"
         return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
 
     def describe(self, row: dict[str, float]) -> str:

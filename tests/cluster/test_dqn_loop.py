@@ -110,6 +110,24 @@ def test_a_step_ends_early_when_time_is_up(loop):
     assert learning.batches == 1
 
 
+@pytest.mark.parametrize("bound", [{"car_steps": 5000}, {"episodes": 200}])
+def test_no_batch_is_begun_beyond_a_bound(loop, bound):
+    learning = loop(evaluate_every=10**9, **bound)
+    name, most = next(iter(bound.items()))
+    begun: list[int] = []
+    collect = learning._collect
+
+    def count():
+        begun.append(learning.counts()[name])
+        return collect()
+
+    learning._collect = count
+    learning.step()
+    assert learning.done()
+    assert len(begun) > 1
+    assert max(begun) < most
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
