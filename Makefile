@@ -16,11 +16,11 @@ PORT   ?= 5000
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install develop evolve dqn compare test ui bench pictures lint format
+.PHONY: help install develop evolve dqn compare test test-slow ui bench pictures lint format
 
 help: ## This list
 	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo; echo "  PYTHON=/path/to/python  makes .venv with that one (3.11 or newer);  PORT=5000  is make ui's"
 
 install: $(STAMP) ## Create .venv and install into it (the others do so by themselves)
@@ -36,8 +36,11 @@ dqn: $(STAMP) ## Train a driver by deep Q-learning instead; ARGS as above
 compare: $(STAMP) ## Compare the learners on all roads, up to an hour; ARGS=--quick takes minutes
 	@$(BIN)/gridsim-compare $(ARGS)
 
-test: $(DEV) ## Run all tests; ARGS='-m "not e2e"' leaves out those with real Ray workers
-	$(BIN)/python -m pytest $(ARGS)
+test: $(DEV) ## Run the tests, in minutes; ARGS="tests/gridsim -k rays" are passed on to pytest
+	$(BIN)/python -m pytest -n 2 -m "not e2e" $(ARGS)
+
+test-slow: $(DEV) ## Run the other tests: whole commands, real Ray workers, kills, hosts, images
+	$(BIN)/python -m pytest -m e2e $(ARGS)
 
 ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
 	@echo "MLflow's UI on http://127.0.0.1:$(PORT); Ctrl-C ends it"

@@ -76,5 +76,5 @@ def test_make_help_names_every_target(root: Path) -> None:
     assert done.returncode == 0, done.stderr
     targets = re.search(r"^\.PHONY:(.*)$", (root / "Makefile").read_text(encoding="utf-8"), flags=re.MULTILINE)
     assert targets is not None
-    described = dict(re.findall(r"^  ([a-z]+) +(\S.*)$", done.stdout, flags=re.MULTILINE))
+    described = dict(re.findall(r"^  ([a-z-]+) +(\S.*)$", done.stdout, flags=re.MULTILINE))
     assert set(described) == set(targets[1].split())
