@@ -238,7 +238,6 @@ class Session:
     def __post_init__(self) -> None:
         self.learning = new_learning(self.run.settings, self.pool, self.maps, self.initial, self.on_progress)
         self._digest = self.run.digest()
-        self._bests = description.Bests()
         if self.run.saved is not None:
             self.learning.restore(*self.run.saved)
 
@@ -284,7 +283,7 @@ class Session:
 
     def _log(self, step: int, row: dict[str, float], ago_s: float = 0.0) -> None:
         metrics = {name: row[name] for name in self.learning.columns if name not in NOT_LOGGED}
-        self.tracker.log_row(step, metrics | self._bests(row), ago_s)
+        self.tracker.log_row(step, metrics, ago_s)
 
     def save(self) -> None:
         """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""

@@ -1,9 +1,7 @@
-"""What MLflow is told of a training run: its name, parameters, tags, description, best figures, and its champion."""
+"""What MLflow is told of a training run: its name, parameters, tags, description, and its champion."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -14,7 +12,6 @@ from cluster.tracking.commit import git_commit
 from cluster.tracking.mlflow_run import MODEL, RUN_ID, Version
 from cluster.tracking.tracker import Model
 from evolution.networks.policy import PolicySpec
-from gridsim.config import SimConfig
 from gridsim.maps.scenarios import label
 
 if TYPE_CHECKING:
@@ -22,13 +19,6 @@ if TYPE_CHECKING:
     import torch
 
     from cluster.runs.run import RunFolder
-
-BEST = {
-    "best_fitness": "fitness/best",
-    "best_distance_m": "distance_m/best",
-    "best_success_rate": "validation/success_rate",
-}
-"""MLflow's table of runs shows each metric's last value; these are logged when they grow, so that it is the best."""
 
 
 def what(settings: RunSettings) -> str:
@@ -70,24 +60,15 @@ def group(settings: RunSettings) -> str:
 
 
 def params(settings: RunSettings) -> dict[str, str]:
-    """The whole configuration."""
-    found = {name: str(value) for name, value in to_dict(settings).items()}
-    found |= {f"curriculum/{k}": str(v) for k, v in dataclasses.asdict(settings.curriculum()).items()}
-    for part, values in dataclasses.asdict(SimConfig()).items():
-        found |= {f"{part}/{k}": str(v) for k, v in values.items()}
-    return found
+    """All that decides the champion; what follows from it, and the simulator's constants, are in config.json."""
+    return {name: str(value) for name, value in to_dict(settings).items()}
 
 
 def tags(settings: RunSettings) -> dict[str, str]:
-    """What runs are found, grouped and coloured by; `group` is all but the seed."""
+    """What runs are found and grouped by, beside their parameters; `group` is all but the seed."""
     return {
         "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
-        "search": settings.algorithm,
         "scenario": settings.scenario,
-        "seed": str(settings.seed),
-        "policy": settings.policy,
-        "observation": settings.observation,
-        "traffic": str(settings.traffic),
         "group": group(settings),
         "git_commit": git_commit(),
     }
@@ -165,20 +146,3 @@ def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str
         tags={**facts, **{k: f"{v:.6g}" for k, v in held_out_metrics(held_out).items()}},
     )
     return Model(version, build, facts)
-
-
-class Bests:
-    """The best figures of a history, told row after row."""
-
-    def __init__(self) -> None:
-        self._best: dict[str, float] = {}
-
-    def __call__(self, row: Mapping[str, float]) -> dict[str, float]:
-        """Those of BEST that this row is the first to reach."""
-        grown = {
-            name: row[column]
-            for name, column in BEST.items()
-            if column in row and row[column] > self._best.get(name, -math.inf)
-        }
-        self._best |= grown
-        return grown

@@ -33,8 +33,8 @@ Status = Literal["FINISHED", "KILLED", "FAILED"]
 
 KEY_TAG = "gridsim.key"
 """The tag that a run is found again by, if it was killed before anybody knew its id."""
-NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "gridsim.note"
-"""MLflow's tag of the description, and ours that says which description was written here."""
+NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
+"""MLflow's tag of the description, and ours that says which was written here; the UI lists neither."""
 CHAMPION_TAG = "champion_sha256"
 """The tag by which a registered version tells whose champion it is."""
 RUN_ID = "{run_id}"

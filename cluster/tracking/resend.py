@@ -47,10 +47,10 @@ def _send(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
     history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
     ended = path.stat().st_mtime
     tracker = make_tracker(run, uri, experiment, late=True, started=_ms(ended - summary["wall_s"]))
-    bests, age, last = description.Bests(), time.time() - ended, history[-1]["wall_s"]
+    age, last = time.time() - ended, history[-1]["wall_s"]
     for step, row in enumerate(history):
         metrics = {name: value for name, value in row.items() if name not in NOT_LOGGED}
-        tracker.log_row(step, metrics | bests(row), age + last - row["wall_s"])
+        tracker.log_row(step, metrics, age + last - row["wall_s"])
     tracker.log_summary(description.held_out_metrics(held_out), ago_s=age)
     try:
         run_id = tracker.wait_ready(WAIT_S)

@@ -90,8 +90,6 @@ def check_complete(served, name):
         logged = client(served.uri).get_metric_history(run_id, column)
         assert {metric.step: metric.value for metric in logged} == pytest.approx(wanted)
     metrics = run.data.metrics
-    assert metrics["best_distance_m"] == max(float(row["distance_m/best"]) for row in history)
-    assert metrics["best_fitness"] == max(float(row["fitness/best"]) for row in history)
     assert metrics["held_out/distance_m"] == found["held_out"]["distance_m"]
     assert f"**{found['held_out']['success_rate']:.1%}**" in run.data.tags["mlflow.note.content"]
     assert f'"runs:/{run_id}/model"' in run.data.tags["mlflow.note.content"]
