@@ -295,7 +295,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
 
     warn_of_crowd(prog, flags.workers, flags.address)
     made = _make_folder(prog, run)
-    tracker = make_tracker(run, uri, flags.experiment)
+    tracker = make_tracker(run, uri, flags.experiment, started=time.time() - time.perf_counter() + started)
     closing = contextlib.ExitStack()
     status: Status = "FAILED"
     code = FAILED

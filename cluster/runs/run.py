@@ -284,6 +284,7 @@ class Session:
     def _log(self, step: int, row: dict[str, float], ago_s: float = 0.0) -> None:
         metrics = {name: row[name] for name in self.learning.columns if name not in NOT_LOGGED}
         self.tracker.log_row(step, metrics, ago_s)
+        self.tracker.wall_s = row["wall_s"]
 
     def save(self) -> None:
         """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
@@ -329,7 +330,7 @@ class Session:
                 scenario, states, path / "trajectory.png",
                 f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
             )  # fmt: skip
-        wall = self._wall_s()
+        self.tracker.wall_s = wall = self._wall_s()
         summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracker.run_id or "",

@@ -93,7 +93,7 @@ class Identity:
         key: the run's own unique name, by which it is found again (KEY_TAG).
         run_id: MLflow's id of it, where that is known.
         late: the run is over, and what MLflow has of it stays as it is: its status, its times, its files.
-        started: ms since the epoch at which a new one began; None is now.
+        started: ms since the epoch at which a new one began.
     """
 
     uri: str
@@ -105,7 +105,7 @@ class Identity:
     key: str = ""
     run_id: str | None = None
     late: bool = False
-    started: int | None = None
+    started: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,6 +151,7 @@ class LoggedRun:
         run = self._find() or self._create()
         self.run_id: str = run.info.run_id
         self._artifacts: str = run.info.artifact_uri
+        self._started: int = run.info.start_time
         self._over = identity.late and run.info.status == "FINISHED"
 
     def _create(self) -> "Run":
@@ -277,10 +278,15 @@ class LoggedRun:
         )
         return True
 
-    def end(self, status: Status, timestamp: int | None = None) -> None:
-        """End the run, now or at a time in ms since the epoch. One that is over stays as it is."""
+    def end(self, status: Status, wall_s: float | None = None) -> None:
+        """End the run, now or so many seconds after its start. One that is over stays as it is.
+
+        MLflow's UI shows the time from start to end as the run's duration, and lets no start change: the pauses of a
+        run that was stopped and resumed are left out by an earlier end.
+        """
         if not (self._over and status == "FINISHED"):
-            self._client.set_terminated(self.run_id, status, timestamp)
+            ended = None if wall_s is None else self._started + round(1000.0 * wall_s)
+            self._client.set_terminated(self.run_id, status, ended)
 
 
 def _note_tags(text: str) -> dict[str, str]:

@@ -45,8 +45,9 @@ def _send(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
     model = description.torch_model(load_champion(run.path / CHAMPION), run.settings, held_out)
     note = description.describe(run, summary)
     history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
-    ended = path.stat().st_mtime
-    tracker = make_tracker(run, uri, experiment, late=True, started=_ms(ended - summary["wall_s"]))
+    ended, wall = path.stat().st_mtime, summary["wall_s"]
+    tracker = make_tracker(run, uri, experiment, late=True, started=ended - wall)
+    tracker.wall_s = wall
     age, last = time.time() - ended, history[-1]["wall_s"]
     for step, row in enumerate(history):
         metrics = {name: value for name, value in row.items() if name not in NOT_LOGGED}
@@ -62,12 +63,8 @@ def _send(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
     tracker.describe(note)
     tracker.log_model(run.path, model)
     tracker.log_artifacts(run.path)
-    lost = tracker.close("FINISHED", WAIT_S, _ms(ended))
+    lost = tracker.close("FINISHED", WAIT_S)
     sent = tracker.sent
     counts = ((sent.rows, "row"), (sent.files, "file"), (sent.models, "model"))
     words = [f"{n} {noun}{'' if n == 1 else 's'}" for n, noun in counts if n]
     return f"sent to MLflow: {', '.join(words)}" if words else NOTHING, lost
-
-
-def _ms(seconds: float) -> int:
-    return int(1000.0 * seconds)

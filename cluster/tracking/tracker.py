@@ -78,7 +78,11 @@ class Tracker:
 
     On resume hand over the whole history: what MLflow has is skipped. What a resumed run says differently (a larger
     number of generations, another commit) is added as tag `resumed/<name>`, as MLflow lets no parameter change. With
-    `late` nothing but what is missing is logged (`mlflow_run.Identity`).
+    `late` nothing but what is missing is logged (`mlflow_run.Identity`). A new run `started` so many seconds after the
+    epoch, or now.
+
+    Attributes:
+        wall_s: seconds that the run has taken, pauses left out, by which it ends in MLflow; None: it ends when closed.
     """
 
     def __init__(
@@ -93,7 +97,7 @@ class Tracker:
         start: bool = True,
         note: str = "",
         late: bool = False,
-        started: int | None = None,
+        started: float | None = None,
     ):
         if key is not None and not re.fullmatch(r"[\w.:/-]{1,250}", key):
             raise ValueError(f"{key!r} cannot be a run's key")
@@ -110,7 +114,7 @@ class Tracker:
             key or uuid.uuid4().hex,
             run_id,
             late,
-            started,
+            int(1000.0 * (time.time() if started is None else started)),
         )
         self._changed = threading.Condition()  # guards what follows; the thread alone takes away from the deques
         self._rows: deque[Row] = deque()
@@ -121,12 +125,12 @@ class Tracker:
         self._model_error = ""
         self._last_step = 0
         self._status: Status | None = None  # set by close()
-        self._ended: int | None = None
         self._terminated = False
         self._error: str | None = None
         self._run_id: str | None = None
         self._report: str | None = None
         self.sent = Sent()
+        self.wall_s: float | None = None
 
         self._run: LoggedRun | None = None  # the thread's own
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
@@ -229,16 +233,15 @@ class Tracker:
             self._changed.notify_all()
         self.start()
 
-    def close(self, status: Status, timeout_s: float = CLOSE_S, ended: int | None = None) -> str | None:
+    def close(self, status: Status, timeout_s: float = CLOSE_S) -> str | None:
         """Log what is queued, end the run as `status`, and return None, or one line about what could not be logged.
 
         Raises nothing and returns within `timeout_s`, whatever MLflow does; a server that is away gets one more chance.
-        `ended` is when the run ended, in ms since the epoch; None is now.
         """
         with self._changed:
             if self._status is not None:
                 return self._report
-            self._status, self._ended = status, ended
+            self._status = status
             if status != "FINISHED":
                 self._model = None  # there is a better one to come
             self._changed.notify_all()
@@ -371,7 +374,7 @@ class Tracker:
     def _terminate(self) -> None:
         """End the run as `close` was told."""
         assert self._status is not None
-        self._opened().end(self._status, self._ended)
+        self._opened().end(self._status, self.wall_s)
         with self._changed:
             self._terminated = True
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import BIN, answers, descendants, finish, rows, start, summary, wait_until
+from commands import BIN, answers, descendants, duration_s, finish, rows, start, summary, wait_until
 
 from cluster.commands.cli import REMOVED, EvolveFlags, evaluate_main, evolve_main
 from cluster.commands.watch import watch_main
@@ -73,8 +73,10 @@ def test_ctrl_c_saves_and_leaves_nothing_behind(reference, empty_database, tmp_p
     assert experiment is not None
     (run,) = client.search_runs([experiment.experiment_id])
     assert run.info.status == "KILLED"
+    assert duration_s(tmp_path / "runs/c") == pytest.approx(float(rows(tmp_path / "runs/c")[-1]["wall_s"]), abs=0.01)
     done = evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert duration_s(tmp_path / "runs/c") == pytest.approx(summary(tmp_path / "runs/c")["wall_s"], abs=0.01)
     assert summary(tmp_path / "runs/c")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
 
 
@@ -364,6 +366,7 @@ def test_a_finished_run_can_be_extended(reference, tmp_path):
     short[short.index("6")] = "3"
     done = evolve("--workers", "0", "--name", "s", *short, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert duration_s(tmp_path / "runs/s") == pytest.approx(summary(tmp_path / "runs/s")["wall_s"], abs=0.01)
     again = evolve("--workers", "0", "--resume", "runs/s", cwd=tmp_path)
     assert again.returncode == 0
     assert "finished" in again.stdout

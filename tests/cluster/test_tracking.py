@@ -66,6 +66,18 @@ def test_how_it_ended(uri, status):
     assert client(uri).get_run(ended.run_id).info.status == status
 
 
+def test_the_duration_is_what_the_run_has_taken_without_its_pauses(uri):
+    began = time.time() - 500.0
+    for status, wall_s in (("KILLED", 54.0), ("FINISHED", 61.5)):
+        logged = tracker(uri, started=began)
+        logged.log_row(0, row(0))
+        logged.wall_s = wall_s
+        assert logged.close(status) is None
+        info = client(uri).get_run(logged.run_id).info
+        assert info.start_time == int(1000.0 * began)
+        assert info.end_time - info.start_time == 1000.0 * wall_s
+
+
 def test_rows_are_never_waited_for(uri):
     started = time.perf_counter()
     logged = tracker(uri)

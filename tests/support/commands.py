@@ -60,6 +60,17 @@ def all_in_mlflow(run):
     return client.get_run(ended["mlflow_run_id"]).info.status == "FINISHED"
 
 
+def duration_s(run):
+    """Duration that MLflow, in the database beside the run's folder's folder, has of the only run there."""
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient(tracking_uri=f"sqlite:///{run.parent.parent}/mlflow.db")
+    experiment = client.get_experiment_by_name("gridsim")
+    assert experiment is not None
+    (found,) = client.search_runs([experiment.experiment_id])
+    return (found.info.end_time - found.info.start_time) / 1000.0
+
+
 def descendants(pid):
     """Processes below a process, by /proc."""
     parents = {}
