@@ -43,10 +43,7 @@ test-slow: $(DEV) ## Run the other tests: whole commands, real Ray workers, kill
 	$(BIN)/python -m pytest -m e2e $(ARGS)
 
 ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
-	@echo "MLflow's UI on http://127.0.0.1:$(PORT); Ctrl-C ends it"
-	@PYTHONWARNINGS=ignore MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui \
-	  --backend-store-uri sqlite:///mlflow.db --host 127.0.0.1 --port $(PORT) --workers 2 \
-	  --uvicorn-opts "--log-level warning"
+	@$(BIN)/python -m cluster.commands.ui $(PORT)
 
 bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
 	$(BIN)/python benchmarks/throughput.py

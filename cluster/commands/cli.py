@@ -384,7 +384,7 @@ def _run(
         f"{found} after {summary[name + 's']} {name}s, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
         f"{summary['wall_s']:.0f} s\nrun: {typed(run.path)}   champion: {typed(run.path / 'champion.npz')}\n"
         f"watch it: {called('gridsim-watch')} {typed(run.path)}\n"
-        f"compare: make ui, or mlflow ui --backend-store-uri {tracker.uri}"
+        f"compare: {tracker.where()}"
     )
 
 

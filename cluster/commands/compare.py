@@ -252,6 +252,8 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
         fail(PROG, problem, again, FAILED)
     if results and results.runs:
         results.show(console)
+    if tracker:
+        console.print(f"compare: {tracker.where()}", soft_wrap=True)
     if status == "KILLED":
         print(f"{PROG}: stopped; {again}", file=sys.stderr)
     elif failed:

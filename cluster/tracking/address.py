@@ -16,6 +16,7 @@ import urllib.request
 from pathlib import Path
 
 DEFAULT_URI = "sqlite:///mlflow.db"
+UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
 PROBE_S = 3.0
 _SERVERS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
 

@@ -12,21 +12,23 @@ own, runs whatever a model's maker has put into it, in either format, unless MLF
 
 import contextlib
 import hashlib
+import json
 import logging
 import os
 import shutil
 import tempfile
+import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from cluster.tracking.address import TrackingError, connect, sqlite_path
+from cluster.tracking.address import TrackingError, connect, shown, sqlite_path
 from cluster.tracking.commit import git_commit
 
 if TYPE_CHECKING:
-    from mlflow.entities import FileInfo, Metric, Run
+    from mlflow.entities import Experiment, FileInfo, Metric, Run
     from mlflow.tracking import MlflowClient
 
 Status = Literal["FINISHED", "KILLED", "FAILED"]
@@ -39,6 +41,12 @@ CHAMPION_TAG = "champion_sha256"
 """The tag by which a registered version tells whose champion it is."""
 RUN_ID = "{run_id}"
 """Stands in a description for MLflow's id of the run, which is not known when it is written."""
+BEST = "best"
+"""Alias of a registered model's version with the greatest success on held-out roads."""
+VIEW, _VIEW_TAG = "gridsim", "mlflow.sharedViewState.gridsim"
+"""The saved view of an experiment in MLflow's UI, and the experiment's tag that holds it."""
+_COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_out/speed_mps": 150, "car_steps": 90}
+"""What the view's run table shows of each run, and how wide, in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
 
@@ -132,6 +140,7 @@ class LoggedRun:
 
     Attributes:
         run_id: MLflow's id.
+        experiment_id: MLflow's id of its experiment.
         logged: the steps that MLflow has of each metric.
     """
 
@@ -145,7 +154,7 @@ class LoggedRun:
         if path and not path.exists():
             _create_database(path)
         self._client = MlflowClient(tracking_uri=identity.uri)
-        self._experiment_id = _experiment_id(self._client, identity.experiment, path)
+        self.experiment_id = _experiment_id(self._client, identity.experiment, path)
         self.logged: dict[str, set[int]] = {}
         self._listed: dict[str | None, dict[str, int]] = {}  # folder -> sizes of the artifacts in it
         run = self._find() or self._create()
@@ -164,7 +173,7 @@ class LoggedRun:
         if commit != "unknown":
             natural["mlflow.source.git.commit"] = commit
         tags = {**natural, **self._tags(), **_note_tags(asked.note)}
-        run = self._client.create_run(self._experiment_id, asked.started, tags, asked.name)
+        run = self._client.create_run(self.experiment_id, asked.started, tags, asked.name)
         self._client.log_batch(run.info.run_id, params=[Param(*param) for param in asked.params.items()])
         return run
 
@@ -203,7 +212,7 @@ class LoggedRun:
                 if run.info.lifecycle_stage == "active":
                     return run
         wanted = f"tags.`{KEY_TAG}` = '{self._identity.key}'"
-        found = self._client.search_runs([self._experiment_id], wanted, max_results=1)
+        found = self._client.search_runs([self.experiment_id], wanted, max_results=1)
         return self._client.get_run(found[0].info.run_id) if found else None
 
     def _tags(self) -> dict[str, str]:
@@ -382,11 +391,57 @@ def _experiment_id(client: "MlflowClient", name: str, database: Path | None) -> 
     experiment = client.get_experiment_by_name(name)
     if experiment is None:
         try:
-            return client.create_experiment(name, artifact_location=location)
+            return client.create_experiment(name, artifact_location=location, tags={_VIEW_TAG: _view()})
         except MlflowException as error:
             if error.error_code != "RESOURCE_ALREADY_EXISTS":  # another run was first
                 raise
             experiment = client.get_experiment_by_name(name)
     if experiment is None or experiment.lifecycle_stage != "active":
         raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
+    _add_view(client, experiment)
     return experiment.experiment_id
+
+
+# ------------------------------------------------------------------------------------------------ MLflow's UI
+
+
+def run_table(server: str, experiment_id: str) -> str:
+    """Address of an experiment's run table in the UI that an MLflow server shows: MLflow 3.17 opens another page."""
+    page = f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={VIEW}"
+    return f"{shown(server)}/{page}"
+
+
+def run_tables(uri: str, server: str) -> dict[str, str]:
+    """`run_table` of each experiment in a store that has runs, by name."""
+    quiet()
+    from mlflow.tracking import MlflowClient
+
+    path = sqlite_path(uri)
+    if path and not path.exists():
+        return {}
+    client = MlflowClient(tracking_uri=uri)
+    found = [each for each in client.search_experiments() if client.search_runs([each.experiment_id], max_results=1)]
+    for experiment in found:
+        _add_view(client, experiment)
+    return {each.name: run_table(server, each.experiment_id) for each in found}
+
+
+def _add_view(client: "MlflowClient", experiment: "Experiment") -> None:
+    """Give an experiment the saved view, unless it has one, which may have been changed in the UI."""
+    from mlflow.exceptions import MlflowException
+
+    if _VIEW_TAG not in experiment.tags:
+        with contextlib.suppress(MlflowException):  # a server may allow runs and no more
+            client.set_experiment_tag(experiment.experiment_id, _VIEW_TAG, _view())
+
+
+def _view() -> str:
+    """The saved view as MLflow's UI writes it: the run table's columns, and curves over car-steps."""
+    columns = {f"metrics.`{name}`": width for name, width in _COLUMNS.items()}
+    state = {
+        "selectedColumns": list(columns),
+        "columnOrder": list(columns),
+        "columnWidths": columns,
+        "globalLineChartConfig": {"xAxisKey": "metric", "selectedXAxisMetricKey": "car_steps", "lineSmoothness": 0},
+    }
+    return json.dumps({"name": "GridSim", "createdAt": int(1000.0 * time.time()), "state": json.dumps(state)})

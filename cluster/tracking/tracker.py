@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cluster.tracking.address import TrackingError, check_uri, one_line, shown
+from cluster.tracking.address import UI, TrackingError, check_uri, one_line, shown
 from cluster.tracking.mlflow_run import (
     CHAMPION_TAG,
     MODEL,
@@ -30,6 +30,7 @@ from cluster.tracking.mlflow_run import (
     Row,
     Status,
     Version,
+    run_table,
     save_model,
     saved_champion,
 )
@@ -161,6 +162,14 @@ class Tracker:
             if self._run_id is None:
                 raise TrackingError(f"{shown(self.uri)}: {self._error or f'MLflow not ready after {timeout_s:g} s'}")
             return self._run_id
+
+    def where(self) -> str:
+        """How to see the run beside others in MLflow's UI, in words for the terminal."""
+        served = self.uri.startswith("http")
+        table = run_table(self.uri if served else UI, self._run.experiment_id) if self._run else ""
+        if served:
+            return table or shown(self.uri)
+        return f"make ui, or mlflow ui --backend-store-uri {self.uri}" + (f"; then open\n{table}" if table else "")
 
     def missing(self, steps: Iterable[int], timeout_s: float = 30.0) -> list[int]:
         """Those of `steps` that MLflow has nothing of (rows still queued count as missing). Waits like `wait_ready`."""

@@ -373,4 +373,7 @@ def test_a_finished_run_can_be_extended(reference, tmp_path):
     done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(rows(tmp_path / "runs/s")) == 6
+    assert duration_s(tmp_path / "runs/s") == pytest.approx(summary(tmp_path / "runs/s")["wall_s"], abs=0.01)
+    assert "compare: make ui" in done.stdout
+    assert "http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning&" in done.stdout
     assert summary(tmp_path / "runs/s")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]

@@ -1,0 +1,56 @@
+"""`make ui`: MLflow's UI on loopback, and the links to the run tables in it once it answers."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+
+from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, one_line
+from cluster.tracking.mlflow_run import run_tables
+
+# The server runs no jobs, and nobody is told that it runs.
+_ENVIRONMENT = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"}
+
+
+def main(port: str) -> None:
+    """Show the runs in `mlflow.db` of the working directory, until Ctrl-C."""
+    address = f"http://127.0.0.1:{port}"
+    try:
+        socket.create_server(("127.0.0.1", int(port))).close()
+        tables = run_tables(check_uri(DEFAULT_URI), address)
+    except TrackingError as error:
+        sys.exit(f"make ui: {error}")
+    except (OSError, OverflowError, ValueError):
+        sys.exit(f"make ui: port {port} is in use or none; choose another with make ui PORT=...")
+    except Exception as error:  # a database of another MLflow
+        sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}")
+    command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]
+    server = subprocess.Popen(
+        [sys.executable, "-m", "mlflow", *command, "--uvicorn-opts", "--log-level warning"],
+        env={**os.environ, **_ENVIRONMENT},
+    )
+    try:
+        while server.poll() is None and not _answers(address):
+            time.sleep(0.2)
+        if server.poll() is None:
+            print(f"MLflow's UI on {address}; Ctrl-C ends it")
+            for name, table in tables.items():
+                print(f"runs of {name}: {table}")
+            if not tables:
+                print("there are no runs yet: make evolve makes one")
+            sys.stdout.flush()
+        sys.exit(server.wait())
+    except KeyboardInterrupt:
+        server.wait()
+
+
+def _answers(address: str) -> bool:
+    try:
+        return bool(check_uri(address))
+    except TrackingError:
+        return False
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,119 @@
+"""MLflow's UI as `make ui` shows it: the link that is printed leads to the runs, their figures and their curves."""
+
+import contextlib
+import html
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+from tracked import free_port, row, tracker
+
+from cluster.tracking.mlflow_run import run_tables
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def logged(uri, name, success_rate):
+    """A run with three rows and a champion; returns what its command says of MLflow in the end."""
+    begun = tracker(uri, experiment="gridsim", run_name=name, key=name)
+    for step in range(3):
+        begun.log_row(step, row(step) | {"validation/success_rate": 0.25 * step})
+    begun.log_summary({"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5})
+    begun.wall_s = 83.0
+    assert begun.close("FINISHED") is None
+    return begun.where()
+
+
+def test_a_run_says_where_its_table_is(uri):
+    said = logged(uri, "first", 0.875)
+    table = run_tables(uri, "http://127.0.0.1:5000")["gridsim"]
+    assert said == f"make ui, or mlflow ui --backend-store-uri {uri}; then open\n{table}"
+    assert re.fullmatch(
+        r"http://127.0.0.1:5000/#/experiments/\d+/runs\?workflowType=machine_learning&viewStateShareKey=gridsim", table
+    )
+
+
+def test_an_experiment_from_before_gets_the_view_and_keeps_one_that_was_changed(uri):
+    from mlflow.tracking import MlflowClient
+
+    client, tag = MlflowClient(tracking_uri=uri), "mlflow.sharedViewState.gridsim"
+    experiment = client.create_experiment("gridsim")
+    logged(uri, "first", 0.875)
+    assert "held_out/success_rate" in client.get_experiment(experiment).tags[tag]
+    client.set_experiment_tag(experiment, tag, "mine")
+    logged(uri, "second", 0.5)
+    assert client.get_experiment(experiment).tags[tag] == "mine"
+
+
+@contextlib.contextmanager
+def make_ui(root, folder, port):
+    """`make ui` in a folder; what is yielded is the link that it prints for the experiment `gridsim`."""
+    command = ["make", "-f", str(root / "Makefile"), "-o", f"{sys.prefix}/.installed", f"VENV={sys.prefix}", "ui"]
+    silent = ("CI", "DO_NOT_TRACK", "MLFLOW_DISABLE_TELEMETRY", "PYTEST_CURRENT_TEST")  # each turns telemetry off
+    env = {name: value for name, value in os.environ.items() if name not in silent}
+    with subprocess.Popen(
+        [*command, f"PORT={port}"], cwd=folder, env=env, stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as ui:
+        try:
+            assert ui.stdout
+            yield next(line.split()[-1] for line in ui.stdout if line.startswith("runs of gridsim: "))
+        finally:
+            os.killpg(ui.pid, signal.SIGINT)
+
+
+def seen(address, profile):
+    """A page as a browser has it after 20 s of its own time, as HTML."""
+    assert CHROMIUM
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
+    command += ["--window-size=1900,1000", "--virtual-time-budget=20000", "--dump-dom", address]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    return html.unescape(re.sub(r"<(script|style).*?</\1>", "", done.stdout, flags=re.DOTALL))
+
+
+@pytest.mark.e2e
+@pytest.mark.skipif(not CHROMIUM, reason="there is no chromium")
+def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
+    folder = tmp_path / "store"
+    logged(uri, "first", 0.875)
+    logged(uri, "second", 0.625)
+    with make_ui(root, folder, port := free_port()) as link:
+        table = seen(link, tmp_path / "profile")
+        for words in (">first<", ">second<", "held_out/success_rate", "validation/success_rate", "held_out/speed_mps",
+                      "car_steps", ">0.875<", ">0.625<", ">1.4min<", "Model registry"):  # fmt: skip
+            assert words in table, words
+        curves = seen(f"{link}&compareRunsMode=CHART", tmp_path / "profile")
+        for words in (">first<", ">second<", "first (distance_m/mean)", "second (distance_m/mean)"):
+            assert words in curves, words
+        assert re.search(r'class="xtitle"[^>]*>car_steps<', curves)
+        events = urllib.request.Request(
+            f"http://127.0.0.1:{port}/ajax-api/3.0/mlflow/ui-telemetry",
+            b'{"records": []}',
+            {"Content-Type": "application/json"},
+        )
+        with urllib.request.urlopen(events, timeout=20) as answer:
+            assert json.load(answer) == {"status": "disabled"}
+
+
+def test_a_port_in_use_is_one_line(tmp_path):
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        done = subprocess.run(
+            [sys.executable, "-m", "cluster.commands.ui", port],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+    assert done.returncode == 1
+    assert done.stderr == f"make ui: port {port} is in use or none; choose another with make ui PORT=...\n"
+    assert not list(Path(tmp_path).iterdir())
