@@ -265,13 +265,27 @@ class LoggedRun:
         return self._listed[folder]
 
     def register(self, version: Version) -> bool:
-        """Make the uploaded model the newest version of its name. False where this run's champion is one already."""
+        """Make the uploaded model the newest version of its name, and give the best of all versions its alias.
+
+        Returns: whether it was made; False where this run's champion is one already.
+        """
+        client = self._client
+        found = client.search_model_versions(f"name = '{version.name}' and run_id = '{self.run_id}'")
+        new = all(each.tags.get(CHAMPION_TAG) != version.champion_sha256 for each in found)
+        if new:
+            self._create_version(version)
+        best = max(
+            client.search_model_versions(f"name = '{version.name}'"),
+            key=lambda each: (float(each.tags.get("held_out/success_rate", -1.0)), -int(each.version)),
+        )
+        if str(client.get_registered_model(version.name).aliases.get(BEST)) != str(best.version):
+            client.set_registered_model_alias(version.name, BEST, str(best.version))
+        return new
+
+    def _create_version(self, version: Version) -> None:
         from mlflow.exceptions import MlflowException
 
         client = self._client
-        found = client.search_model_versions(f"name = '{version.name}' and run_id = '{self.run_id}'")
-        if any(each.tags.get(CHAMPION_TAG) == version.champion_sha256 for each in found):
-            return False
         try:
             client.create_registered_model(version.name, description=version.about)
         except MlflowException as error:
@@ -285,7 +299,6 @@ class LoggedRun:
             description=version.note,
             await_creation_for=0,
         )
-        return True
 
     def end(self, status: Status, wall_s: float | None = None) -> None:
         """End the run, now or so many seconds after its start. One that is over stays as it is.

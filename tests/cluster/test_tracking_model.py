@@ -116,10 +116,11 @@ def test_a_hostile_model_is_refused_where_users_load_models(tmp_path, monkeypatc
 # ---------------------------------------------------------------------------------------------- registered
 
 
-def champion_model(seed):
+def champion_model(seed, success_rate=0.5):
     genome = np.random.default_rng(seed).standard_normal(PolicySpec.parse("mlp:6,7").size).astype(np.float32)
     settings = EvolveSettings("curved", seed=seed)
-    return torch_model(Champion(genome, "mlp:6,7", "curved", SimConfig()), settings, HELD_OUT)
+    held_out = HELD_OUT | {"success_rate": success_rate}
+    return torch_model(Champion(genome, "mlp:6,7", "curved", SimConfig()), settings, held_out)
 
 
 def logged(uri, folder, seed):
@@ -154,6 +155,17 @@ def test_a_champion_is_registered_once(uri, tmp_path):
     assert logged(uri, folder, seed=2) == (run_id, None)  # it was extended, and has another champion
     assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {1, 2}
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns != before
+
+
+@pytest.mark.e2e
+def test_the_best_version_has_an_alias(uri, tmp_path):
+    best = []
+    for seed, success_rate in enumerate((0.5, 0.75, 0.75, 0.25)):
+        begun = tracker(uri, key=f"key-{seed}")
+        begun.log_model(tmp_path, champion_model(seed, success_rate))
+        assert begun.close("FINISHED", timeout_s=120) is None
+        best.append(int(client(uri).get_model_version_by_alias(NAME, "best").version))
+    assert best == [1, 2, 2, 2]
 
 
 def test_without_torch_everything_else_is_logged(uri, tmp_path):
