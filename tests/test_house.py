@@ -26,12 +26,16 @@ TORCH_AT_IMPORT = {"evolution/dqn/learner.py"}
 MOST_MODULES, MOST_LINES = 14, 500  # of a folder, and of a file
 
 
+def is_typing_only(node: ast.AST) -> bool:
+    """Whether it is a block for type checkers alone."""
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
 def imported(tree: ast.Module) -> Iterator[tuple[str, int, bool]]:
     """Yield each imported top-level module, its line, and whether it is imported when the file is."""
     lazy: set[int] = set()
     for node in ast.walk(tree):
-        typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        if typing_only or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+        if is_typing_only(node) or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
             lazy.update(id(inner) for inner in ast.walk(node))
     for node in ast.walk(tree):
         if not isinstance(node, ast.stmt | ast.expr):
@@ -85,7 +89,11 @@ def own_imports(root: Path) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for name, file in names.items():
         asked: set[str] = set()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        typing_only = {id(inner) for node in ast.walk(tree) if is_typing_only(node) for inner in ast.walk(node)}
+        for node in ast.walk(tree):
+            if id(node) in typing_only:
+                continue
             if isinstance(node, ast.Import):
                 asked |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module:
