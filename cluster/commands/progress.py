@@ -53,7 +53,8 @@ class Progress:
         )  # fmt: skip
         settings = session.run.settings
         verb = "continuing" if done else self._learning.verb
-        console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}")
+        what = f"{settings.policy} on {settings.scenario}, seed {settings.seed}"
+        console.print(f"{verb} {what} -> {folder}", soft_wrap=True)
 
     def __enter__(self) -> Progress:
         self._bar.start()

@@ -164,7 +164,8 @@ class Evolution(Learning):
         return self.generation, s.generations, "generations"
 
     def describe(self, row: dict[str, float]) -> str:
-        done = f"{self.generation} generations  " if self.way()[2] != "generations" else ""
+        plural = "" if self.generation == 1 else "s"
+        done = f"{self.generation} generation{plural}  " if self.way()[2] != "generations" else ""
         return (
             f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
             f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"
