@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
+from commands import importable
 from test_pool import Answering, Evaluated, never_built
 from test_ray_pool import gone
 
@@ -72,7 +73,7 @@ def script(tmp_path: Path, root: Path) -> Iterator[Callable[..., subprocess.Pope
     def start(when: str, members: int) -> subprocess.Popen[str]:
         process = subprocess.Popen(
             [sys.executable, path, when, str(members)],
-            env=os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{root / 'tests'}"},
+            env=os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{importable(__file__)}"},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
