@@ -389,13 +389,14 @@ def _run(
 
 
 def _make_folder(prog: str, run: RunFolder) -> list[Path]:
-    """Make a run's folder. Returns the folders that were made for it, the innermost first."""
+    """Make a run's folder and lock it. Returns the folders that were made for it, the innermost first."""
+    from cluster.runs.run import RunError, lock
+
     made = [path for path in (run.path, *run.path.parents) if not path.exists()]
     try:
-        run.path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        _discard(made)
-        fail(prog, f"{run.path} cannot be made: {error.strerror}; choose another --output")
+        lock(run.path)
+    except RunError as error:
+        fail(prog, str(error))
     return made
 
 

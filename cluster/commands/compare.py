@@ -51,6 +51,7 @@ from cluster.comparison.results import (
 )
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CheckpointError
+from cluster.runs.run import RunError, lock
 from cluster.runs.settings import SettingsError, check_workers
 from evolution.networks.policy import Observation
 from gridsim.maps.scenarios import REGISTRY
@@ -146,8 +147,8 @@ def _compare(arguments: Sequence[str]) -> int:
         folder, flags = _prepare(arguments, flags)
         cells = folder.cells()
         uri = check_uri(flags.tracking_uri or None)
-        experiment.hold(folder.path)
-    except (ExperimentError, CheckpointError, SettingsError) as error:
+        lock(folder.path)
+    except (ExperimentError, CheckpointError, RunError, SettingsError) as error:
         fail(PROG, str(error))
     except TrackingError as error:
         fail(PROG, str(error))

@@ -14,7 +14,7 @@ from typing import Any
 from cluster.commands.progress import way
 from cluster.comparison.plan import COMPARISON, Cell, CellError
 from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, make_tracker, new_run, open_run
+from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, lock, make_tracker, new_run, open_run
 from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
 from cluster.tracking.mlflow_run import Status
 from cluster.training.trainer import Maps
@@ -101,7 +101,7 @@ class Cells:
                 self.note("compiling the simulator for this machine, once")
             warming.wait()
             kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
-            run.path.mkdir(parents=True, exist_ok=True)
+            lock(run.path)
             run.write_config()
             session.process_started = time.perf_counter()  # a budget is of learning, not of what is loaded for it
             session.learn()

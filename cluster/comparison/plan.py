@@ -8,7 +8,6 @@ comparison.json. Who trains a cell is a function that is passed in.
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import json
 import os
 import re
@@ -341,17 +340,6 @@ def new_folder(output: Path, name: str) -> Path:
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise ExperimentError(f"--output {output}: cannot be written; choose another folder")
     return path.absolute()
-
-
-def hold(path: Path) -> None:
-    """Make a comparison's folder and keep it for this process until that ends. Raises ExperimentError."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        fcntl.flock(os.open(path, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise ExperimentError(f"{path}: another process is at work on it; wait for it, or stop it") from None
-    except OSError as error:
-        raise ExperimentError(f"{path} cannot be made: {error.strerror}; choose another --output") from error
 
 
 def _word(scenario: str) -> str:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import fcntl
+import functools
 import hashlib
 import json
 import math
@@ -135,10 +137,26 @@ def _map_sha256(settings: RunSettings) -> str:
         raise SettingsError(str(error)) from error
 
 
+@functools.cache  # a process may ask again
+def lock(path: Path) -> None:
+    """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        folder = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise RunError(f"{path} cannot be made: {error.strerror}; choose another --output") from error
+    with contextlib.suppress(OSError):  # NFS cannot lock folders
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunError(f"{path}: another process is at work on it; wait for it, or stop it") from None
+
+
 def open_run(folder: Path) -> RunFolder:
-    """A run's folder to be resumed, its checkpoint read and checked. Raises RunError."""
+    """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError."""
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
+    lock(folder.resolve())
     settings, init = read_config(folder / CONFIG)
     run = RunFolder(folder.resolve(), settings, init, map_sha256=_map_sha256(settings))
     if not (folder / CHECKPOINT).is_file():

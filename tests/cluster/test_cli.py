@@ -17,7 +17,9 @@ import pytest
 from commands import BIN, answers, descendants, duration_s, finish, rows, start, summary, wait_until
 
 from cluster.commands.cli import REMOVED, EvolveFlags, evaluate_main, evolve_main
+from cluster.commands.compare import compare_main
 from cluster.commands.watch import watch_main
+from cluster.comparison.plan import Budget, ComparisonFolder, Plan
 from cluster.runs.checkpoint import save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import EvolveSettings
@@ -222,15 +224,15 @@ def test_wrong_use_is_one_clear_line(name, tmp_path):
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
-def said_by(monkeypatch, capsys, *arguments):
-    """What gridsim-evolve says on its standard error where it refuses to begin."""
-    monkeypatch.setattr(sys, "argv", ["gridsim-evolve", *arguments, "--workers", "0"])
+def said_by(monkeypatch, capsys, *arguments, main=evolve_main, prog="gridsim-evolve"):
+    """What a command says on its standard error where it refuses to begin."""
+    monkeypatch.setattr(sys, "argv", [prog, *arguments, "--workers", "0"])
     with pytest.raises(SystemExit) as ended:
-        evolve_main()
+        main()
     assert ended.value.code == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("gridsim-evolve: error: ")
+    assert err.startswith(f"{prog}: error: ")
     return err.splitlines()
 
 
@@ -327,6 +329,21 @@ def test_a_checkpoint_of_the_version_before_is_refused_beside_a_new_config(monke
     RunFolder(folder, EvolveSettings("curved")).write_config()
     (line,) = said_by(monkeypatch, capsys, "--resume", str(folder))
     assert "do not belong together" in line
+
+
+@pytest.mark.parametrize(("main", "prog"), [(evolve_main, "gridsim-evolve"), (compare_main, "gridsim-compare")])
+def test_a_folder_that_another_process_works_on_is_refused_in_one_line(main, prog, monkeypatch, capsys, tmp_path):
+    RunFolder(tmp_path, EvolveSettings("curved")).write_config()
+    ComparisonFolder(tmp_path, Plan(("curved",), ("dqn",), 1, Budget(car_steps=1000))).write()
+    hold = f"from cluster.runs.run import lock, Path; lock(Path({str(tmp_path)!r})); print(flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout
+        other.stdout.readline()
+        (line,) = said_by(monkeypatch, capsys, "--resume", str(tmp_path), main=main, prog=prog)
+        assert line.endswith(f"{tmp_path}: another process is at work on it; wait for it, or stop it")
+        other.communicate(b"\n")
+    (line,) = said_by(monkeypatch, capsys, "--resume", str(tmp_path))
+    assert "has no checkpoint.npz" in line
 
 
 @pytest.mark.e2e

@@ -10,7 +10,6 @@ from finished_runs import make_run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.comparison import plan as experiment
 from cluster.comparison.cells import Cells, settings_of
 from cluster.comparison.plan import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
 from cluster.comparison.results import LEARNERS, ExperimentError, learner_of
@@ -199,13 +198,6 @@ def test_damaged_comparison_is_refused(tmp_path, text):
     (tmp_path / "comparison.json").write_text(text)
     with pytest.raises(ExperimentError, match=r"comparison\.json"):
         open_comparison(tmp_path)
-
-
-def test_a_folder_is_worked_on_by_one_process(tmp_path):
-    experiment.hold(tmp_path / "c")
-    with pytest.raises(ExperimentError, match="another process is at work on it"):
-        experiment.hold(tmp_path / "c")
-    experiment.hold(tmp_path / "d")
 
 
 @pytest.mark.parametrize(("budget", "every"), [("200k", 20_000), ("1G", 1_000_000)])
