@@ -269,7 +269,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
     console = Console()
     try:
         flags, run = _prepare(kind, arguments)
-        from cluster.runs.run import is_finished, make_tracker
+        from cluster.runs.run import is_finished, log_missing, make_tracker
         from cluster.training.trainer import Maps
         from cluster.workers import kernels
         from cluster.workers.ray_pool import RayPool
@@ -277,10 +277,9 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         from gridsim.config import SimConfig
 
         if is_finished(run):
-            from cluster.tracking.resend import send
-
             first = kind.counts[0]
-            sent, lost = send(run, flags.tracking_uri, flags.experiment)
+            sent, lost = log_missing(run, flags.tracking_uri, flags.experiment)
+            sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
             console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
             if lost:
                 print(f"{prog}: warning: {lost}", file=sys.stderr)

@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.champion import Champion
+from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
 from cluster.runs.settings import SETTINGS, DqnSettings, EvolveSettings, RunSettings, SettingsError, from_dict, to_dict
 from cluster.tracking import description
-from cluster.tracking.address import TrackingError
+from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.tracker import Tracker
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Learning, Maps, held_out_episodes, now
@@ -264,8 +264,7 @@ class Session:
         learning, scenario = self.learning, self.run.settings.scenario
         if is_map_file(scenario) and (problem := short_lap(scenario, learning.sim)):
             learning.warn(problem)
-        for step, past in enumerate(learning.history):  # what MLflow has is skipped
-            self._log(step, past, learning.wall_before_s - past["wall_s"])
+        log_rows(self.tracker, learning.history)
         if learning.history:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
         learning.meanwhile, learning.out_of_time = self._save_last, self._out_of_time
@@ -297,12 +296,7 @@ class Session:
             learning = self.learning
             self.save()
             self._unsaved = False
-            self._log(learning.steps - 1, learning.history[-1])
-
-    def _log(self, step: int, row: dict[str, float], ago_s: float = 0.0) -> None:
-        metrics = {name: row[name] for name in self.learning.columns if name not in NOT_LOGGED}
-        self.tracker.log_row(step, metrics, ago_s)
-        self.tracker.wall_s = row["wall_s"]
+            log_rows(self.tracker, learning.history[-1:], learning.steps - 1)
 
     def save(self) -> None:
         """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
@@ -376,12 +370,7 @@ class Session:
         summary = self.finish(workers)
         self._drop_replay()
         note("logging to MLflow")
-        if not summary["mlflow_run_id"]:
-            with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
-                summary["mlflow_run_id"] = self.tracker.wait_ready(30.0)
-        write_summary(self.run.path, summary)
-        self.tracker.describe(description.describe(self.run, summary))
-        self.tracker.log_artifacts(self.run.path)
+        log_end(self.tracker, self.run, summary, description.describe(self.run, summary))
         return summary
 
     def _drop_replay(self) -> None:
@@ -422,6 +411,54 @@ def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "",
         run_id=known.get("run_id") if known.get("uri") == uri else None,
         key=run.tracking_key, start=False, note=description.describe(run), **more,
     )  # fmt: skip
+
+
+def log_rows(tracker: Tracker, rows: list[dict[str, float]], first: int = 0, ago_s: float = 0.0) -> None:
+    """Log rows of a history, of step `first` and those after it, the last one of so many seconds ago."""
+    for step, row in enumerate(rows, first):
+        metrics = {name: value for name, value in row.items() if name not in NOT_LOGGED}
+        tracker.log_row(step, metrics, ago_s + rows[-1]["wall_s"] - row["wall_s"])
+        tracker.wall_s = row["wall_s"]
+
+
+def log_end(tracker: Tracker, run: RunFolder, summary: dict[str, Any], note: str) -> None:
+    """Log the description and the files of a finished run; its summary gets the id of MLflow's run."""
+    if not summary.get("mlflow_run_id"):
+        with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
+            summary["mlflow_run_id"] = tracker.wait_ready(30.0)
+            write_summary(run.path, summary)
+    tracker.describe(note)
+    tracker.log_artifacts(run.path)
+
+
+def log_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
+    """Log what MLflow lacks of a finished run, with the times of then; what MLflow has is not touched.
+
+    Args: the run, opened; the tracking address, or "" for the one that the run has; the experiment.
+    Returns: what was logged, in a few words, and one line about what could not be, or None.
+    """
+    assert run.saved is not None
+    arrays, meta = run.saved
+    path = run.path / SUMMARY
+    try:
+        summary, ended = json.loads(path.read_bytes()), path.stat().st_mtime
+        model = description.torch_model(load_champion(run.path / CHAMPION), run.settings, summary["held_out"])
+        figures, note = description.held_out_metrics(summary["held_out"]), description.describe(run, summary)
+        uri = check_uri(uri or meta["tracking"]["uri"] or None)
+        tracker = make_tracker(run, uri, experiment, late=True, started=ended - summary["wall_s"])
+    except (CheckpointError, TrackingError) as error:
+        return "", f"what MLflow lacks is not sent: {error}"
+    except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited
+        reason = f"{run.path} has not the files of a finished run ({type(error).__name__})"
+        return "", f"what MLflow lacks is not sent: {reason}"
+    ago_s = time.time() - ended
+    log_rows(tracker, [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()], 0, ago_s)
+    tracker.log_summary(figures, ago_s=ago_s)
+    tracker.wall_s = summary["wall_s"]
+    tracker.log_model(run.path, model)
+    log_end(tracker, run, summary, note)
+    lost = tracker.close("FINISHED", timeout_s=60.0)
+    return str(tracker.sent), lost
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

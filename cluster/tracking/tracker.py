@@ -4,7 +4,7 @@ MLflow takes two seconds to import and to open its store, and milliseconds a row
 thread that is fed through a queue. What cannot be logged is kept, tried again, and in the end reported; it never stops
 a run. Every row is logged once: a resumed run asks MLflow what it has, and a request whose answer was lost is
 repeated with the same timestamps, which MLflow recognises. Nothing is kept for MLflow alone: the checkpoint holds the
-history and the run's folder the files, so that whoever opens the run again can send what is missing (`resend.send`).
+history and the run's folder the files, so that what is missing can be sent later (`run.log_missing`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sized
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -68,6 +68,10 @@ class Sent:
     rows: int = 0
     files: int = 0
     models: int = 0
+
+    def __str__(self) -> str:
+        counts = ((self.rows, "row"), (self.files, "file"), (self.models, "model"))
+        return ", ".join(_count(number, noun) for number, noun in counts if number)
 
 
 class Tracker:
@@ -260,8 +264,8 @@ class Tracker:
         self._thread.join(timeout_s)
         with self._changed:
             steps = [row.step for row in self._rows]
-            lost = [f"{_count(steps, 'row')} (step {_span(steps)})"] if steps else []
-            lost += [_count(self._files, "file")] if self._files else []
+            lost = [f"{_count(len(steps), 'row')} (step {_span(steps)})"] if steps else []
+            lost += [_count(len(self._files), "file")] if self._files else []
             lost += ["the model"] if self._model or self._model_error else []
             lost += [] if self._terminated else [f"the status {status}"]
             if lost:
@@ -406,8 +410,8 @@ def _check_name(name: str) -> None:
         raise ValueError(f"{name!r} is no name that MLflow allows")
 
 
-def _count(things: Sized, noun: str) -> str:
-    return f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _span(steps: list[int]) -> str:

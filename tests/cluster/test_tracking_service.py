@@ -17,8 +17,7 @@ import pytest
 from commands import finish, rows, start, summary, wait_until
 from tracked import client, drive_registered, free_port, mlflow_server
 
-from cluster.runs.run import open_run
-from cluster.tracking.resend import NOTHING, send
+from cluster.runs.run import log_missing, open_run
 
 pytestmark = pytest.mark.e2e
 
@@ -131,7 +130,7 @@ def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     assert run.info.end_time - run.info.start_time == pytest.approx(1000.0 * summary(folder)["wall_s"], abs=2.0)
 
     dump = [query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")]
-    assert send(open_run(folder), "", "gridsim") == (NOTHING, None)
+    assert log_missing(open_run(folder), "", "gridsim") == ("", None)
     assert dump == [
         query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")
     ]
@@ -158,8 +157,8 @@ def test_an_edited_run_is_finished_all_the_same_and_nothing_of_it_is_sent(served
     path = tmp_path / "edited/summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     before = query(served.database, "SELECT * FROM metrics")
-    sent, lost = send(open_run(tmp_path / "edited"), "", "gridsim")
-    assert sent == NOTHING
+    sent, lost = log_missing(open_run(tmp_path / "edited"), "", "gridsim")
+    assert sent == ""
     assert lost is not None
     assert lost.startswith("what MLflow lacks is not sent: ")
     assert "\n" not in lost
@@ -170,7 +169,7 @@ def test_a_server_that_is_away_is_no_reason_to_fail(served):
     uri = f"http://127.0.0.1:{free_port()}"
     done = finish(COMMAND, "--resume", "runs/during", "--tracking-uri", uri, cwd=served.cwd)
     assert done.returncode == 0
-    assert f"is finished: {GENERATIONS} generations; {NOTHING}." in done.stdout
+    assert f"is finished: {GENERATIONS} generations; nothing to do." in done.stdout
     assert re.fullmatch(
         rf"{COMMAND}: warning: what MLflow lacks is not sent: no MLflow server at {uri}: [^\n]*\n", done.stderr
     )
