@@ -18,9 +18,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
-from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, learner_of, part, read_json, read_run
+from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, read_json, read_run
 from cluster.runs import checkpoint
-from cluster.runs.run import CONFIG, SUMMARY
+from cluster.runs.run import CONFIG, SUMMARY, RunError, read_config
 from cluster.runs.settings import MAX_TRAFFIC
 from evolution.networks.policy import Observation
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
@@ -225,9 +225,12 @@ class Cell:
             if not self.folder.is_dir() or any(not path.name.startswith(".") for path in self.folder.iterdir()):
                 raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
             return
-        config = read_json(self.folder / CONFIG)
-        settings = part(config, "settings", self.folder / CONFIG)
+        try:
+            settings, _ = read_config(self.folder / CONFIG)
+        except RunError as error:
+            raise ExperimentError(str(error)) from error
         asked = {
+            "learner": self.learner,
             "scenario": self.scenario,
             "seed": self.seed,
             "traffic": self.traffic,
@@ -235,12 +238,11 @@ class Cell:
         }
         if self.plan.population and self.learner != "dqn":
             asked["population"] = self.plan.population
-        found = {name: settings.get(name) for name in asked} | {"learner": learner_of(config)}
-        for name, value in (asked | {"learner": self.learner}).items():
-            if found[name] != value:
+        for name, value in asked.items():
+            found = getattr(settings, name)
+            if found != value:
                 raise ExperimentError(
-                    f"{self.folder}: its {name} is {str(found[name])[:40]}, and {COMPARISON} asks for {value}; "
-                    "one of them was edited"
+                    f"{self.folder}: its {name} is {found}, and {COMPARISON} asks for {value}; one of them was edited"
                 )
 
 

@@ -18,10 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from cluster.runs import checkpoint
 from cluster.runs.champion import evaluate, load_champion
 from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.run import CHAMPION, CONFIG, HISTORY, SUMMARY, read_history
-from cluster.runs.settings import MAX_TRAFFIC
+from cluster.runs.run import CHAMPION, CONFIG, SUMMARY, RunError, read_config
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
-from evolution.networks.policy import Observation
 from gridsim.maps.scenarios import label
 
 if TYPE_CHECKING:
@@ -71,22 +69,6 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def part(content: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
-    """An object inside another. Raises ExperimentError."""
-    if not isinstance(content.get(name), dict):
-        raise ExperimentError(f"{path} is damaged: it has no {name}")
-    return content[name]
-
-
-def learner_of(config: Mapping[str, Any]) -> str:
-    """Which learner a run's config.json tells of."""
-    if config.get("command") == "gridsim-dqn":
-        return "dqn"
-    settings = config["settings"]
-    two = settings.get("search") == "evolution" and settings.get("recombination") == "two"
-    return "two-parents" if two else str(settings.get("search", ""))
-
-
 @dataclass(frozen=True)
 class Run:
     """A finished training run, of a comparison or any other.
@@ -116,61 +98,30 @@ def read_run(folder: Path) -> Run:
         raise ExperimentError(f"{folder} is no run's folder: it has no {CONFIG}")
     if not (folder / SUMMARY).is_file():
         raise ExperimentError(f"{folder} is not finished: it has no {SUMMARY}; finish it with --resume {folder}")
-    config, summary = read_json(folder / CONFIG), read_json(folder / SUMMARY)
-    settings = part(config, "settings", folder / CONFIG)
-    learner = learner_of(config)
-    traffic, observation = settings.get("traffic"), settings.get("observation")
-    scenario, seed = summary.get("scenario"), summary.get("seed")
-    if (settings.get("scenario"), settings.get("seed")) != (scenario, seed):
-        raise ExperimentError(f"{folder}: {CONFIG} and {SUMMARY} do not belong together; one of them was edited")
-    sound = (
-        isinstance(scenario, str)
-        and type(seed) is int
-        and type(traffic) is int
-        and 0 <= traffic <= MAX_TRAFFIC
-        and observation in get_args(Observation)
-        and learner in LEARNERS
-    )
-    if not sound:
-        raise ExperimentError(f"{folder / CONFIG} is damaged: its settings are not those of a run")
-    held_out = part(summary, "held_out", folder / SUMMARY)
-    figures = {name: held_out.get(name) for name in RUN_FIGURES[:4]}
-    figures |= {name: summary.get(name) for name in ("car_steps", "wall_s")}
-    for name, value in figures.items():
-        share = name.endswith("_rate")
-        if type(value) not in (int, float) or not 0.0 <= value <= (1.0 if share else 1e15):  # type: ignore[operator]
-            raise ExperimentError(f"{folder / SUMMARY} is damaged: its {name} is {str(value)[:40]}")
+    path = folder / SUMMARY
+    summary = read_json(path)
     try:
+        settings, _ = read_config(folder / CONFIG)
         champion = load_champion(folder / CHAMPION)
-    except CheckpointError as error:
+    except (CheckpointError, RunError) as error:
         raise ExperimentError(str(error)) from error
+    if (settings.scenario, settings.seed) != (summary.get("scenario"), summary.get("seed")):
+        raise ExperimentError(f"{folder}: {CONFIG} and {SUMMARY} do not belong together; one of them was edited")
     if champion.sha256 != summary.get("champion_sha256"):
         raise ExperimentError(f"{folder}: {CHAMPION} is not the champion that {SUMMARY} tells of")
-    figures |= _from_history(folder, summary)
+    if not isinstance(summary.get("held_out"), dict):
+        raise ExperimentError(f"{path} is damaged: it has no held_out")
+    figures = summary | summary["held_out"]
+    for name in RUN_FIGURES:
+        if name not in figures:
+            raise ExperimentError(f"{path} has no {name}; delete it, and make it again with --resume {folder}")
+        value = figures[name]
+        if type(value) not in (int, float) or not 0.0 <= value <= (1.0 if name.endswith("_rate") else 1e15):
+            raise ExperimentError(f"{path} is damaged: its {name} is {str(value)[:40]}")
     return Run(
-        folder, learner, scenario, seed, traffic, observation, champion.sha256,  # type: ignore[arg-type]
-        {name: float(figures[name]) for name in RUN_FIGURES},  # type: ignore[arg-type]
+        folder, settings.learner, settings.scenario, settings.seed, settings.traffic, settings.observation,
+        champion.sha256, {name: float(figures[name]) for name in RUN_FIGURES},
     )  # fmt: skip
-
-
-def _from_history(folder: Path, summary: Mapping[str, Any]) -> dict[str, float]:
-    """What training cost, and what it had cost when the final champion was bred (of the DQN: evaluated).
-
-    Raises: ExperimentError.
-    """
-    index = summary.get("champion_generation", summary.get("champion_evaluation"))
-    try:
-        history = read_history(folder / HISTORY)
-        found = {"training_s": history[-1]["wall_s"], "best_car_steps": math.nan, "best_wall_s": math.nan}
-        if type(index) is int and 0 <= index < len(history):
-            found |= {f"best_{name}": history[index][name] for name in ("car_steps", "wall_s")}
-    except OSError as error:
-        raise ExperimentError(f"{folder / HISTORY}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ExperimentError(f"{folder / HISTORY} is damaged: {type(error).__name__}") from error
-    if any(value < 0.0 or math.isinf(value) for value in found.values()):
-        raise ExperimentError(f"{folder / HISTORY} is damaged: row {index} is not that of a run")
-    return found
 
 
 # ------------------------------------------------------------------------------------------------------- errors
@@ -234,10 +185,10 @@ class Errors:
             content = read_json(path)
             if (content["format"], content["gridsim"]) == (FORMAT, version("gridsim")):
                 self._kept = {
-                    str(key): {name: _number(values[name]) for name in ERROR_FIGURES}
+                    str(key): {name: float("nan" if values[name] is None else values[name]) for name in ERROR_FIGURES}
                     for key, values in content["errors"].items()
                 }
-        except (ExperimentError, KeyError, TypeError, AttributeError):
+        except (ExperimentError, LookupError, TypeError, ValueError, AttributeError):
             pass  # it can be measured again
 
     def of(self, run: Run) -> Run:
@@ -255,12 +206,3 @@ class Errors:
         }
         content = {"format": FORMAT, "gridsim": version("gridsim"), "errors": kept}
         checkpoint.write_atomic(self._path, (json.dumps(content, indent=1) + "\n").encode(), durable=False)
-
-
-def _number(value: object) -> float:
-    """A number that was written to JSON, null for what is none. Raises TypeError."""
-    if value is None:
-        return math.nan
-    if type(value) not in (int, float):
-        raise TypeError
-    return float(value)  # type: ignore[arg-type]

@@ -8,7 +8,6 @@ process, the folder holds a whole step, the last or the one before, and a resume
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
 import fcntl
 import functools
@@ -343,6 +342,7 @@ class Session:
                 f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
             )  # fmt: skip
         self.tracker.wall_s = wall = self._wall_s()
+        best = learning.history[learning.champion.generation]
         summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracker.run_id or "",
@@ -358,6 +358,8 @@ class Session:
             "validation_success_rate": learning.champion.success_rate,
             "solved": learning.solved,
             "lost_chunks": learning.lost_chunks,
+            "training_s": learning.history[-1]["wall_s"],
+            **{f"best_{name}": best[name] for name in ("car_steps", "wall_s")},
             "held_out": figures,
         }
         self.tracker.log_summary(description.held_out_metrics(figures))
@@ -464,9 +466,3 @@ def log_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | N
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:
     """Write summary.json, the mark of a finished run."""
     checkpoint.write_atomic(folder / SUMMARY, (json.dumps(summary, indent=2) + "\n").encode())
-
-
-def read_history(path: Path) -> list[dict[str, float]]:
-    """Rows of a history.csv."""
-    with path.open(newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]

@@ -82,6 +82,11 @@ class RunSettings:
         """What learns: evolution, random or dqn."""
         raise NotImplementedError
 
+    @property
+    def learner(self) -> str:
+        """What a comparison calls it, which tells the two ways of recombination apart."""
+        return self.algorithm
+
     def curriculum(self) -> CurriculumConfig:
         """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
         low, _ = speed_interval(self.scenario)
@@ -181,6 +186,10 @@ class EvolveSettings(RunSettings):
     @property
     def algorithm(self) -> str:
         return self.search
+
+    @property
+    def learner(self) -> str:
+        return "two-parents" if (self.search, self.recombination) == ("evolution", "two") else self.search
 
     def search_config(self) -> SearchConfig:
         """The search's parameters."""

@@ -7,9 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from commands import rows
 
 from cluster.runs.checkpoint import CheckpointError, load, save
-from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run, read_history
+from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run
 from cluster.runs.settings import EvolveSettings
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import MAX_TRIED, Champion, Maps
@@ -499,7 +500,7 @@ def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, 
         resumed.learn()
     assert resumed.interrupted
     assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 3
-    assert len(read_history(tmp_path / "history.csv")) == 3
+    assert len(rows(tmp_path)) == 3
 
 
 def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):

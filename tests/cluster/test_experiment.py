@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from cluster.comparison.cells import Cells, settings_of
 from cluster.comparison.plan import Budget, CellError, ComparisonFolder, Plan, open_comparison, read_runs, train
-from cluster.comparison.results import LEARNERS, ExperimentError, learner_of
+from cluster.comparison.results import LEARNERS, ExperimentError
 from cluster.runs import checkpoint
 from cluster.runs.run import RunFolder
-from cluster.runs.settings import DqnSettings, to_dict
+from cluster.runs.settings import DqnSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.scenarios import REGISTRY
 
@@ -113,7 +113,7 @@ def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, tra
     for cell in plan.cells(tmp_path):
         settings = settings_of(cell)
         settings.check()
-        assert learner_of({"command": settings.command, "settings": to_dict(settings)}) == cell.learner
+        assert settings.learner == cell.learner
         specs.setdefault(cell.learner, set()).add(PolicySpec.parse(settings.policy))
     assert set(specs) == set(LEARNERS)
     assert {spec.observation for found in specs.values() for spec in found} == {observation}

@@ -7,6 +7,8 @@ import numpy as np
 
 from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
 from cluster.runs.champion import Champion
+from cluster.runs.run import RunFolder
+from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
@@ -21,17 +23,19 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, 
     genome = rng.standard_normal(genes).astype(np.float32)
     champion = Champion(genome, "mlp:6,7", scenario, SimConfig(), traffic)
     champion.save(folder / "champion.npz")
-    settings = {"scenario": scenario, "seed": seed, "traffic": traffic, "observation": "rays", "population": 512}
-    config = {"command": "gridsim-dqn" if learner == "dqn" else "gridsim-evolve", "settings": settings}
+    settings: RunSettings = DqnSettings(scenario, traffic, seed, policy="mlp:6,7")
     if learner != "dqn":
-        settings["search"] = "random" if learner == "random" else "evolution"
-        settings["recombination"] = "two" if learner == "two-parents" else "all"
+        settings = EvolveSettings(
+            scenario, traffic, seed, policy="mlp:6,7", population=512,
+            search="random" if learner == "random" else "evolution",
+            recombination="two" if learner == "two-parents" else "all",
+        )  # fmt: skip
     summary = {
         "scenario": scenario, "seed": seed, "car_steps": 5000, "wall_s": 12.5, "champion_generation": 1,
+        "training_s": 6.0, "best_car_steps": 3000.0, "best_wall_s": 4.0,
         "champion_sha256": champion.sha256, "held_out": HELD_OUT, **more,
     }  # fmt: skip
-    (folder / "config.json").write_text(json.dumps(config))
-    (folder / "history.csv").write_text("generation,car_steps,wall_s\n0,1000,2.0\n1,3000,4.0\n2,5000,6.0\n")
+    RunFolder(folder, settings).write_config()
     (folder / "summary.json").write_text(json.dumps(summary))
     return summary
 
