@@ -25,17 +25,15 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
-from gridsim.car.reward import reward
+from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
-from gridsim.counter import GOLDEN, mix
+from gridsim.envs.episodes import Episodes
+from gridsim.envs.observing import Observer
 from gridsim.envs.simulator import Simulator
-from gridsim.jit import njit
-from gridsim.maps.map import Map, starts_at
-from gridsim.maps.roads import clearance
-from gridsim.maps.scenarios import TRAINING_SEED, build, check_name, default_traffic, is_map_file, map_of
-from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
+from gridsim.sensing.grid import grids
 from gridsim.traffic.world import LANE
 
 if TYPE_CHECKING:
@@ -46,37 +44,6 @@ RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture a control period: true spe
 _F, _U = np.float32, np.uint64
 _NAMES = np.array([end.name.lower() for end in End])
 _TIME = int(End.TIME)  # a plain number: comparing arrays with an IntEnum is slow
-
-
-@njit
-def _draw(keys, episodes, which, numbers, drawn):
-    """For cars `which` [k] in their episodes: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
-    for k in range(which.shape[0]):
-        i = which[k]
-        episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)
-        drawn[k] = mix(episode + _U(3) * GOLDEN)
-        for j in range(2):
-            numbers[k, j] = (mix(episode + _U(j + 1) * GOLDEN) >> _U(11)) * (1.0 / (1 << 53))
-
-
-@njit
-def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slowest, limit, dt, observations, rewards):
-    """Observations [n, rays + 1], if not None, and rewards [n]; `fastest` m/s: upper speed of each car's scenario."""
-    rays = ranges.shape[1]
-    for i in range(ranges.shape[0]):
-        speed = speeds[i]
-        if observations is not None:
-            for r in range(rays):
-                observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
-            if closing is not None:
-                for r in range(rays):
-                    observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
-            last = rays if closing is None else 2 * rays
-            observations[i, last] = min(max(speed / limit, slowest), _F(1.0))
-        if begun[i]:
-            rewards[i] = _F(0.0)
-        else:
-            rewards[i] = reward(ranges[i], reach, speed, progress[i], ends[i], fastest[i], dt)
 
 
 class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -149,32 +116,16 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = num_envs
         self.config = config or SimConfig()
         self.scenario = scenario
-        if isinstance(maps, int) and is_map_file(scenario):
-            maps = [build(scenario, map_seed, self.config)] * min(maps, 1)
-        given = [] if isinstance(maps, int) else list(maps)
-        self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in given]
-        if not self._seeds:
-            raise ValueError("an environment needs 1 map or more")
         self.traffic = default_traffic(scenario) if traffic is None else traffic
-        self.simulator = Simulator(given, num_envs, self.config, max_steps=max_episode_steps, traffic=self.traffic)
-        self._index = {seed: k for k, seed in enumerate(self._seeds) if given}  # of each map among the simulator's
+        self.simulator = Simulator([], num_envs, self.config, max_steps=max_episode_steps, traffic=self.traffic)
+        self._episodes = Episodes(num_envs, scenario, maps, map_seed, self.config)
+        self.simulator.scenarios = self._episodes.maps
         self.render_mode = render_mode
         self._views: dict[int, Renderer] = {}  # by map
         self._window: Window | None = None
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
-        self._motion, self._steering = motion, steering
-        rays = self.config.sensors.rays
-        self._width = (2 if motion else 1) * rays + 1 + steering
-        low = np.zeros(self._width, dtype=np.float32)
-        low[rays:] = -1.0
-        self._slowest = _F(-self.config.vehicle.reverse_limit / self.config.vehicle.speed_limit)
-        low[self._width - 1 - steering] = self._slowest
-        self._table = grid_table(self.config) if observation == "grid" else None
-        self._stack = np.zeros((num_envs, frames, CELLS, CELLS), dtype=np.uint8) if observation == "grid" else None
-        self.single_observation_space = Box(low, np.ones_like(low))
-        if observation == "grid":
-            shape = (CELLS, CELLS) if frames == 1 else (frames, CELLS, CELLS)
-            self.single_observation_space = Box(0, 255, shape, dtype=np.uint8)
+        self._observer = Observer(self.simulator, observation, frames, motion, steering)
+        self.single_observation_space = self._observer.space
         self.single_action_space: Discrete | Box = Discrete(len(Action))
         if actions == "continuous":
             self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
@@ -182,10 +133,8 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         #: float32 [n, rays], m: the ranges that the last observations were made of.
         self.ranges = np.zeros((num_envs, self.config.sensors.rays), dtype=np.float32)
-        self._keys: np.ndarray | None = None  # uint64 [n], each car's seed; None before the first reset
-        self._episodes = np.zeros(num_envs, dtype=np.uint64)  # number of each car's episode since it was seeded
         self._fastest = np.ones(num_envs, dtype=np.float32)  # m/s, upper speed of each car's scenario
-        self._started = False
+        self._seeded = self._started = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -205,17 +154,18 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(f"unknown option {next(iter(options))!r}; there are: map_seed, start")
         self._started = False
         super().reset(seed=seed)
-        if seed is not None or self._keys is None:
+        if seed is not None or not self._seeded:
             first = int(self.np_random.integers(1 << 63)) if seed is None else seed
-            self._keys = _U(first % (1 << 64)) + np.arange(self.num_envs, dtype=np.uint64)
-            self._episodes[:] = 0
+            self._episodes.keys[:] = _U(first % (1 << 64)) + np.arange(self.num_envs, dtype=np.uint64)
+            self._episodes.numbers[:] = 0
+            self._seeded = True
         else:
-            self._episodes += _U(1)
+            self._episodes.numbers += _U(1)
         if map_seed is not None:
-            self._keep_own_maps()
-        maps, starts, keys = self._episode(np.arange(self.num_envs), map_seed, start)
+            self._episodes.keep_own_maps()
+        maps, starts, keys = self._episodes.draw(np.arange(self.num_envs), map_seed, start)
         ranges, speeds = self.simulator.reset(starts, maps, keys=keys)
-        self._fastest[:] = self._upper_speeds(maps)
+        self._fastest[:] = self._episodes.upper_speeds(maps)
         self._started = True
         progress, begun = np.zeros(self.num_envs, dtype=np.float32), np.ones(self.num_envs, dtype=np.bool_)
         observations, _ = self._observe(ranges, speeds, progress, self.simulator.state.ends, begun)
@@ -239,119 +189,24 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ranges, speeds, progress, ends = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
-            self._episodes[which] += _U(1)
-            maps, starts, keys = self._episode(which)
+            self._episodes.numbers[which] += _U(1)
+            maps, starts, keys = self._episodes.draw(which)
             ranges[which], speeds[which] = self.simulator.reset(starts, maps, which, keys)
             ends[which] = End.RUNNING
-            self._fastest[which] = self._upper_speeds(maps)
+            self._fastest[which] = self._episodes.upper_speeds(maps)
         observations, rewards = self._observe(ranges, speeds, progress, ends, begun)
         truncations = ends == _TIME
         terminations = (ends != 0) ^ truncations
         return observations, rewards, terminations, truncations, self._info(speeds, ends)
 
-    def _keep_own_maps(self) -> None:
-        """Forget the maps that were asked for by a reset and are not among those that episodes are drawn from."""
-        kept = [seed for seed in self._seeds if seed in self._index]
-        self.simulator.scenarios[:] = [self.simulator.scenarios[self._index[seed]] for seed in kept]
-        self._index = {seed: k for k, seed in enumerate(kept)}
-
-    def _map(self, seed: int) -> int:
-        """Index among the simulator's scenarios of the map of a seed, built where it is not there yet."""
-        seed = map_of(self.scenario, seed)
-        if seed not in self._index:
-            self.simulator.scenarios.append(build(self.scenario, seed, self.config))
-            self._index[seed] = len(self.simulator.scenarios) - 1
-        return self._index[seed]
-
-    def _upper_speeds(self, maps: np.ndarray) -> np.ndarray:
-        """Upper speed (m/s) of the scenario of each of maps [k]."""
-        return np.array([s.road.speed_high for s in self.simulator.scenarios], dtype=np.float32)[maps]
-
-    def _episode(
-        self, which: np.ndarray, map_seed: Any = None, start: Any = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and traffic's keys [k] of the present episodes of cars `which`, drawn or given."""
-        numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
-        _draw(self._keys, self._episodes, which, numbers, keys)
-        if map_seed is None:
-            drawn = (numbers[:, 0] * len(self._seeds)).astype(np.intp)
-            index = {k: self._map(self._seeds[k]) for k in np.unique(drawn)}
-            maps = np.array([index[k] for k in drawn])
-        else:
-            seeds = np.asarray(map_seed)
-            if seeds.dtype.kind not in "iu" or seeds.shape not in ((), which.shape) or seeds.min() < 0:
-                raise ValueError(f"map_seed must be a whole number from 0, or {len(which)} of them, not {map_seed!r}")
-            maps = np.array([self._map(int(seed)) for seed in np.broadcast_to(seeds, which.shape)])
-        starts = np.empty((len(which), 5), dtype=np.float32)
-        if start is None:
-            for m in np.unique(maps):
-                of = np.flatnonzero(maps == m)
-                starts[of] = starts_at(self.simulator.scenarios[m], numbers[of, 1])
-        else:
-            starts[:] = self._checked_start(start, maps)
-        return maps, starts, keys
-
-    def _checked_start(self, start: Any, maps: np.ndarray) -> np.ndarray:
-        """A caller's start, float32 [n, 5]."""
-        vehicle = self.config.vehicle
-        try:
-            starts = np.broadcast_to(np.asarray(start, dtype=np.float32), (len(maps), 5))
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"start must be x, y, heading, speed, steering, or {len(maps)} rows of these, not {start!r}"
-            ) from None
-        if not np.isfinite(starts).all():
-            raise ValueError(f"start must be five finite numbers, not {start!r}")
-        for m, (x, y, _, speed, steering) in zip(maps, starts, strict=True):
-            if not -vehicle.reverse_limit <= speed <= vehicle.speed_limit:
-                raise ValueError(f"a start's speed must be within the car's limits, not {speed:g} m/s")
-            if abs(steering) > np.radians(vehicle.steering_limit) + 1e-6:
-                raise ValueError(f"a start's steering must be within the car's limits, not {steering:g} rad")
-            if clearance(self.simulator.scenarios[m].road, x, y) < 0.0:
-                raise ValueError(f"a start must be on the road, not at {x:g} m, {y:g} m")
-        return starts
-
     def _observe(
         self, ranges: np.ndarray, speeds: np.ndarray, progress: np.ndarray, ends: np.ndarray, begun: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Observations and rewards [n] of a step."""
-        n = len(ranges)
-        rewards = np.empty(n, dtype=np.float32)
-        observations = np.empty((n, self._width), dtype=np.float32) if self._table is None else None
-        _observe(
-            ranges,
-            self.simulator.closing if self._motion else None,
-            speeds,
-            progress,
-            ends,
-            self._fastest,
-            begun,
-            _F(self.config.sensors.range),
-            self._slowest,
-            _F(self.config.vehicle.speed_limit),
-            _F(self.config.episode.control_period),
-            observations,
-            rewards,
-        )
         self.ranges = ranges
         if self.render_mode is not None:
             self._remember(begun)
-        if observations is None:
-            return self._grids(begun), rewards
-        if self._steering:
-            limit = np.radians(self.config.vehicle.steering_limit)
-            observations[:, -1] = np.clip(self.simulator.state.cars[:, STEERING] / limit, -1.0, 1.0)
-        return observations, rewards
-
-    def _grids(self, begun: np.ndarray) -> np.ndarray:
-        """Occupancy grids of the present ranges, stacked if so asked; the caller's own."""
-        assert self._table is not None
-        assert self._stack is not None
-        now = grids(self._table, self.ranges)
-        if self._stack.shape[1] == 1:
-            return now
-        push_frames(self._stack, now, begun)
-        return self._stack.copy()
+        return self._observer.look(ranges, speeds, progress, ends, begun, self._fastest)
 
     # ---------------------------------------------------------------------------------------------------- pictures
 
@@ -376,7 +231,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """What car i's world looks like: uint8 [height, width, 3]."""
         from gridsim.view.render import Renderer  # here, because nothing else needs pygame
 
-        state = self.simulator.state
+        state, table = self.simulator.state, self._observer.table
         m = int(state.maps[i])
         view = self._views.get(m)
         if view is None or view.scenario is not self.simulator.scenarios[m]:
@@ -386,8 +241,8 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return view.draw(
             state.cars[i],
             boxes=others,
-            ranges=self.ranges[i] if self._table is None else None,
-            grid=None if self._table is None else grids(self._table, self.ranges[i : i + 1])[0],
+            ranges=self.ranges[i] if table is None else None,
+            grid=None if table is None else grids(table, self.ranges[i : i + 1])[0],
             path=np.array(self._paths[i]),
             text=f"{speed:.1f} m/s    {distance:,.0f} m",
         )

@@ -1,0 +1,116 @@
+"""Which episodes cars meet: map, start and traffic follow from a car's seed and from the episode's number alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gridsim.config import SimConfig
+from gridsim.counter import GOLDEN, mix
+from gridsim.jit import njit
+from gridsim.maps.map import Map, starts_at
+from gridsim.maps.roads import clearance
+from gridsim.maps.scenarios import build, is_map_file, map_of
+
+_U = np.uint64
+
+
+@njit
+def _draw(keys, episodes, which, numbers, drawn):
+    """For cars `which` [k] in their episodes: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
+    for k in range(which.shape[0]):
+        i = which[k]
+        episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)
+        drawn[k] = mix(episode + _U(3) * GOLDEN)
+        for j in range(2):
+            numbers[k, j] = (mix(episode + _U(j + 1) * GOLDEN) >> _U(11)) * (1.0 / (1 << 53))
+
+
+class Episodes:
+    """The episodes of a batch of cars.
+
+    Attributes:
+        maps: those that are built; a simulator's scenarios.
+        keys: uint64 [n], each car's seed.
+        numbers: uint64 [n], of each car's episode since it was seeded.
+    """
+
+    def __init__(self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, config: SimConfig):
+        """Episodes on `maps`, or on so many from `map_seed` on, which are built when first needed.
+
+        Raises: ValueError with one line where there is no map.
+        """
+        self.scenario, self.config = scenario, config
+        if isinstance(maps, int) and is_map_file(scenario):
+            maps = [build(scenario, map_seed, config)] * min(maps, 1)
+        self.maps: list[Map] = [] if isinstance(maps, int) else list(maps)
+        self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in maps]
+        if not self._seeds:
+            raise ValueError("an environment needs 1 map or more")
+        self._index = {seed: k for k, seed in enumerate(self._seeds) if self.maps}  # of each map that is built
+        self.keys = np.zeros(cars, dtype=np.uint64)
+        self.numbers = np.zeros(cars, dtype=np.uint64)
+
+    def draw(
+        self, which: np.ndarray, map_seed: Any = None, start: Any = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Maps [k], starts [k, 5] and traffic's keys [k] of the present episodes of cars `which`, drawn or given."""
+        numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
+        _draw(self.keys, self.numbers, which, numbers, keys)
+        if map_seed is None:
+            drawn = (numbers[:, 0] * len(self._seeds)).astype(np.intp)
+            index = {k: self._map(self._seeds[k]) for k in np.unique(drawn)}
+            maps = np.array([index[k] for k in drawn])
+        else:
+            seeds = np.asarray(map_seed)
+            if seeds.dtype.kind not in "iu" or seeds.shape not in ((), which.shape) or seeds.min() < 0:
+                raise ValueError(f"map_seed must be a whole number from 0, or {len(which)} of them, not {map_seed!r}")
+            maps = np.array([self._map(int(seed)) for seed in np.broadcast_to(seeds, which.shape)])
+        starts = np.empty((len(which), 5), dtype=np.float32)
+        if start is None:
+            for m in np.unique(maps):
+                of = np.flatnonzero(maps == m)
+                starts[of] = starts_at(self.maps[m], numbers[of, 1])
+        else:
+            starts[:] = self._checked_start(start, maps)
+        return maps, starts, keys
+
+    def upper_speeds(self, maps: np.ndarray) -> np.ndarray:
+        """Upper speed (m/s) of the scenario of each of maps [k]."""
+        return np.array([s.road.speed_high for s in self.maps], dtype=np.float32)[maps]
+
+    def keep_own_maps(self) -> None:
+        """Forget the maps that were asked for by a reset and are not among those that episodes are drawn from."""
+        kept = [seed for seed in self._seeds if seed in self._index]
+        self.maps[:] = [self.maps[self._index[seed]] for seed in kept]
+        self._index = {seed: k for k, seed in enumerate(kept)}
+
+    def _map(self, seed: int) -> int:
+        """Index among `maps` of the map of a seed, built where it is not there yet."""
+        seed = map_of(self.scenario, seed)
+        if seed not in self._index:
+            self.maps.append(build(self.scenario, seed, self.config))
+            self._index[seed] = len(self.maps) - 1
+        return self._index[seed]
+
+    def _checked_start(self, start: Any, maps: np.ndarray) -> np.ndarray:
+        """A caller's start, float32 [n, 5]."""
+        vehicle = self.config.vehicle
+        try:
+            starts = np.broadcast_to(np.asarray(start, dtype=np.float32), (len(maps), 5))
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"start must be x, y, heading, speed, steering, or {len(maps)} rows of these, not {start!r}"
+            ) from None
+        if not np.isfinite(starts).all():
+            raise ValueError(f"start must be five finite numbers, not {start!r}")
+        for m, (x, y, _, speed, steering) in zip(maps, starts, strict=True):
+            if not -vehicle.reverse_limit <= speed <= vehicle.speed_limit:
+                raise ValueError(f"a start's speed must be within the car's limits, not {speed:g} m/s")
+            if abs(steering) > np.radians(vehicle.steering_limit) + 1e-6:
+                raise ValueError(f"a start's steering must be within the car's limits, not {steering:g} rad")
+            if clearance(self.maps[m].road, x, y) < 0.0:
+                raise ValueError(f"a start must be on the road, not at {x:g} m, {y:g} m")
+        return starts
