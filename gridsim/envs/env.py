@@ -42,17 +42,19 @@ if TYPE_CHECKING:
 RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture a control period: true speed
 
 _F, _U = np.float32, np.uint64
-_NAMES = np.array([end.name.lower() for end in End])
-_TIME = int(End.TIME)  # a plain number: comparing arrays with an IntEnum is slow
+_SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
+#: bool [ends]: what terminates and what truncates an episode.
+TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])
+TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 
 
 class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many cars at once, each in an episode of its own.
 
     The step after an episode's end begins the next one and does not drive (`AutoresetMode.NEXT_STEP`, which all of
-    Gymnasium's wrappers know). info: `distance_m` (new ground of the episode so far), `speed_mps` and `end` (`running`,
-    `collision`, `idle`, `success` or `time`), arrays [n]. Collision, idle and success terminate; `time`, the time
-    limit, truncates.
+    Gymnasium's wrappers know). info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and
+    `end`, the number of an `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate:
+    the road goes on, and neither is observed.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form
@@ -169,7 +171,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._started = True
         progress, begun = np.zeros(self.num_envs, dtype=np.float32), np.ones(self.num_envs, dtype=np.bool_)
         observations, _ = self._observe(ranges, speeds, progress, self.simulator.state.ends, begun)
-        return observations, self._info(speeds, self.simulator.state.ends)
+        return observations, self._info(speeds, self.simulator.state.ends.copy())
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode where the last step ended one.
@@ -195,9 +197,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ends[which] = End.RUNNING
             self._fastest[which] = self._episodes.upper_speeds(maps)
         observations, rewards = self._observe(ranges, speeds, progress, ends, begun)
-        truncations = ends == _TIME
-        terminations = (ends != 0) ^ truncations
-        return observations, rewards, terminations, truncations, self._info(speeds, ends)
+        return observations, rewards, TERMINATES[ends], TRUNCATES[ends], self._info(speeds, ends)
 
     def _observe(
         self, ranges: np.ndarray, speeds: np.ndarray, progress: np.ndarray, ends: np.ndarray, begun: np.ndarray
@@ -268,14 +268,16 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._window = None
 
     def _info(self, speeds: np.ndarray, ends: np.ndarray) -> dict[str, Any]:
-        """Distance, speed and end of every car, in Gymnasium's form: each with a mask of whose it is."""
+        """Distance, speed, success and end of every car, in Gymnasium's form: each with a mask of whose it is."""
         all_of_them = np.ones(self.num_envs, dtype=np.bool_)
         return {
             "distance_m": self.simulator.state.cars[:, DISTANCE].copy(),
             "speed_mps": speeds,
-            "end": _NAMES[ends],
+            "is_success": ends == _SUCCESS,
+            "end": ends,
             "_distance_m": all_of_them,
             "_speed_mps": all_of_them,
+            "_is_success": all_of_them,
             "_end": all_of_them,
         }
 

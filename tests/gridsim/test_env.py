@@ -161,11 +161,13 @@ def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Map]) -> None
             for k in np.flatnonzero(running & (terminations | truncations)):
                 row = results[0, k]
                 assert (row["distance"], row["steps"]) == (np.float32(info["distance_m"][k]), step)
-                assert End(row["end"]).name.lower() == info["end"][k]
+                assert row["end"] == info["end"][k]
+                assert info["is_success"][k] == (row["end"] == End.SUCCESS)
+                assert truncations[k] == (row["end"] in (End.SUCCESS, End.TIME))
             ends |= set(info["end"][running])
             running &= ~(terminations | truncations)
         assert not running.any()
-    assert ends == {"running", "collision", "idle", "success", "time"}
+    assert ends == set(End)
 
 
 def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Map]) -> None:
@@ -187,11 +189,14 @@ def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Map]) -> No
 # --- ends, rewards, automatic resets
 
 
-def test_time_truncates_and_everything_else_terminates(maps: list[Map]) -> None:
+def test_success_and_time_truncate_and_everything_else_terminates(maps: list[Map]) -> None:
     timed = GridSimEnv(maps=maps, max_episode_steps=3)
     timed.reset(seed=0)
     outcomes = [timed.step(Action.NONE) for _ in range(3)]
-    assert [(o[2], o[3], o[4]["end"]) for o in outcomes] == [(False, False, "running")] * 2 + [(False, True, "time")]
+    assert [(o[2], o[3], o[4]["end"]) for o in outcomes] == [(False, False, End.RUNNING)] * 2 + [
+        (False, True, End.TIME)
+    ]
+    assert not any(o[4]["is_success"] for o in outcomes)
 
     crashing = GridSimEnv(maps=maps)
     crashing.reset(seed=0)
@@ -200,7 +205,7 @@ def test_time_truncates_and_everything_else_terminates(maps: list[Map]) -> None:
         if term or trunc:
             break
         assert 0.0 < reward <= 1.0
-    assert (term, trunc, info["end"], reward) == (True, False, "collision", -1.0)
+    assert (term, trunc, info["end"], reward) == (True, False, End.COLLISION, -1.0)
 
     parked = GridSimEnv(maps=maps)
     parked.reset(seed=0)
@@ -208,16 +213,17 @@ def test_time_truncates_and_everything_else_terminates(maps: list[Map]) -> None:
         _, reward, term, trunc, info = parked.step(Action.BRAKE)
         if term or trunc:
             break
-    assert (term, trunc, info["end"], info["speed_mps"]) == (True, False, "idle", 0.0)
+    assert (term, trunc, info["end"], info["speed_mps"]) == (True, False, End.IDLE, 0.0)
     assert reward > 0.0
 
     short = GridSimEnv(maps=maps, config=SimConfig(episode=EpisodeConfig(target=1.0)))
     short.reset(seed=0)
     for _ in range(10):
-        *_, term, trunc, info = short.step(Action.ACCELERATE)
+        _, reward, term, trunc, info = short.step(Action.ACCELERATE)
         if term or trunc:
             break
-    assert (term, trunc, info["end"]) == (True, False, "success")
+    assert (term, trunc, info["end"], info["is_success"]) == (False, True, End.SUCCESS, True)
+    assert reward > 0.0
     assert info["distance_m"] >= 1.0
 
 
@@ -247,7 +253,7 @@ def test_the_step_after_an_end_begins_the_next_episode_and_does_not_drive(maps: 
     _, rewards, terminations, truncations, info = env.step(np.full(8, Action.ACCELERATE))
     assert not (terminations | truncations | (rewards != 0.0) | (info["distance_m"] != 0.0)).any()
     np.testing.assert_array_equal(info["speed_mps"], 0.0)
-    assert set(info["end"]) == {"running"}
+    assert set(info["end"]) == {End.RUNNING}
     *_, info = env.step(np.full(8, Action.ACCELERATE))
     assert (info["distance_m"] > 0.0).all()
 
@@ -312,7 +318,7 @@ def test_wrappers_of_vector_environments_work(maps: list[Map]) -> None:
         assert len(infos) == n
         for k in np.flatnonzero(over):
             assert infos[k]["episode"]["r"] == pytest.approx(returns[k], abs=1e-4)
-            assert infos[k]["end"] in {"collision", "time"}
+            assert infos[k]["end"] in {End.COLLISION, End.TIME}
             counted += 1
     assert counted > n
 
@@ -327,7 +333,8 @@ def test_the_native_environment_equals_gymnasiums_own_vector_of_singles(maps: li
             np.testing.assert_array_equal(a, b)
         assert ours[4].keys() == theirs[4].keys()
         np.testing.assert_array_equal(ours[4]["distance_m"], theirs[4]["distance_m"])
-        np.testing.assert_array_equal(ours[4]["end"], theirs[4]["end"].astype(str))
+        np.testing.assert_array_equal(ours[4]["end"], theirs[4]["end"])
+        np.testing.assert_array_equal(ours[4]["is_success"], theirs[4]["is_success"])
 
 
 # --- wrong use

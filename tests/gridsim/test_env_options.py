@@ -11,7 +11,7 @@ from driving import SENSING, drive
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from gridsim.car.ego import DISTANCE, SPEED
+from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.simulator import views
@@ -151,7 +151,7 @@ def test_the_reward_among_traffic_is_the_papers(maps: dict[str, list[Map]]) -> N
             )
             if over[i]:
                 expected = 0.0
-            elif info["end"][i] == "collision":
+            elif info["end"][i] == End.COLLISION:
                 expected = -1.0
                 collisions += 1
             assert rewards[i] == pytest.approx(expected, abs=2e-5)
@@ -175,7 +175,8 @@ def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Map]], name: str) -> N
         for a, b in zip(ours, theirs, strict=True):  # what an observation is made of changes nothing else
             np.testing.assert_array_equal(a, b)
     assert len(np.unique(seen)) == 3
-    assert set(info) == {"distance_m", "speed_mps", "end", "_distance_m", "_speed_mps", "_end"}
+    named = {"distance_m", "speed_mps", "is_success", "end"}
+    assert set(info) == named | {f"_{name}" for name in named}
 
 
 def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str, list[Map]]) -> None:

@@ -13,6 +13,7 @@ from driving import SENSING, drive
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
+from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
 from gridsim.maps.map import Map
@@ -244,6 +245,16 @@ def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
                 counted += 1
     assert counted > 9
     env.close()
+
+
+def test_torch_takes_what_the_vector_environment_tells(maps: dict[str, list[Map]]) -> None:
+    """Gymnasium's NumpyToTorch turns all of it into tensors."""
+    import torch
+
+    env = GridSimVectorEnv(2, maps=maps["seamless"])
+    for *_, info in (env.reset(seed=0), env.step(np.zeros(2, dtype=int))):
+        told = {name: torch.from_numpy(value) for name, value in info.items()}
+        assert told["end"].tolist() == [End.RUNNING] * 2
 
 
 def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Map]]) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from cluster.tracking import mlflow_run
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.tracker import Tracker
+from gridsim.car.ego import End
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}
@@ -104,7 +105,7 @@ def drive_both(champion, network, traffic=0):
     mine = drive(champion.act)
     theirs = drive(lambda seen: int(network(torch.from_numpy(seen[None])).argmax()))
     assert mine == theirs, (mine[1], theirs[1])
-    return len(mine[0]), mine[1]["end"], mine[1]["distance_m"]
+    return len(mine[0]), End(mine[1]["end"]).name.lower(), mine[1]["distance_m"]
 
 
 FRESH = """
