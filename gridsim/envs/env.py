@@ -15,11 +15,14 @@ a single environment meets after `reset(seed=s + i)`, whatever the other cars do
 
 from __future__ import annotations
 
+import dataclasses
+import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -293,8 +296,25 @@ class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
         self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
         self.render_mode = render_mode
         self._seeded = False
+        self._spec: EnvSpec | None = None
         self.observation_space = self.cars.single_observation_space
         self.action_space = self.cars.single_action_space
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How `gymnasium.make` made it, with its time limit."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        # gymnasium.make keeps `max_episode_steps` to itself and its TimeLimit wrapper; it sets this before. An episode
+        # may last as long as the wrapper lets it, and `info["end"]` is to tell when time is up.
+        maker, simulator = sys._getframe(1), self.cars.simulator
+        if maker.f_code is gymnasium.make.__code__:
+            asked = maker.f_locals["max_episode_steps"] or maker.f_locals["env_spec"].max_episode_steps
+            if asked is not None and asked > 0:
+                simulator.max_steps = asked
+        self._spec = spec and dataclasses.replace(spec, max_episode_steps=simulator.max_steps)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

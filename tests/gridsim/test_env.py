@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
-from gymnasium.wrappers import FlattenObservation, FrameStackObservation
+from gymnasium.wrappers import FlattenObservation, FrameStackObservation, TimeAwareObservation
 from gymnasium.wrappers import RecordEpisodeStatistics as RecordOne
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from gymnasium.wrappers.vector import FlattenObservation as FlattenAll
@@ -298,11 +298,26 @@ def test_wrappers_of_a_single_environment_work() -> None:
     assert info["episode"]["r"] == pytest.approx(total, abs=1e-5)
 
 
-def test_gymnasiums_time_limit_truncates() -> None:
-    env = gymnasium.make(IDS[0], maps=1, max_episode_steps=2)
-    env.reset(seed=0)
-    assert env.step(4)[2:4] == (False, False)
-    assert env.step(4)[2:4] == (False, True)
+@pytest.mark.parametrize("mode", ["single", "sync", "vector_entry_point"])
+@pytest.mark.parametrize("steps", [2, 40])
+def test_the_time_limit_of_make_is_the_environments_own(mode: str, steps: int) -> None:
+    """Below and above that of the configuration, which holds unless one is given."""
+    config = SimConfig(episode=EpisodeConfig(time_limit=2.0, patience=100))
+    for limit, given in ((20, {}), (steps, {"max_episode_steps": steps})):
+        options: dict[str, Any] = {"maps": 1, "config": config, **given}
+        if mode == "single":
+            env: Any = gymnasium.make(IDS[2], **options)
+            assert env.spec.max_episode_steps == limit
+            TimeAwareObservation(env)
+            again = env.spec.make()
+            assert again.unwrapped.cars.simulator.max_steps == again.spec.max_episode_steps == limit
+        else:
+            env = gymnasium.make_vec(IDS[2], 1, vectorization_mode=mode, **options)
+        env.reset(seed=0)
+        seen = [env.step(4 if mode == "single" else np.array([4]))[2:] for _ in range(limit)]
+        assert not any(trunc or info["end"] for _, trunc, info in seen[:-1])
+        terminated, truncated, info = seen[-1]
+        assert (terminated, truncated, info["end"]) == (False, True, End.TIME)
 
 
 def test_wrappers_of_vector_environments_work(maps: list[Map]) -> None:
