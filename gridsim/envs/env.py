@@ -54,10 +54,14 @@ TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many cars at once, each in an episode of its own.
 
-    The step after an episode's end begins the next one and does not drive (`AutoresetMode.NEXT_STEP`, which all of
-    Gymnasium's wrappers know). info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and
-    `end`, the number of an `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate:
-    the road goes on, and neither is observed.
+    `autoreset_mode` says what comes after an episode's end: `NEXT_STEP`, the step after it begins the next one and does
+    not drive; `SAME_STEP`, the next one begins at once, and info has what the last one ended with as `final_obs`, an
+    array of objects, and `final_info`; `DISABLED`, the cars that have ended are reset by the caller before the next
+    step, `reset(options={"reset_mask": mask})`.
+
+    info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of an
+    `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate: the road goes on, and
+    neither is observed.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form
@@ -81,6 +85,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         actions: Literal["discrete", "continuous"] = "discrete",
         render_mode: Literal["rgb_array", "human"] | None = None,
         max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         config: SimConfig | None = None,
     ):
         """Maps are built when an episode first needs them.
@@ -98,6 +103,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             actions: `discrete` or `continuous`.
             render_mode: `rgb_array`, or `human`, a window that follows the first car.
             max_episode_steps: time limit in control steps; None is the configuration's.
+            autoreset_mode: of `gymnasium.vector`, or its value, as in `SameStep`.
             config: vehicle, sensors and episode.
         Raises: ValueError with one line where an argument makes no sense.
         """
@@ -116,9 +122,14 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 raise ValueError(f"{name} is seen beside rays; leave it out with observation='grid'")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
+        if autoreset_mode not in [known for mode in AutoresetMode for known in (mode, mode.value)]:
+            values = ", ".join(mode.value for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode must be one of {values}, not {autoreset_mode!r}")
         if map_seed < 0:
             raise ValueError(f"map_seed must be 0 or more, not {map_seed}")
         self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.config = config or SimConfig()
         self.scenario = scenario
         self.traffic = default_traffic(scenario) if traffic is None else traffic
@@ -142,52 +153,61 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._seeded = self._started = False
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode for every car.
+        """Begin an episode for every car, or for those of `reset_mask`.
 
         Args:
-            seed: car i is seeded with seed + i; without a seed the cars go on to their next episodes.
+            seed: car i is seeded with seed + i, or with seed[i]; without a seed a car goes on to its next episode.
             options: `map_seed`, one for all cars or one each: the map of these episodes; `start`, [5] or [n, 5]: x, y
-                (m), heading (rad), speed (m/s), steering (rad). What follows these episodes is drawn as ever.
-        Returns: (observations float32 [n, rays + 1], info).
+                (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars, once all have
+                been reset. What follows these episodes is drawn as ever.
+        Returns: (observations of all cars, info, whose masks say who has been reset).
         Raises: ValueError with one line for an option that is unknown or makes no sense.
         """
         options = dict(options or {})
-        map_seed, start = options.pop("map_seed", None), options.pop("start", None)
+        map_seed, start, mask = (options.pop(name, None) for name in ("map_seed", "start", "reset_mask"))
         if options:
-            raise ValueError(f"unknown option {next(iter(options))!r}; there are: map_seed, start")
-        self._started = False
-        super().reset(seed=seed)
-        if seed is not None or not self._seeded:
-            first = int(self.np_random.integers(1 << 63)) if seed is None else seed
-            self._episodes.keys[:] = _U(first % (1 << 64)) + np.arange(self.num_envs, dtype=np.uint64)
-            self._episodes.numbers[:] = 0
-            self._seeded = True
-        else:
-            self._episodes.numbers += _U(1)
-        if map_seed is not None:
+            raise ValueError(f"unknown option {next(iter(options))!r}; there are: map_seed, start, reset_mask")
+        if mask is None:
+            mask = np.ones(self.num_envs, dtype=np.bool_)
+        elif (
+            not isinstance(mask, np.ndarray)
+            or mask.dtype != np.bool_
+            or mask.shape != (self.num_envs,)
+            or not mask.any()
+        ):
+            raise ValueError(f"reset_mask must be an array of {self.num_envs} bools, at least one of them true")
+        elif not self._started:
+            raise ResetNeeded("reset_mask was given before the first reset of all cars")
+        which = np.flatnonzero(mask)
+        self._started &= len(which) < self.num_envs
+        self._seed(seed, which)
+        if map_seed is not None and len(which) == self.num_envs:
             self._episodes.keep_own_maps()
-        maps, starts, keys = self._episodes.draw(np.arange(self.num_envs), map_seed, start)
-        ranges, speeds = self.simulator.reset(starts, maps, keys=keys)
-        self._fastest[:] = self._episodes.upper_speeds(maps)
+        self.ranges = self.ranges.copy()
+        self.ranges[which], _ = self._begin(which, map_seed, start)
         self._started = True
-        progress, begun = np.zeros(self.num_envs, dtype=np.float32), np.ones(self.num_envs, dtype=np.bool_)
-        observations, _ = self._observe(ranges, speeds, progress, self.simulator.state.ends, begun)
-        return observations, self._info(speeds, self.simulator.state.ends.copy())
+        self._note(which, mask)
+        speeds = self.simulator.state.cars[:, SPEED].copy()
+        info = self._info(speeds, self.simulator.state.ends.copy())
+        return self._observer.look(self.ranges, speeds), {name: value * mask for name, value in info.items()}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One control period of every car, or the beginning of its next episode where the last step ended one.
+        """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
 
         Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; of no effect where an episode begins.
         Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n],
         info).
-        Raises: gymnasium.error.ResetNeeded before the first reset; ValueError with one line for anything but an action
-        for each car.
+        Raises: gymnasium.error.ResetNeeded before the first reset, and where an episode has ended that nothing resets;
+        ValueError with one line for anything but an action for each car.
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
         begun = self.simulator.state.ends != 0
+        if self.autoreset_mode is AutoresetMode.DISABLED and begun.any():
+            over = f"episodes of {begun.sum()} of {self.num_envs} cars"
+            raise ResetNeeded(f"step() was called after the end of the {over}; call reset() with a reset_mask first")
         if np.shape(actions) != self.action_space.shape:
             each = f"{self.num_envs} cars, each with an action of {self.single_action_space}"
             raise ValueError(f"there are {each}, not actions of shape {np.shape(actions)}")
@@ -195,21 +215,66 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if begun.any():
             which = np.flatnonzero(begun)
             self._episodes.numbers[which] += _U(1)
-            maps, starts, keys = self._episodes.draw(which)
-            ranges[which], speeds[which] = self.simulator.reset(starts, maps, which, keys)
+            ranges[which], speeds[which] = self._begin(which)
             ends[which] = End.RUNNING
-            self._fastest[which] = self._episodes.upper_speeds(maps)
-        observations, rewards = self._observe(ranges, speeds, progress, ends, begun)
-        return observations, rewards, TERMINATES[ends], TRUNCATES[ends], self._info(speeds, ends)
-
-    def _observe(
-        self, ranges: np.ndarray, speeds: np.ndarray, progress: np.ndarray, ends: np.ndarray, begun: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Observations and rewards [n] of a step."""
         self.ranges = ranges
+        rewards = self._observer.rewards(ranges, speeds, progress, ends, begun, self._fastest)
+        self._note(slice(None), begun)
+        observations = self._observer.look(ranges, speeds)
+        info = self._info(speeds, ends)
+        terminations, truncations = TERMINATES[ends], TRUNCATES[ends]
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ends.any():
+            info = self._begin_anew(observations, info, ends != 0)
+        return observations, rewards, terminations, truncations, info
+
+    def _seed(self, seed: int | Sequence[int | None] | None, which: np.ndarray) -> None:
+        """Seed cars `which`, or let them go on to their next episodes."""
+        n, episodes = self.num_envs, self._episodes
+        if seed is None or isinstance(seed, int):
+            super().reset(seed=seed)
+            seeds = [None if seed is None else seed + i for i in range(n)]
+        else:
+            seeds = list(seed)
+            if len(seeds) != n or not all(s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in seeds):
+                raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
+        if self._seeded:
+            episodes.numbers[which] += _U(1)
+        else:
+            episodes.keys[:] = _U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
+            episodes.numbers[:] = 0
+            self._seeded = True
+        for i in which:
+            given = seeds[i]
+            if given is not None:
+                episodes.keys[i], episodes.numbers[i] = int(given) % (1 << 64), 0
+
+    def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """Begin the present episodes of cars `which`. Returns: ranges [k, rays] and speeds [k]."""
+        maps, starts, keys = self._episodes.draw(which, map_seed, start)
+        ranges, speeds = self.simulator.reset(starts, maps, which, keys)
+        self._fastest[which] = self._episodes.upper_speeds(maps)
+        return ranges, speeds
+
+    def _begin_anew(self, observations: np.ndarray, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
+        """Begin the next episodes of cars `over` [n]; changes `observations`. Returns: info of both episodes."""
+        which = np.flatnonzero(over)
+        last = np.full(self.num_envs, None, dtype=object)
+        for i in which:
+            last[i] = observations[i].copy()
+        self._episodes.numbers[which] += _U(1)
+        self.ranges[which], speeds = self._begin(which)
+        self._note(which, over)
+        observations[which] = self._observer.look(self.ranges[which], speeds, which)
+        final = {name: value * over for name, value in info.items()}
+        state = self.simulator.state
+        info = self._info(state.cars[:, SPEED].copy(), state.ends.copy())
+        return info | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
+
+    def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
+        """Take in what cars `which` sense now; `begun` [n] says where an episode has begun."""
+        self._observer.take(self.ranges[which], begun[which], which)
         if self.render_mode is not None:
             self._remember(begun)
-        return self._observer.look(ranges, speeds, progress, ends, begun, self._fastest)
 
     # ---------------------------------------------------------------------------------------------------- pictures
 
@@ -293,6 +358,7 @@ class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
     def __init__(
         self, scenario: str = "seamless", *, render_mode: Literal["rgb_array", "human"] | None = None, **options: Any
     ):
+        options["autoreset_mode"] = AutoresetMode.DISABLED
         self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
         self.render_mode = render_mode
         self._seeded = False

@@ -65,16 +65,17 @@ class Episodes:
             maps = np.array([index[k] for k in drawn])
         else:
             seeds = np.asarray(map_seed)
-            if seeds.dtype.kind not in "iu" or seeds.shape not in ((), which.shape) or seeds.min() < 0:
-                raise ValueError(f"map_seed must be a whole number from 0, or {len(which)} of them, not {map_seed!r}")
-            maps = np.array([self._map(int(seed)) for seed in np.broadcast_to(seeds, which.shape)])
+            every = self.keys.shape
+            if seeds.dtype.kind not in "iu" or seeds.shape not in ((), every) or seeds.min() < 0:
+                raise ValueError(f"map_seed must be a whole number from 0, or {every[0]} of them, not {map_seed!r}")
+            maps = np.array([self._map(int(seed)) for seed in np.broadcast_to(seeds, every)[which]])
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is None:
             for m in np.unique(maps):
                 of = np.flatnonzero(maps == m)
                 starts[of] = starts_at(self.maps[m], numbers[of, 1])
         else:
-            starts[:] = self._checked_start(start, maps)
+            starts[:] = self._checked_start(start, which, maps)
         return maps, starts, keys
 
     def upper_speeds(self, maps: np.ndarray) -> np.ndarray:
@@ -95,14 +96,14 @@ class Episodes:
             self._index[seed] = len(self.maps) - 1
         return self._index[seed]
 
-    def _checked_start(self, start: Any, maps: np.ndarray) -> np.ndarray:
-        """A caller's start, float32 [n, 5]."""
-        vehicle = self.config.vehicle
+    def _checked_start(self, start: Any, which: np.ndarray, maps: np.ndarray) -> np.ndarray:
+        """A caller's start, float32 [k, 5]."""
+        vehicle, cars = self.config.vehicle, len(self.keys)
         try:
-            starts = np.broadcast_to(np.asarray(start, dtype=np.float32), (len(maps), 5))
+            starts = np.broadcast_to(np.asarray(start, dtype=np.float32), (cars, 5))[which]
         except (TypeError, ValueError):
             raise ValueError(
-                f"start must be x, y, heading, speed, steering, or {len(maps)} rows of these, not {start!r}"
+                f"start must be x, y, heading, speed, steering, or {cars} rows of these, not {start!r}"
             ) from None
         if not np.isfinite(starts).all():
             raise ValueError(f"start must be five finite numbers, not {start!r}")

@@ -12,33 +12,37 @@ from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 
 _F = np.float32
+_ALL = slice(None)
 
 
 @njit
-def _observe(ranges, closing, speeds, progress, ends, fastest, begun, reach, slowest, limit, dt, observations, rewards):
-    """Observations [n, rays + 1], if not None, and rewards [n]; `fastest` m/s: upper speed of each car's scenario."""
+def _observe(ranges, closing, speeds, reach, slowest, limit, observations):
+    """Observations [n, rays + 1], with closing speeds [n, rays] between if they are not None."""
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
-        speed = speeds[i]
-        if observations is not None:
+        for r in range(rays):
+            observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
+        if closing is not None:
             for r in range(rays):
-                observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
-            if closing is not None:
-                for r in range(rays):
-                    observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
-            last = rays if closing is None else 2 * rays
-            observations[i, last] = min(max(speed / limit, slowest), _F(1.0))
+                observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
+        last = rays if closing is None else 2 * rays
+        observations[i, last] = min(max(speeds[i] / limit, slowest), _F(1.0))
+
+
+@njit
+def _reward(ranges, speeds, progress, ends, fastest, begun, reach, dt, rewards):
+    for i in range(ranges.shape[0]):
         if begun[i]:
             rewards[i] = _F(0.0)
         else:
-            rewards[i] = reward(ranges[i], reach, speed, progress[i], ends[i], fastest[i], dt)
+            rewards[i] = reward(ranges[i], reach, speeds[i], progress[i], ends[i], fastest[i], dt)
 
 
 class Observer:
     """Turns what a simulator's cars sense into observations.
 
     Attributes:
-        space: of one car.
+        space: of one car's.
         table: the grid's, or None where rays are seen.
     """
 
@@ -53,6 +57,7 @@ class Observer:
         grid = observation == "grid"
         self.table = grid_table(self.config) if grid else None
         self._stack = np.zeros((len(simulator), frames, CELLS, CELLS), dtype=np.uint8) if grid else None
+        self.space: Box
         if grid:
             shape = (CELLS, CELLS) if frames == 1 else (frames, CELLS, CELLS)
             self.space = Box(0, 255, shape, dtype=np.uint8)
@@ -62,7 +67,32 @@ class Observer:
             low[self._width - 1 - steering] = self._slowest
             self.space = Box(low, np.ones_like(low))
 
-    def look(
+    def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
+        """Let cars `which` [k] sense `ranges` [k, rays]: their newest frame, or the first where they have `begun`."""
+        if self.table is None or self._stack is None or self._stack.shape[1] == 1:
+            return
+        stack = self._stack[which]
+        push_frames(stack, grids(self.table, ranges), begun)
+        if not isinstance(which, slice):  # then it is a copy
+            self._stack[which] = stack
+
+    def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> np.ndarray:
+        """What cars `which` [k] see with ranges [k, rays] and speeds [k], once they `take` these; the caller's own."""
+        if self.table is not None and self._stack is not None:
+            if self._stack.shape[1] > 1:
+                return self._stack[which].copy()
+            return grids(self.table, ranges)
+        vehicle = self.config.vehicle
+        observations = np.empty((len(ranges), self._width), dtype=np.float32)
+        closing = self._simulator.closing[which] if self._motion else None
+        reach, limit = _F(self.config.sensors.range), _F(vehicle.speed_limit)
+        _observe(ranges, closing, speeds, reach, self._slowest, limit, observations)
+        if self._steering:
+            angles = self._simulator.state.cars[which, STEERING]
+            observations[:, -1] = np.clip(angles / np.radians(vehicle.steering_limit), -1.0, 1.0)
+        return observations
+
+    def rewards(
         self,
         ranges: np.ndarray,
         speeds: np.ndarray,
@@ -70,38 +100,9 @@ class Observer:
         ends: np.ndarray,
         begun: np.ndarray,
         fastest: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Observations and rewards [n] of a step, the caller's own; where an episode has `begun` the reward is 0."""
+    ) -> np.ndarray:
+        """The rewards [n] of a step, 0 where an episode has `begun`; `fastest` m/s: upper speeds of the scenarios."""
         rewards = np.empty(len(ranges), dtype=np.float32)
-        observations = np.empty((len(ranges), self._width), dtype=np.float32) if self.table is None else None
-        _observe(
-            ranges,
-            self._simulator.closing if self._motion else None,
-            speeds,
-            progress,
-            ends,
-            fastest,
-            begun,
-            _F(self.config.sensors.range),
-            self._slowest,
-            _F(self.config.vehicle.speed_limit),
-            _F(self.config.episode.control_period),
-            observations,
-            rewards,
-        )
-        if observations is None:
-            return self._grids(ranges, begun), rewards
-        if self._steering:
-            limit = np.radians(self.config.vehicle.steering_limit)
-            observations[:, -1] = np.clip(self._simulator.state.cars[:, STEERING] / limit, -1.0, 1.0)
-        return observations, rewards
-
-    def _grids(self, ranges: np.ndarray, begun: np.ndarray) -> np.ndarray:
-        """Occupancy grids, stacked if so asked."""
-        assert self.table is not None
-        assert self._stack is not None
-        now = grids(self.table, ranges)
-        if self._stack.shape[1] == 1:
-            return now
-        push_frames(self._stack, now, begun)
-        return self._stack.copy()
+        dt = _F(self.config.episode.control_period)
+        _reward(ranges, speeds, progress, ends, fastest, begun, _F(self.config.sensors.range), dt, rewards)
+        return rewards

@@ -1,0 +1,166 @@
+"""Gymnasium's three autoreset modes: the same episodes, and each mode as Gymnasium's own vector environment has it."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from driving import SENSING, drive
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import iterate
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from gridsim.car.ego import End
+from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
+from gridsim.maps.map import Map
+
+N, STEPS = 4, 70
+Outcome = tuple[Any, float, bool, bool, int, float]  # observation, reward, terminated, truncated, end, metres
+
+
+def made(maps: dict[str, list[Map]], mode: AutoresetMode, **options: Any) -> GridSimVectorEnv:
+    return GridSimVectorEnv(N, scenario="city", maps=maps["city"], max_episode_steps=25, autoreset_mode=mode, **options)
+
+
+def same(ours: Any, theirs: Any) -> None:
+    """Equal arrays, or dictionaries and sequences of such."""
+    if isinstance(ours, dict):
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            same(ours[name], theirs[name])
+    elif isinstance(ours, tuple) or (isinstance(ours, np.ndarray) and ours.dtype == object):
+        for a, b in zip(ours, theirs, strict=True):
+            same(a, b)
+    else:
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def rows(env: GridSimVectorEnv, observations: Any) -> list[Any]:
+    return list(iterate(env.observation_space, observations))
+
+
+def episodes(env: GridSimVectorEnv, mode: AutoresetMode, actions: np.ndarray) -> list[list[tuple[Any, list[Outcome]]]]:
+    """Each car's episodes: first observation and what its steps returned; car i takes actions[k, i] at its step k."""
+    seen, _ = env.reset(seed=9)
+    found: list[list[tuple[Any, list[Outcome]]]] = [[(row, [])] for row in rows(env, seen)]
+    driven: Any = np.zeros(N, dtype=int)
+    over = np.zeros(N, dtype=bool)
+    while driven.min() < STEPS:
+        if mode is AutoresetMode.DISABLED and over.any():
+            seen, info = env.reset(options={"reset_mask": over})
+            assert (info["_end"] == over).all()
+            for i in np.flatnonzero(over):
+                found[i].append((rows(env, seen)[i], []))
+            over = np.zeros(N, dtype=bool)
+        seen, rewards, terminations, truncations, info = env.step(actions[np.minimum(driven, STEPS - 1), range(N)])
+        for i, row in enumerate(rows(env, seen)):
+            if mode is AutoresetMode.NEXT_STEP and over[i]:
+                found[i].append((row, []))
+                continue
+            told, last = info, row
+            if mode is AutoresetMode.SAME_STEP and "final_info" in info and info["_final_info"][i]:
+                told, last = info["final_info"], info["final_obs"][i]
+            outcome = (rewards[i], terminations[i], truncations[i], told["end"][i], told["distance_m"][i])
+            found[i][-1][1].append((last, *outcome))
+            driven[i] += 1
+            if last is not row:
+                found[i].append((row, []))
+        over = terminations | truncations
+    return found
+
+
+@pytest.mark.parametrize(("observation", "frames"), SENSING)
+def test_all_modes_drive_the_same_episodes(maps: dict[str, list[Map]], observation: str, frames: int) -> None:
+    options: dict[str, Any] = {"observation": observation, "frames": frames}
+    actions = drive(made(maps, AutoresetMode.NEXT_STEP), STEPS, seed=8)
+    first, *others = (episodes(made(maps, mode, **options), mode, actions) for mode in AutoresetMode)
+    for i in range(N):
+        assert len(first[i]) > 2
+        for other in others:
+            left = STEPS
+            for ours, theirs in zip(first[i], other[i], strict=False):
+                same(ours[0], theirs[0])
+                steps = min(len(ours[1]), len(theirs[1]), left)  # a mode may have gone on after STEPS
+                for a, b in zip(ours[1][:steps], theirs[1][:steps], strict=True):
+                    same(a[0], b[0])
+                    assert a[1:] == b[1:]
+                left -= steps
+            assert left == 0
+
+
+@pytest.mark.parametrize(("observation", "frames"), SENSING)
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_each_mode_is_that_of_gymnasiums_own_vector_environment(
+    maps: dict[str, list[Map]], mode: AutoresetMode, observation: str, frames: int
+) -> None:
+    options: dict[str, Any] = {"observation": observation, "frames": frames}
+    options |= {"scenario": "city", "maps": maps["city"], "max_episode_steps": 25}
+    native = GridSimVectorEnv(N, autoreset_mode=mode.value, **options)
+    synced = gymnasium.vector.SyncVectorEnv([lambda: GridSimEnv(**options)] * N, autoreset_mode=mode)
+    assert native.metadata["autoreset_mode"] is mode
+    seeds: list[int | None] = [40, 7, 40, 3]
+    ours: tuple[Any, ...] = native.reset(seed=seeds)
+    theirs: tuple[Any, ...] = synced.reset(seed=seeds)
+    assert ours[0] in native.observation_space
+    same(ours, theirs)
+    ended = 0
+    for row in drive(native, STEPS, seed=2):
+        ours, theirs = native.step(row), synced.step(row)
+        same(ours, theirs)
+        over = ours[2] | ours[3]
+        ended += over.sum()
+        if mode is AutoresetMode.DISABLED and over.any():
+            each = [None, 5, None, None]
+            ours, theirs = (env.reset(seed=each, options={"reset_mask": over}) for env in (native, synced))
+            same(ours, theirs)
+    assert ended > N
+
+
+def test_make_vec_takes_the_mode_and_statistics_are_told_at_once(maps: dict[str, list[Map]]) -> None:
+    options: Any = {"maps": maps["city"], "max_episode_steps": 5, "autoreset_mode": AutoresetMode.SAME_STEP}
+    env = RecordEpisodeStatistics(gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options))
+    env.reset(seed=0)
+    for k in range(12):
+        *_, truncations, info = env.step(np.full(2, 4))
+        assert truncations.all() == (k % 5 == 4)
+        if truncations.any():
+            assert info["episode"]["l"].tolist() == [5, 5]
+            assert info["final_info"]["end"].tolist() == [End.TIME] * 2
+            assert info["end"].tolist() == [End.RUNNING] * 2
+
+
+def test_a_car_that_has_ended_must_be_reset(maps: dict[str, list[Map]]) -> None:
+    env = made(maps, AutoresetMode.DISABLED)
+    some = np.array([True, False, False, True])
+    with pytest.raises(ResetNeeded, match="first reset of all"):
+        env.reset(options={"reset_mask": some})
+    env.reset(seed=1)
+    for _ in range(25):
+        *_, info = env.step(np.full(N, 4))
+        if info["end"].any():
+            break
+    with pytest.raises(ResetNeeded, match="reset_mask"):
+        env.step(np.full(N, 4))
+    env.reset(options={"reset_mask": info["end"] != 0})
+    env.step(np.full(N, 4))
+
+
+@pytest.mark.parametrize("mask", [[True] * N, np.ones(N), np.ones(3, dtype=bool), np.zeros(N, dtype=bool), "all"])
+def test_a_wrong_mask_is_refused(maps: dict[str, list[Map]], mask: Any) -> None:
+    env = made(maps, AutoresetMode.DISABLED)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="reset_mask must be an array of 4 bools"):
+        env.reset(options={"reset_mask": mask})
+    env.step(np.full(N, 4))
+
+
+@pytest.mark.parametrize("seed", [[1, 2], [1, 2, 3, -4], [1, 2, 3, 0.5], "abcd"])
+def test_wrong_seeds_are_refused(maps: dict[str, list[Map]], seed: Any) -> None:
+    with pytest.raises(ValueError, match="seed must be a whole number from 0, or 4 of them"):
+        made(maps, AutoresetMode.NEXT_STEP).reset(seed=seed)
+
+
+def test_a_wrong_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="autoreset_mode must be one of NextStep, SameStep, Disabled, not 'never'"):
+        GridSimVectorEnv(1, autoreset_mode="never")
