@@ -6,8 +6,8 @@ Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and 
 `motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s, and with
 `steering` at the end the steering angle as a share of 27 degrees; or `grid`, uint8 [80, 80], the occupancy grid of
 `gridsim.sensing.grid`, and with `frames` above 1 [frames, 80, 80], the newest last. Action: `discrete`, one of
-`vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of `vehicle.act_continuous`. Reward: the
-paper's, within [-1, 1], see `gridsim.car.reward`.
+`vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of `vehicle.act_continuous`, clipped to that.
+Reward: the paper's, within [-1, 1], see `gridsim.car.reward`.
 
 An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
 a single environment meets after `reset(seed=s + i)`, whatever the other cars do.

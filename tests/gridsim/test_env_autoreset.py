@@ -46,12 +46,12 @@ def episodes(env: GridSimVectorEnv, mode: AutoresetMode, actions: np.ndarray) ->
     found: list[list[tuple[Any, list[Outcome]]]] = [[(row, [])] for row in rows(env, seen)]
     driven: Any = np.zeros(N, dtype=int)
     over = np.zeros(N, dtype=bool)
-    while driven.min() < STEPS:
+    while np.min(driven) < STEPS:
         if mode is AutoresetMode.DISABLED and over.any():
             seen, info = env.reset(options={"reset_mask": over})
             assert (info["_end"] == over).all()
-            for i in np.flatnonzero(over):
-                found[i].append((rows(env, seen)[i], []))
+            for k in np.flatnonzero(over):
+                found[k].append((rows(env, seen)[k], []))
             over = np.zeros(N, dtype=bool)
         seen, rewards, terminations, truncations, info = env.step(actions[np.minimum(driven, STEPS - 1), range(N)])
         for i, row in enumerate(rows(env, seen)):

@@ -210,6 +210,16 @@ def test_pedal_and_wheel_do_what_they_say(maps: dict[str, list[Map]]) -> None:
     np.testing.assert_allclose(steering, [6.0, -6.0, 2.7], atol=1e-3)  # 60 degrees/s; 27 at the lock
 
 
+def test_continuous_actions_are_clipped(maps: dict[str, list[Map]]) -> None:
+    wild = np.array([[1.5, -7.0], [1e300, -math.inf], [-2.0, 1.01]])
+    one, other = (GridSimVectorEnv(3, maps=maps["seamless"], actions="continuous") for _ in range(2))
+    one.reset(seed=0)
+    other.reset(seed=0)
+    for _ in range(5):
+        for ours, theirs in zip(one.step(wild)[:4], other.step(np.sign(wild))[:4], strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
 # --- wrong use
 
 
@@ -218,10 +228,6 @@ def test_pedal_and_wheel_do_what_they_say(maps: dict[str, list[Map]]) -> None:
     ("action", "text"),
     [
         ([math.nan, 0.0], "not nan"),
-        ([0.0, math.inf], "not inf"),
-        ([1.5, 0.0], "not 1.5"),
-        ([0.0, -1.01], "not -1.01"),
-        ([0.0, 1e300], "not inf"),
         ([None, 0.0], "numbers"),
         (["a", "b"], "numbers"),
         ([True, False], "numbers"),
