@@ -63,23 +63,30 @@ class Champion:
         """What it sees: rays or grid."""
         return PolicySpec.parse(self.policy).observation
 
-    def act(self, observation: np.ndarray, speed: float | np.ndarray | None = None) -> int | np.ndarray:
+    def act(
+        self, observation: np.ndarray | dict[str, np.ndarray], speed: float | np.ndarray | None = None
+    ) -> int | np.ndarray:
         """The action for an observation, or actions [n] for n of them.
 
         Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed, and what else it may see
-        (`make_env` gives it). Of the grid, what `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the
-        speed in m/s, which a grid does not show: the environment's `info["speed_mps"]`.
+        (`make_env` gives it). Of the grid, the environment's dictionary of grid and speed, or what `convnet.act_on`
+        takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which that does not show.
         Raises: ValueError with one line for an observation that this champion does not see.
         """
         spec = PolicySpec.parse(self.policy)
         if isinstance(spec, CnnSpec):
+            if isinstance(observation, dict):
+                if speed is None:
+                    speed = observation["speed"][..., 0] * np.float32(self.sim.vehicle.speed_limit)
+                grids = observation["grid"]
+                observation = grids[..., 0, :, :] if spec.frames == 1 else grids
             if speed is None:
-                raise ValueError(f'{spec} needs the speed beside the grid: act(observation, info["speed_mps"])')
+                raise ValueError(f'{spec} needs the speed (m/s) beside the grid: act(grid, info["speed_mps"])')
             return convnet.act_on(spec, self.genome, observation, speed)
         return act_on(
             spec,
             self.genome,
-            observation,
+            np.asarray(observation),
             self.sim.sensors.range,
             self.sim.vehicle.speed_limit,
             math.radians(self.sim.vehicle.steering_limit),

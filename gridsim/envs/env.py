@@ -2,12 +2,17 @@
 
 `import gridsim` registers an id for each scenario, `GridSim/Seamless-v0` and so on.
 
-Observation: `rays`, float32 [rays + 1], the rays' ranges as shares of 50 m and the speed as a share of 30 m/s, and with
-`motion` between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s, and with
-`steering` at the end the steering angle as a share of 27 degrees; or `grid`, uint8 [80, 80], the occupancy grid of
-`gridsim.sensing.grid`, and with `frames` above 1 [frames, 80, 80], the newest last. Action: `discrete`, one of
-`vehicle.Action`, or `continuous`, float32 [2] in [-1, 1], pedal and wheel of `vehicle.act_continuous`, clipped to that.
-Reward: the paper's, within [-1, 1], see `gridsim.car.reward`.
+Observation:
+
+* `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; with `motion`
+  between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s, and with `steering`
+  at the end the steering angle as a share of 27 degrees.
+* `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
+  and `speed`, float32 [1], as a share of 30 m/s.
+* `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as policies of convolutions take pictures.
+
+Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`.
 
 An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
 a single environment meets after `reset(seed=s + i)`, whatever the other cars do.
@@ -15,6 +20,7 @@ a single environment meets after `reset(seed=s + i)`, whatever the other cars do
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import sys
 from collections.abc import Sequence
@@ -32,7 +38,7 @@ from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.episodes import Episodes
-from gridsim.envs.observing import Observer
+from gridsim.envs.observing import Observer, row
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
@@ -51,7 +57,7 @@ TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])
 TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 
 
-class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """Many cars at once, each in an episode of its own.
 
     `autoreset_mode` says what comes after an episode's end: `NEXT_STEP`, the step after it begins the next one and does
@@ -78,7 +84,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         maps: int | Sequence[Map] = 8,
         map_seed: int = TRAINING_SEED,
         traffic: int | None = None,
-        observation: Literal["rays", "grid"] = "rays",
+        observation: Literal["rays", "grid", "image"] = "rays",
         frames: int = 1,
         motion: bool = False,
         steering: bool = False,
@@ -96,7 +102,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first of them; the others' follow.
             traffic: other cars in each car's world; None is as many as the scenario has by default.
-            observation: `rays` or `grid`.
+            observation: `rays`, `grid` or `image`.
             frames: grids that make an observation, 1 to 16.
             motion: whether rays also tell the motion of what they meet.
             steering: whether the steering angle is told beside them.
@@ -109,17 +115,17 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         check_name(scenario)
         for name, value, known in (
-            ("observation", observation, ("rays", "grid")),
+            ("observation", observation, ("rays", "grid", "image")),
             ("actions", actions, ("discrete", "continuous")),
             ("render_mode", render_mode, (None, "rgb_array", "human")),
         ):
             if value not in known:
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
         if not 1 <= frames <= 16 or (frames > 1 and observation == "rays"):
-            raise ValueError(f"frames must be 1 to 16, and more than 1 only for observation='grid', not {frames}")
+            raise ValueError(f"frames must be 1 to 16, and more than 1 only for grids, not {frames}")
         for name, asked in (("motion", motion), ("steering", steering)):
-            if asked and observation == "grid":
-                raise ValueError(f"{name} is seen beside rays; leave it out with observation='grid'")
+            if asked and observation != "rays":
+                raise ValueError(f"{name} is seen beside rays; leave it out with observation={observation!r}")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         if autoreset_mode not in [known for mode in AutoresetMode for known in (mode, mode.value)]:
@@ -154,7 +160,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode for every car, or for those of `reset_mask`.
 
         Args:
@@ -193,7 +199,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         info = self._info(speeds, self.simulator.state.ends.copy())
         return self._observer.look(self.ranges, speeds), {name: value * mask for name, value in info.items()}
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
 
         Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; of no effect where an episode begins.
@@ -255,16 +261,21 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._fastest[which] = self._episodes.upper_speeds(maps)
         return ranges, speeds
 
-    def _begin_anew(self, observations: np.ndarray, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
+    def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Begin the next episodes of cars `over` [n]; changes `observations`. Returns: info of both episodes."""
         which = np.flatnonzero(over)
         last = np.full(self.num_envs, None, dtype=object)
-        for i in which:
-            last[i] = observations[i].copy()
+        for i in which.tolist():
+            last[i] = copy.deepcopy(row(observations, i))
         self._episodes.numbers[which] += _U(1)
         self.ranges[which], speeds = self._begin(which)
         self._note(which, over)
-        observations[which] = self._observer.look(self.ranges[which], speeds, which)
+        seen = self._observer.look(self.ranges[which], speeds, which)
+        if isinstance(seen, dict):
+            for name, part in seen.items():
+                observations[name][which] = part
+        else:
+            observations[which] = seen
         final = {name: value * over for name, value in info.items()}
         state = self.simulator.state
         info = self._info(state.cars[:, SPEED].copy(), state.ends.copy())
@@ -350,7 +361,7 @@ class GridSimVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         }
 
 
-class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
+class GridSimEnv(gymnasium.Env[Any, Any]):
     """One car: a `GridSimVectorEnv` of one without its automatic resets; arguments, spaces, reward and info are its."""
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012, Gymnasium's own form
@@ -382,18 +393,16 @@ class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
                 simulator.max_steps = asked
         self._spec = spec and dataclasses.replace(spec, max_episode_steps=simulator.max_steps)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; see `GridSimVectorEnv.reset`. Returns: (observation float32 [rays + 1], info)."""
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode; see `GridSimVectorEnv.reset`. Returns: (observation, info)."""
         super().reset(seed=seed)
         if seed is None and not self._seeded:
             seed = int(self.np_random.integers(1 << 63))
         self._seeded = True
         observations, info = self.cars.reset(seed=seed, options=options)
-        return observations[0], self._own(info)
+        return row(observations, 0), self._own(info)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control period. Returns: (observation, reward, terminated, truncated, info).
 
         Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError with one line for
@@ -402,7 +411,7 @@ class GridSimEnv(gymnasium.Env[np.ndarray, Any]):
         if self.cars.simulator.state.ends[0] != End.RUNNING:
             raise ResetNeeded("step() was called after the episode's end; call reset() first")
         observations, rewards, terminations, truncations, info = self.cars.step(np.asarray(action)[None])
-        return observations[0], float(rewards[0]), bool(terminations[0]), bool(truncations[0]), self._own(info)
+        return row(observations, 0), float(rewards[0]), bool(terminations[0]), bool(truncations[0]), self._own(info)
 
     def render(self) -> np.ndarray | None:
         """A picture uint8 [height, width, 3] with `rgb_array`; None with `human`, whose window step and reset draw."""

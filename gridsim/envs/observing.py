@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 
 from gridsim.car.ego import STEERING
 from gridsim.car.reward import reward
@@ -13,6 +13,7 @@ from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
 
 _F = np.float32
 _ALL = slice(None)
+Seen = np.ndarray | dict[str, np.ndarray]
 
 
 @njit
@@ -38,11 +39,16 @@ def _reward(ranges, speeds, progress, ends, fastest, begun, reach, dt, rewards):
             rewards[i] = reward(ranges[i], reach, speeds[i], progress[i], ends[i], fastest[i], dt)
 
 
+def row(observations: Seen, i: int) -> Seen:
+    """What car i sees of what all see."""
+    return {name: part[i] for name, part in observations.items()} if isinstance(observations, dict) else observations[i]
+
+
 class Observer:
     """Turns what a simulator's cars sense into observations.
 
     Attributes:
-        space: of one car's.
+        space: of what one car sees.
         table: the grid's, or None where rays are seen.
     """
 
@@ -54,34 +60,40 @@ class Observer:
         rays, vehicle = self.config.sensors.rays, self.config.vehicle
         self._width = (2 if motion else 1) * rays + 1 + steering
         self._slowest = _F(-vehicle.reverse_limit / vehicle.speed_limit)
-        grid = observation == "grid"
-        self.table = grid_table(self.config) if grid else None
-        self._stack = np.zeros((len(simulator), frames, CELLS, CELLS), dtype=np.uint8) if grid else None
-        self.space: Box
-        if grid:
-            shape = (CELLS, CELLS) if frames == 1 else (frames, CELLS, CELLS)
-            self.space = Box(0, 255, shape, dtype=np.uint8)
-        else:
-            low = np.zeros(self._width, dtype=np.float32)
-            low[rays:] = -1.0
-            low[self._width - 1 - steering] = self._slowest
-            self.space = Box(low, np.ones_like(low))
+        self._alone = observation == "image"
+        self.table = None if observation == "rays" else grid_table(self.config)
+        self._stack = np.zeros((len(simulator), frames, CELLS, CELLS) if self.table else 0, dtype=np.uint8)
+        image = Box(0, 255, (frames, CELLS, CELLS), dtype=np.uint8)
+        low = np.zeros(self._width, dtype=np.float32)
+        low[rays:] = -1.0
+        low[self._width - 1 - steering] = self._slowest
+        self.space: Box | Dict = Box(low, np.ones_like(low))
+        if observation == "image":
+            self.space = image
+        elif observation == "grid":
+            self.space = Dict({"grid": image, "speed": Box(self._slowest, 1.0, (1,), dtype=np.float32)})
 
     def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
         """Let cars `which` [k] sense `ranges` [k, rays]: their newest frame, or the first where they have `begun`."""
-        if self.table is None or self._stack is None or self._stack.shape[1] == 1:
+        if self.table is None or self._stack.shape[1] == 1:
             return
         stack = self._stack[which]
         push_frames(stack, grids(self.table, ranges), begun)
         if not isinstance(which, slice):  # then it is a copy
             self._stack[which] = stack
 
-    def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> np.ndarray:
+    def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
         """What cars `which` [k] see with ranges [k, rays] and speeds [k], once they `take` these; the caller's own."""
-        if self.table is not None and self._stack is not None:
-            if self._stack.shape[1] > 1:
-                return self._stack[which].copy()
-            return grids(self.table, ranges)
+        if self.table is None:
+            return self._rays(ranges, speeds, which)
+        one = self._stack.shape[1] == 1
+        image = grids(self.table, ranges)[:, None] if one else self._stack[which].copy()
+        if self._alone:
+            return image
+        share = np.clip(speeds / _F(self.config.vehicle.speed_limit), self._slowest, _F(1.0))
+        return {"grid": image, "speed": share[:, None]}
+
+    def _rays(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice) -> np.ndarray:
         vehicle = self.config.vehicle
         observations = np.empty((len(ranges), self._width), dtype=np.float32)
         closing = self._simulator.closing[which] if self._motion else None

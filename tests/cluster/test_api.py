@@ -184,5 +184,20 @@ def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer):
         seer.act(np.zeros(32, dtype=np.float32), 5.0)
 
 
+@pytest.mark.parametrize("frames", [1, 2])
+def test_a_champion_of_the_grid_drives_what_its_environment_shows(frames, seer):
+    spec = PolicySpec.parse(f"cnn:8,8,8@{frames}")
+    driver = Champion(np.random.default_rng(2).normal(size=spec.size).astype(np.float32), str(spec), "curved", seer.sim)
+    env = driver.make_env(maps=1)
+    observation, info = env.reset(seed=1)
+    assert observation["grid"].shape == (frames, 80, 80)
+    for _ in range(5):
+        grid = observation["grid"] if frames > 1 else observation["grid"][0]
+        action = driver.act(observation)
+        assert action == driver.act(observation, info["speed_mps"]) == driver.act(grid, info["speed_mps"])
+        observation, _, terminated, truncated, info = env.step(action)
+        assert not terminated | truncated
+
+
 def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):
     assert evolve(ON_THE_GRID, workers=2)[0].sha256 == seer.sha256

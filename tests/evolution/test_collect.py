@@ -221,7 +221,7 @@ def test_the_environment_pays_and_shows_the_same(scenarios: list[Map], driver: n
         observation, info = env.reset(seed=0, options={"start": episode["start"]})
         for step in range(int(results[k]["steps"]) + 1):
             if grid:
-                assert (np.rint(inputs[row, :-1] * 255) == observation[0].reshape(-1)).all()
+                assert (np.rint(inputs[row, :-1] * 255) == observation["grid"][0].reshape(-1)).all()
                 assert inputs[row, -1] == math.floor((info["speed_mps"][0] / F(10) - F(1)) * F(4096) + F(0.5)) / 4096
             else:
                 ranges = env.ranges[0]

@@ -25,13 +25,18 @@ from gridsim.traffic.world import LANE
 
 @pytest.mark.usefixtures("dummy")
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
-@pytest.mark.parametrize(("observation", "frames"), SENSING)
+@pytest.mark.parametrize(
+    "sees",
+    [
+        *({"motion": motion, "steering": steering} for motion in (False, True) for steering in (False, True)),
+        *({"observation": kind, "frames": frames} for kind in ("grid", "image") for frames in (1, 4)),
+    ],
+    ids=lambda sees: "-".join(map(str, sees.values())),
+)
 @pytest.mark.parametrize("name", REGISTRY)
-def test_gymnasiums_checker_passes(
-    maps: dict[str, list[Map]], name: str, observation: str, frames: int, actions: str
-) -> None:
+def test_gymnasiums_checker_passes(maps: dict[str, list[Map]], name: str, sees: dict[str, Any], actions: str) -> None:
     """It makes the environment in both of its render modes, too."""
-    options: dict[str, Any] = {"observation": observation, "frames": frames, "actions": actions}
+    options: dict[str, Any] = {"actions": actions, **sees}
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gymnasium.make(f"GridSim/{name.capitalize()}-v0", maps=maps[name][:1], **options).unwrapped)
@@ -41,9 +46,13 @@ def test_gymnasiums_checker_passes(
 def test_spaces_are_those_of_the_options(observation: str, frames: int) -> None:
     options: Any = {"observation": observation, "frames": frames, "actions": "continuous"}
     env = gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options)
-    shape = {"rays": (32,), "grid": (CELLS, CELLS) if frames == 1 else (frames, CELLS, CELLS)}[observation]
-    assert env.single_observation_space.shape == shape
-    assert env.single_observation_space.dtype == (np.float32 if observation == "rays" else np.uint8)
+    space: Any = env.single_observation_space
+    if observation == "grid":
+        assert set(space.spaces) == {"grid", "speed"}
+        assert (space["speed"].shape, space["speed"].dtype) == ((1,), np.float32)
+        space = space["grid"]
+    assert space.shape == ((32,) if observation == "rays" else (frames, CELLS, CELLS))
+    assert space.dtype == (np.float32 if observation == "rays" else np.uint8)
     assert env.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
     seen, _ = env.reset(seed=1)
     assert seen in env.observation_space
@@ -65,8 +74,8 @@ def test_traffic_is_the_scenarios_unless_given() -> None:
     [
         ("highway", {}),
         ("seamless", {"traffic": 6, "actions": "continuous"}),
-        ("roundabout", {"observation": "grid", "frames": 4}),
-        ("city", {"observation": "grid", "actions": "continuous"}),
+        ("roundabout", {"observation": "image", "frames": 4}),
+        ("city", {"observation": "image", "actions": "continuous"}),
     ],
 )
 def test_an_episode_follows_from_seed_and_number_alone(
@@ -164,24 +173,27 @@ def test_the_reward_among_traffic_is_the_papers(maps: dict[str, list[Map]]) -> N
 def test_a_grid_is_what_the_rays_say(maps: dict[str, list[Map]], name: str) -> None:
     options: dict[str, Any] = {"scenario": name, "maps": maps[name]}
     env, rays = GridSimVectorEnv(6, observation="grid", **options), GridSimVectorEnv(6, **options)
-    seen, _ = env.reset(seed=4)
-    rays.reset(seed=4)
+    alone = GridSimVectorEnv(6, observation="image", **options)
+    (seen, _), (beside, _) = env.reset(seed=4), rays.reset(seed=4)
+    alone.reset(seed=4)
     table = grid_table(env.config)
     for row in drive(env, 60, seed=5):
         np.testing.assert_array_equal(env.ranges, rays.ranges)
-        np.testing.assert_array_equal(seen, grids(table, env.ranges))
+        np.testing.assert_array_equal(seen["grid"], grids(table, env.ranges)[:, None])
+        np.testing.assert_allclose(seen["speed"], beside[:, -1:], rtol=1e-6)
         seen, *ours, info = env.step(row)
-        _, *theirs, _ = rays.step(row)
+        beside, *theirs, _ = rays.step(row)
+        np.testing.assert_array_equal(alone.step(row)[0], seen["grid"])
         for a, b in zip(ours, theirs, strict=True):  # what an observation is made of changes nothing else
             np.testing.assert_array_equal(a, b)
-    assert len(np.unique(seen)) == 3
+    assert len(np.unique(seen["grid"])) == 3
     named = {"distance_m", "speed_mps", "is_success", "end"}
     assert set(info) == named | {f"_{name}" for name in named}
 
 
 def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: dict[str, list[Map]]) -> None:
     n = 5
-    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="grid", frames=4, max_episode_steps=9)
+    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="image", frames=4, max_episode_steps=9)
     table = grid_table(env.config)
     for seed in (3, None):
         seen, _ = env.reset(seed=seed)
@@ -269,12 +281,13 @@ def test_an_error_is_one_line_for_any_number_of_cars(maps: dict[str, list[Map]])
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ({"observation": "image"}, "observation must be rays or grid, not 'image'"),
+        ({"observation": "film"}, "observation must be rays or grid or image, not 'film'"),
         ({"actions": "both"}, "actions must be discrete or continuous, not 'both'"),
         ({"render_mode": "ansi"}, "render_mode must be None or rgb_array or human, not 'ansi'"),
         ({"frames": 0}, "frames must be 1 to 16"),
         ({"frames": 17, "observation": "grid"}, "frames must be 1 to 16"),
-        ({"frames": 4}, "only for observation='grid'"),
+        ({"frames": 4}, "only for grids"),
+        ({"motion": True, "observation": "image"}, "leave it out with observation='image'"),
         ({"traffic": -1}, "not -1"),
         ({"traffic": 3, "scenario": "no/map.yaml"}, "no lanes for traffic"),
         ({"scenario": "no/map.yaml"}, "no/map.yaml"),

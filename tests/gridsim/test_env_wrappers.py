@@ -10,6 +10,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from driving import SENSING, drive
+from gymnasium.spaces import flatten
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
@@ -130,14 +131,14 @@ def test_wrappers_of_a_single_environment(observation: str, frames: int, actions
     )
     first, _ = plain.reset(seed=2)
     seen, _ = env.reset(seed=2)
-    past = [first.reshape(-1)] * 3
+    past = [flatten(plain.observation_space, first)] * 3
     total, steps, over = 0.0, 0, False
     action: Any = int(Action.ACCELERATE) if actions == "discrete" else np.array([1.0, 0.1], dtype=np.float32)
     while not over:
         np.testing.assert_array_equal(seen, np.array(past))
         assert seen in env.observation_space
         now, reward, terminated, truncated, _ = plain.step(action)
-        past = [*past[1:], now.reshape(-1)]
+        past = [*past[1:], flatten(plain.observation_space, now)]
         seen, wrapped, *_, info = env.step(action)
         assert wrapped == reward
         total, steps, over = total + float(reward), steps + 1, terminated or truncated
@@ -164,9 +165,9 @@ def side_by_side(
 def test_vector_wrappers_of_observations() -> None:
     low, high = np.zeros(32, dtype=np.float32), np.full(32, 2.0, dtype=np.float32)
     expected: list[tuple[Any, dict[str, Any], Any]] = [
-        (lambda env: wrappers.DtypeObservation(env, F), {"observation": "grid"}, lambda seen: seen.astype(F)),
+        (lambda env: wrappers.DtypeObservation(env, F), {"observation": "image"}, lambda seen: seen.astype(F)),
         (lambda env: wrappers.ReshapeObservation(env, (4, 8)), {}, lambda seen: seen.reshape(-1, 4, 8)),
-        (lambda env: wrappers.FlattenObservation(env), {"observation": "grid"}, lambda seen: seen.reshape(3, -1)),
+        (lambda env: wrappers.FlattenObservation(env), {"observation": "image"}, lambda seen: seen.reshape(3, -1)),
         (
             lambda env: wrappers.TransformObservation(env, lambda seen: 1.0 - seen),
             {},

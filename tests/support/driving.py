@@ -5,7 +5,7 @@ import numpy as np
 from gridsim.car.vehicle import Action
 from gridsim.envs.env import GridSimVectorEnv
 
-SENSING = [("rays", 1), ("grid", 1), ("grid", 4)]
+SENSING = [("rays", 1), ("grid", 1), ("grid", 4), ("image", 1)]
 
 
 def drive(env: GridSimVectorEnv, steps: int, seed: int) -> np.ndarray:
