@@ -99,7 +99,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         Args:
             num_envs: cars.
             scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
-            maps: how many maps the episodes are drawn from, or the maps themselves.
+            maps: how many maps the episodes are drawn from, or the maps themselves. All environments of a process share
+                a scenario's maps.
             map_seed: seed of the first of them; the others' follow.
             traffic: other cars in each car's world; None is as many as the scenario has by default.
             observation: `rays`, `grid` or `image`.
@@ -157,6 +158,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.ranges = np.zeros((num_envs, self.config.sensors.rays), dtype=np.float32)
         self._fastest = np.ones(num_envs, dtype=np.float32)  # m/s, upper speed of each car's scenario
         self._seeded = self._started = False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy draws pictures of its own, and opens a window of its own."""
+        return {**vars(self), "_views": {}, "_window": None}
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

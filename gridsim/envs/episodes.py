@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -15,6 +16,18 @@ from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build, is_map_file, map_of
 
 _U = np.uint64
+#: The maps that environments of this process were built for, as long as one of them has them.
+_SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDictionary()
+
+
+def shared_map(scenario: str, seed: int, config: SimConfig) -> Map:
+    """A map that all environments of this process share; one of a file, which may change, is read anew."""
+    if is_map_file(scenario):
+        return build(scenario, seed, config)
+    found = _SHARED.get((scenario, seed, config))
+    if found is None:
+        found = _SHARED[scenario, seed, config] = build(scenario, seed, config)
+    return found
 
 
 @njit
@@ -92,7 +105,7 @@ class Episodes:
         """Index among `maps` of the map of a seed, built where it is not there yet."""
         seed = map_of(self.scenario, seed)
         if seed not in self._index:
-            self.maps.append(build(self.scenario, seed, self.config))
+            self.maps.append(shared_map(self.scenario, seed, self.config))
             self._index[seed] = len(self.maps) - 1
         return self._index[seed]
 

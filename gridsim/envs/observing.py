@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
@@ -72,6 +74,14 @@ class Observer:
             self.space = image
         elif observation == "grid":
             self.space = Dict({"grid": image, "speed": Box(self._slowest, 1.0, (1,), dtype=np.float32)})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the table, whose copy could be written to: kernels would be compiled anew for it."""
+        return {**vars(self), "table": self.table is not None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.table = grid_table(self.config) if state["table"] else None
 
     def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
         """Let cars `which` [k] sense `ranges` [k, rays]: their newest frame, or the first where they have `begun`."""

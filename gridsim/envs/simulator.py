@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -220,6 +221,15 @@ class Simulator:
         self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
         self._order, self._runs = _by_map(self._rows)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Without arrays that are read-only: copies of them are not, and kernels would be compiled anew for these."""
+        return {**vars(self), "_atlas": None, "_fan": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._fan = fan(self.config.sensors.rays, self._constants.ray_first, self._constants.ray_step)
+        self._lay_out()
+
     def __len__(self) -> int:
         return len(self.state.ends)
 
@@ -320,11 +330,14 @@ class Simulator:
         missing = [scenario for scenario in wanted.values() if not any(scenario is other for other in shown)]
         if missing:
             self._shown = list(wanted.values()) if everyone else shown + missing
-            self._atlas = make_atlas(
-                [scenario.road for scenario in self._shown], [scenario.network for scenario in self._shown]
-            )
+            self._lay_out()
         row = {id(scenario): k for k, scenario in enumerate(self._shown)}
         return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int64)
+
+    def _lay_out(self) -> None:
+        """Make the atlas of the maps that it shows."""
+        if self._shown:
+            self._atlas = make_atlas([shown.road for shown in self._shown], [shown.network for shown in self._shown])
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.

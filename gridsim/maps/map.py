@@ -109,6 +109,10 @@ class Map:
         """Copies are read-only, too: kernels would be compiled anew for arrays that can be written to."""
         return Map.from_arrays, (self.arrays(),)
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Map:
+        """It cannot be changed, so that copies share it."""
+        return self
+
 
 def blank(config: SimConfig) -> Map:
     """A map of 8 m x 8 m without any road: to compile kernels with, before there are maps."""

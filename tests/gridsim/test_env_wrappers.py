@@ -16,11 +16,18 @@ from gymnasium.wrappers import vector as wrappers
 
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
+from gridsim.config import SensorConfig, SimConfig
+from gridsim.envs import episodes, observing, simulator
 from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
+from gridsim.maps import map
 from gridsim.maps.map import Map
+from gridsim.maps.scenarios import build
+from gridsim.sensing import grid
 from gridsim.view.render import NoDisplayError
 
 F = np.float32
+KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing._reward, grid._fill_grids]
+KERNELS += [grid._push_frames, episodes._draw, map._starts_at]
 
 
 # --- pictures
@@ -256,6 +263,60 @@ def test_torch_takes_what_the_vector_environment_tells(maps: dict[str, list[Map]
     for *_, info in (env.reset(seed=0), env.step(np.zeros(2, dtype=int))):
         told = {name: torch.from_numpy(value) for name, value in info.items()}
         assert told["end"].tolist() == [End.RUNNING] * 2
+
+
+def test_environments_share_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
+
+    def counted(*of: Any) -> Map:
+        built.append(of)
+        return build(*of)
+
+    monkeypatch.setattr(episodes, "build", counted)
+    envs: list[Any] = [gymnasium.make("GridSim/Curved-v0", maps=2, map_seed=700) for _ in range(4)]
+    many = gymnasium.make_vec("GridSim/Curved-v0", num_envs=8, maps=2, map_seed=700)
+    for env in (*envs, many):
+        for seed in range(4):
+            env.reset(seed=seed)
+    assert len(built) == 2
+    other = GridSimEnv("curved", maps=2, map_seed=700, config=SimConfig(sensors=SensorConfig(range=30.0)))
+    other.reset(seed=0)
+    assert len(built) == 3
+
+
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+@pytest.mark.parametrize(("observation", "frames"), SENSING)
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+@pytest.mark.parametrize("single", [True, False])
+def test_a_copied_environment_goes_on_alike_with_the_same_kernels(
+    single: bool, clone: Any, observation: str, frames: int, actions: str
+) -> None:
+    options: Any = {"maps": 2, "observation": observation, "frames": frames, "actions": actions}
+    options |= {"render_mode": "rgb_array", "motion": observation == "rays"}
+    name = "GridSim/City-v0"
+    env: Any = gymnasium.make(name, **options) if single else gymnasium.make_vec(name, num_envs=3, **options)
+    env.action_space.seed(1)
+    row = [env.action_space.sample() for _ in range(12)]
+    env.reset(seed=5)
+    for middle in (False, True):  # of an episode, or at its beginning
+        env.step(row[0])
+        env.render()
+        if not middle:
+            env.reset(seed=5)
+        compiled = [len(kernel.signatures) for kernel in KERNELS]
+        other = clone(env)
+        for action in row[1:]:
+            ours, theirs = env.step(action), other.step(action)
+            assert repr(ours) == repr(theirs)
+            np.testing.assert_equal(ours, theirs)
+            if single and (ours[2] or ours[3]):
+                break
+        np.testing.assert_array_equal(env.render(), other.render())
+        np.testing.assert_equal(env.reset(), other.reset())
+        assert [len(kernel.signatures) for kernel in KERNELS] == compiled
+        maps = [each.unwrapped.cars if single else each.unwrapped for each in (env, other)]
+        if clone is copy.deepcopy:
+            assert maps[0].simulator.scenarios[0] is maps[1].simulator.scenarios[0]
 
 
 def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Map]]) -> None:
