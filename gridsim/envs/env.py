@@ -12,7 +12,8 @@ Observation:
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as policies of convolutions take pictures.
 
 Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
-clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`.
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. There is no penalty for idling, 15
+steps without progress: its last step is rewarded as any other, and the episode terminates.
 
 An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
 a single environment meets after `reset(seed=s + i)`, whatever the other cars do.
