@@ -15,12 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cluster.workers.pool import BuildMap, answer
+from cluster.workers.pool import NOBODY, BuildMap, answer
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-NOBODY = np.zeros(0, RECIPE).tobytes()
 Name = tuple[str, int]
 """Of a map: scenario and seed."""
 
@@ -60,9 +58,9 @@ class Actor:
         return os.getpid()
 
     def run(
-        self, serial: int, payload: bytes, first: int, stop: int,
+        self, serial: int, recipes: np.ndarray, first: int, stop: int,
         names: Sequence[Name] = (), gone: Sequence[Name] = (), task: Task | CollectTask | None = None, *maps: Any,
-    ) -> bytes:  # fmt: skip
+    ) -> tuple[Any, ...]:  # fmt: skip
         """What `pool.answer` says; `names` and all after it are for a worker that does not have the task yet."""
         if task is not None:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
@@ -72,7 +70,7 @@ class Actor:
         if self._task is None or serial != self._serial:
             raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
         mine = [self._maps[name] for name in self._task.maps]
-        return answer(self._worker, self._task, mine, payload, first, stop)
+        return answer(self._worker, self._task, mine, recipes, first, stop)
 
 
 class Shared:

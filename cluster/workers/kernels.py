@@ -114,7 +114,7 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
         limits=Limits(1.0, STEPS),
         config=config,
     )
-    answer(Worker(), task, [blank(config)], made.tobytes(), 0, 1)
+    answer(Worker(), task, [blank(config)], made, 0, 1)
     if command == DqnSettings.command:
         Worker().collect(
             CollectTask(

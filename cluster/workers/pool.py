@@ -8,12 +8,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.dqn.experience import Experience, from_bytes, join, to_bytes
+from evolution.dqn.experience import Experience, join
 from evolution.episodes.rollout import RESULT, targets
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind
@@ -33,6 +33,7 @@ LARGER = 4  # times what is worth sending, where that is more
 WHOLE = 0.6  # of a member's metres, from which on it is not cut
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
 LARGE_BYTES = 16 << 20  # of results, that are kept column by column
+NOBODY = np.zeros(0, RECIPE)  # the recipes where experience is collected
 FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
 
 
@@ -116,19 +117,6 @@ class Outcome(Cost):
             self.rewound[chunk.columns], self.worlds[chunk.columns] = rewound[0], worlds[0]
         self._count(worker, results.size, seconds)
 
-    def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
-        """The same of what `answer` made."""
-        rows, columns = (part.stop - part.start for part in chunk)
-        results = np.frombuffer(raw, RESULT, rows * columns, 8).reshape(rows, columns)
-        states = np.frombuffer(raw, np.float32, offset=8 + results.nbytes)
-        k = columns if states.size else 0
-        rewound, worlds = states[: rows * k * 5], states[rows * k * 5 :]
-        self.add(
-            worker, chunk, results, rewound.reshape(rows, k, 5), worlds.reshape(rows, k, *self.worlds.shape[1:]),
-            float(np.frombuffer(raw, np.float64, 1)[0]),
-        )  # fmt: skip
-        self.bytes_up += len(raw)
-
     def lose(self, chunk: Chunk) -> None:
         """Do without a chunk's members: nothing of them counts, not even what is there."""
         self.lost[chunk.rows] = True
@@ -170,13 +158,6 @@ class Collected(Cost):
         self.results[chunk.columns] = results
         self._count(worker, len(results), seconds)
 
-    def take(self, worker: int, chunk: Chunk, raw: bytes) -> None:
-        """The same of what `answer` made."""
-        results = np.frombuffer(raw, RESULT, chunk.columns.stop - chunk.columns.start, 8)
-        experience = from_bytes(self.policy, memoryview(raw)[8 + results.nbytes :])
-        self.add(worker, chunk, experience, results, float(np.frombuffer(raw, np.float64, 1)[0]))
-        self.bytes_up += len(raw)
-
     def lose(self, chunk: Chunk) -> None:
         """Do without a chunk's episodes."""
         self.lost[chunk.columns] = True
@@ -184,19 +165,15 @@ class Collected(Cost):
 
 
 def answer(
-    worker: Worker, task: Task | CollectTask, maps: Sequence[Map], payload: bytes, first: int, stop: int
-) -> bytes:
-    """What a worker says to a chunk: its seconds as float64, its results, its experience if that is what is asked for.
+    worker: Worker, task: Task | CollectTask, maps: Sequence[Map], recipes: np.ndarray, first: int, stop: int
+) -> tuple[Any, ...]:
+    """What a worker says to a chunk: what `Outcome.add` and `Collected.add` take in, the seconds last.
 
-    Bytes take a fifth of what pickled arrays take. The payload of a `Task` is recipes; `first` and `stop` say which of
-    the task's episodes. States some steps before the ends come last, of all of these episodes or of none.
+    Recipes RECIPE [n] are a `Task`'s; `first` and `stop` say which of the task's episodes.
     """
     if isinstance(task, CollectTask):
-        experience, results, seconds = worker.collect(task, maps, first, stop)
-        return b"".join([np.float64(seconds).tobytes(), results.tobytes(), to_bytes(experience)])
-    recipes = freeze(np.frombuffer(payload, RECIPE).copy())
-    results, rewound, worlds, seconds = worker.evaluate(of_episodes(task, first, stop), maps, recipes)
-    return b"".join([np.float64(seconds).tobytes(), results.tobytes(), rewound.tobytes(), worlds.tobytes()])
+        return worker.collect(task, maps, first, stop)
+    return worker.evaluate(of_episodes(task, first, stop), maps, freeze(recipes))
 
 
 class WorkerPool(Protocol):
@@ -256,52 +233,34 @@ class SerialPool:
         asked: Sequence[Chunk] | None = None,
         meanwhile: Meanwhile | None = None,
     ) -> Outcome:
-        started = time.perf_counter()
-        recipes = freeze(recipes)
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
-        maps = [self._build_map(*name) for name in task.maps]
-
-        def evaluate(chunk: Chunk) -> None:
-            part = of_episodes(task, chunk.columns.start, chunk.columns.stop)
-            outcome.add(0, chunk, *self._worker.evaluate(part, maps, recipes[chunk.rows]))
-
-        self._work(task, cut(task, asked, PARTS), evaluate, outcome, on_progress, meanwhile)
-        outcome.wall_s = time.perf_counter() - started
+        self._work(task, asked, recipes, outcome, on_progress, meanwhile)
         return outcome
 
     def collect(
         self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
     ) -> Collected:
-        started = time.perf_counter()
         collected = new_collected(task)
-        maps = [self._build_map(*name) for name in task.maps]
-
-        def collect(chunk: Chunk) -> None:
-            columns = chunk.columns
-            collected.add(0, chunk, *self._worker.collect(task, maps, columns.start, columns.stop))
-
-        self._work(task, cut(task, all_episodes(task), PARTS), collect, collected, on_progress, meanwhile)
-        collected.wall_s = time.perf_counter() - started
+        self._work(task, all_episodes(task), NOBODY, collected, on_progress, meanwhile)
         return collected
 
     def _work(
-        self,
-        task: Task | CollectTask,
-        chunks: list[Chunk],
-        do: Callable[[Chunk], None],
-        brought: Outcome | Collected,
-        on_progress: Progress | None,
-        meanwhile: Meanwhile | None,
-    ) -> None:
+        self, task: Task | CollectTask, asked: Sequence[Chunk], recipes: np.ndarray, brought: Outcome | Collected,
+        on_progress: Progress | None, meanwhile: Meanwhile | None,
+    ) -> None:  # fmt: skip
+        started = time.perf_counter()
+        maps = [self._build_map(*name) for name in task.maps]
         finish(meanwhile)
-        for index, chunk in enumerate(chunks):
+        for index, chunk in enumerate(cut(task, asked, PARTS)):
+            rows, columns = chunk
             try:
-                do(chunk)
+                brought.add(0, chunk, *answer(self._worker, task, maps, recipes[rows], columns.start, columns.stop))
             except Exception as error:
                 raise PoolError(f"a worker failed on {describe(task, index, chunk)}: {last_line(error)}") from error
             if on_progress:
                 on_progress(*brought.progress())
+        brought.wall_s = time.perf_counter() - started
 
     def close(self) -> None:
         pass
@@ -411,12 +370,12 @@ def describe(task: Task | CollectTask, index: int, chunk: Chunk) -> str:
     return f"chunk {index} (members {chunk.rows.start} to {chunk.rows.stop - 1})"
 
 
-def identify(task: Task | CollectTask, chunk: Chunk, payload: bytes) -> str:
-    """The one member, or episode, of a chunk: with its recipe, so that it can be tried again."""
+def identify(task: Task | CollectTask, chunk: Chunk, recipes: np.ndarray) -> str:
+    """The one member, or episode, of a chunk: with its recipe (of `recipes`), so that it can be tried again."""
     if isinstance(task, CollectTask):
         k = chunk.columns.start
         return f"episode {k} (key {task.keys[k]:#x}, exploration {task.epsilons[k]:.3g})"
-    recipe = np.frombuffer(payload, RECIPE)[0]
+    recipe = recipes[chunk.rows][0]
     kind = Kind(int(recipe["kind"])).name.lower()
     rows = f"rows {recipe['a']} and {recipe['b']}"
     return f"member {chunk.rows.start} ({kind} of {rows}, seed {recipe['seed']}, key {task.key:#x})"

@@ -33,6 +33,7 @@ from cluster.workers.pool import (
     FINER,
     LARGEST_S,
     METRE_S,
+    NOBODY,
     BuildMap,
     Chunk,
     Collected,
@@ -99,7 +100,7 @@ class _Call:
     task: Task | CollectTask
     task_ref: Any
     dispatch: Dispatch
-    payload: Callable[[Chunk], bytes]
+    recipes: np.ndarray
     brought: Outcome | Collected
     measured: bool  # whether it is known how long such chunks take
 
@@ -157,18 +158,18 @@ class RayPool:
     ) -> Outcome:  # fmt: skip
         asked = everything(task, recipes) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
-        self._work(task, asked, 1, lambda chunk: recipes[chunk.rows].tobytes(), outcome, on_progress, meanwhile)
+        self._work(task, asked, 1, recipes, outcome, on_progress, meanwhile)
         return outcome
 
     def collect(
         self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
     ) -> Collected:
         collected = new_collected(task)
-        self._work(task, all_episodes(task), FINER, lambda _: b"", collected, on_progress, meanwhile)
+        self._work(task, all_episodes(task), FINER, NOBODY, collected, on_progress, meanwhile)
         return collected
 
     def _work(
-        self, task: Task | CollectTask, asked: Sequence[Chunk], finer: int, payload: Callable[[Chunk], bytes],
+        self, task: Task | CollectTask, asked: Sequence[Chunk], finer: int, recipes: np.ndarray,
         brought: Outcome | Collected, on_progress: Progress | None, meanwhile: Meanwhile | None,
     ) -> None:  # fmt: skip
         """Have what is asked for done, in chunks `finer` times as small as they need be, and fill `brought`."""
@@ -188,7 +189,7 @@ class RayPool:
         dispatch = Dispatch(parts, isinstance(task, CollectTask), expected_s)
         self._serial += 1
         task_ref, brought.broadcast_bytes = self._shared.put(task)
-        call = _Call(task, task_ref, dispatch, payload, brought, kind in self._metre_s)
+        call = _Call(task, task_ref, dispatch, recipes, brought, kind in self._metre_s)
         nobody_since, quiet = time.monotonic(), False
 
         while not dispatch.finished():
@@ -229,12 +230,12 @@ class RayPool:
 
     def _send(self, slot: _Slot, chunk: int, call: _Call) -> None:
         part = call.dispatch.parts[chunk]
-        columns, raw = part.columns, call.payload(part)
+        columns, recipes = part.columns, call.recipes[part.rows]
         if not slot.sent:
             slot.heard = time.monotonic()
-        answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, *self._news(slot, call))
+        answered = slot.actor.run.remote(self._serial, recipes, columns.start, columns.stop, *self._news(slot, call))
         slot.sent.append((self._serial, answered))
-        call.brought.bytes_down += len(raw)
+        call.brought.bytes_down += recipes.nbytes
 
     def _news(self, slot: _Slot, call: _Call) -> list[Any]:
         """What a worker has to be told of the task, which then counts as told."""
@@ -266,7 +267,7 @@ class RayPool:
 
         serial, ref = slot.sent[0]
         try:
-            raw = ray.get(ref)
+            answer = ray.get(ref)
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
             if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
@@ -282,7 +283,8 @@ class RayPool:
         # What an earlier call has left is nobody's any more: a second copy, or what was interrupted.
         chunk = call.dispatch.answered(slot.number, slot.heard) if serial == self._serial else None
         if chunk is not None:
-            call.brought.take(slot.number, call.dispatch.parts[chunk], raw)
+            call.brought.add(slot.number, call.dispatch.parts[chunk], *answer)
+            call.brought.bytes_up += sum(part.nbytes for part in answer[:-1])
         return chunk is not None
 
     def _bury(self, slot: _Slot, call: _Call, reason: str, blamed: bool = True) -> bool:
@@ -293,7 +295,7 @@ class RayPool:
         for part in lost:
             brought.lose(part)
         if lost:
-            who = identify(call.task, lost[0], call.payload(lost[0]))
+            who = identify(call.task, lost[0], call.recipes)
             brought.warnings.append(
                 f"{who} killed its worker {MAX_KILLS} times and is lost; the last time {reason}{self._logs()}"
             )

@@ -47,6 +47,10 @@ class Experience(NamedTuple):
     rewards: np.ndarray  # float32 [rows]
     ends: np.ndarray  # uint8 [rows], End
 
+    @property
+    def nbytes(self) -> int:
+        return sum(array.nbytes for array in self)
+
 
 def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
     """What a row of `Experience.observations` is for such a policy."""
@@ -71,29 +75,6 @@ def join(spec: PolicySpec, parts: Sequence[Experience]) -> Experience:
     if not parts:
         return empty(spec, 0)
     return Experience(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-def to_bytes(experience: Experience) -> bytes:
-    """Experience as bytes for `from_bytes`: rewards, observations, actions, ends (aligned if the bytes are)."""
-    observations, actions, rewards, ends = (np.ascontiguousarray(array) for array in experience)
-    return b"".join([rewards.data, observations.data, actions.data, ends.data]) if len(rewards) else b""
-
-
-def from_bytes(spec: PolicySpec, raw: bytes | memoryview) -> Experience:
-    """What `to_bytes` made of the experience of such a policy; read-only and without a copy.
-
-    Raises: ValueError where the bytes are not whole rows.
-    """
-    dtype, width = observation_dtype_and_width(spec)
-    row = 4 + dtype.itemsize * width + 1 + 1
-    rows, rest = divmod(len(raw), row)
-    if rest:
-        raise ValueError(f"experience of {spec} has {row} bytes a row; {len(raw)} bytes are not whole rows")
-    rewards = np.frombuffer(raw, np.float32, rows)
-    observations = np.frombuffer(raw, dtype, rows * width, 4 * rows).reshape(rows, width)
-    actions = np.frombuffer(raw, np.uint8, rows, (row - 2) * rows)
-    ends = np.frombuffer(raw, np.uint8, rows, (row - 1) * rows)
-    return Experience(observations, actions, rewards, ends)
 
 
 def ages(experience: Experience) -> np.ndarray:

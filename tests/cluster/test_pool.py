@@ -8,12 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from driving import to_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.workers.pool import (
     CHUNK_S,
     METRE_S,
+    NOBODY,
     WORTH_SENDING_S,
     Chunk,
     PoolError,
@@ -28,7 +30,7 @@ from cluster.workers.pool import (
     new_outcome,
 )
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.dqn.experience import Experience, to_bytes
+from evolution.dqn.experience import Experience
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec
@@ -252,14 +254,14 @@ def test_a_worker_that_fails_to_collect_ends_in_one_line_that_names_the_episodes
         SerialPool(never_built, Failing).collect(make_collect_task(512))
 
 
-def test_an_answer_is_taken_as_it_was_given() -> None:
-    """There and back as bytes, as between a worker and a pool that is elsewhere; its arrays are read-only."""
+def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
+    """And what a task holds is read-only."""
     task, scenarios = collect_drive_task(9)
     whole = SerialPool(lambda *name: scenarios[name[1]]).collect(task)
     collected = new_collected(task)
     for first, stop in ((5, 9), (0, 2), (2, 5)):
-        raw = answer(Worker(), task, scenarios, b"", first, stop)
-        collected.take(first, Chunk(slice(0, 1), slice(first, stop)), raw)
+        brought = answer(Worker(), task, scenarios, NOBODY, first, stop)
+        collected.add(first, Chunk(slice(0, 1), slice(first, stop)), *brought)
     assert collected.whole()
     assert to_bytes(collected.experience) == to_bytes(whole.experience)
     assert collected.results.tobytes() == whole.results.tobytes()
@@ -302,7 +304,7 @@ def rewound_task() -> tuple[Task, list[Map]]:
 
 
 def test_states_before_the_end_are_those_of_the_one_who_drove_there() -> None:
-    """The last member drives the last two episodes, which ask for them; alone, in parts, and as bytes."""
+    """The last member drives the last two episodes, which ask for them; alone and in parts."""
     task, scenarios = rewound_task()
     recipes = make_recipes(6)
     asked = [Chunk(slice(5, 6), slice(2, 4)), Chunk(slice(0, 5), slice(0, 2))]
@@ -319,18 +321,17 @@ def test_states_before_the_end_are_those_of_the_one_who_drove_there() -> None:
 
     taken = new_outcome(task, recipes, asked)
     for rows, columns in ((slice(5, 6), slice(3, 4)), (slice(0, 5), slice(0, 2)), (slice(5, 6), slice(2, 3))):
-        raw = answer(Worker(), task, scenarios, recipes[rows].tobytes(), columns.start, columns.stop)
-        taken.take(0, Chunk(rows, columns), raw)
+        brought = answer(Worker(), task, scenarios, recipes[rows], columns.start, columns.stop)
+        taken.add(0, Chunk(rows, columns), *brought)
     assert taken.whole()
     for name in ("results", "rewound", "worlds"):
         assert getattr(taken, name).tobytes() == getattr(outcome, name).tobytes()
-    assert taken.bytes_up >= 12 * RESULT.itemsize + rewound.nbytes + worlds.nbytes
 
 
 def test_a_member_is_told_by_its_recipe() -> None:
     recipes = make_recipes(9)
     recipes["kind"][8] = Kind.MIRRORED
-    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes[k : k + 1].tobytes()) for k in (1, 7, 8)]
+    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes) for k in (1, 7, 8)]
     assert told == [
         "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
         "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",

@@ -17,6 +17,7 @@ import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
 from commands import importable, wait_until
+from driving import to_bytes
 from test_pool import (
     MAPS,
     Answering,
@@ -34,7 +35,7 @@ from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.ray_session import check_address
 from cluster.workers.worker import CollectTask, Task
-from evolution.dqn.experience import Experience, to_bytes
+from evolution.dqn.experience import Experience
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
@@ -158,7 +159,7 @@ def test_results_progress_and_what_is_sent(pool: RayPool) -> None:
     assert told[-1] == (512, 512)
     assert outcome.retries == 0
     assert outcome.bytes_down == 512 * RECIPE.itemsize
-    assert outcome.bytes_up == outcome.results.nbytes + 8 * len(told)
+    assert outcome.bytes_up == outcome.results.nbytes
     assert 8 * 311 * 4 < outcome.broadcast_bytes < 8 * 311 * 4 + 2000
     assert set(outcome.busy_s) <= {0, 1}
     assert len(set(pool.pids())) == pool.workers() <= 2
@@ -308,7 +309,7 @@ def test_experience_keeps_its_order_and_a_killed_worker_costs_its_chunk_alone(
     # The answer to the chunk before it may have been on its way when the worker died; nothing is sent with a suspect.
     assert repeated <= times + min(times, 1), "what else was sent to the worker had not been begun"
     assert times <= collected.retries <= 2 * times
-    assert collected.bytes_up == 8 * len(told) + 12 * 400 + len(to_bytes(wanted.experience))
+    assert collected.bytes_up == 12 * 400 + wanted.experience.nbytes
 
 
 def test_an_exception_while_collecting_names_the_episodes(pool: RayPool, folder: Path) -> None:

@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from driving import to_bytes
 
 from cluster.runs.champion import load_champion
 from cluster.workers.pool import SerialPool
 from cluster.workers.worker import CollectTask, Worker
-from evolution.dqn.experience import NO_ACTION, Experience, ages, join, to_bytes, unpack
+from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.collecting import collect
 from evolution.episodes.rollout import Limits, evaluate, no_traffic
 from evolution.episodes.starts import lane_starts

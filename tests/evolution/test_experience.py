@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from driving import to_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,12 +14,10 @@ from evolution.dqn.experience import (
     ages,
     empty,
     fixed,
-    from_bytes,
     join,
     keep_grid,
     keep_rays,
     observation_dtype_and_width,
-    to_bytes,
     unpack,
 )
 from evolution.networks import convnet
@@ -161,20 +160,6 @@ def test_ages_count_from_each_episodes_first_row(lengths: list[int]) -> None:
     assert ages(made(SPECS[0], lengths)).tolist() == wanted
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=str)
-def test_bytes_there_and_back_keep_every_bit_and_copy_nothing(spec: PolicySpec) -> None:
-    for lengths in ([], [0], [3, 0, 8, 1]):
-        x = made(spec, lengths)
-        raw = to_bytes(x)
-        assert len(raw) == sum(array.nbytes for array in x)
-        back = from_bytes(spec, raw)
-        for before, after in zip(x, back, strict=True):
-            assert (before.dtype, before.shape) == (after.dtype, after.shape)
-            assert before.tobytes() == after.tobytes()
-            assert not after.flags.owndata
-            assert after.flags.aligned
-
-
 def test_parts_are_joined_in_their_order() -> None:
     spec = SPECS[0]
     whole = made(spec, [2, 5, 1])
@@ -185,8 +170,6 @@ def test_parts_are_joined_in_their_order() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     x, grids = made(SPECS[0], [3]), made(SPECS[3], [3])
-    with pytest.raises(ValueError, match="70 bytes a row; 71 bytes are not whole rows"):
-        from_bytes(SPECS[0], bytes(71))
     with pytest.raises(ValueError, match=r"kept as int16 \[rows, 32\], not uint8 \(4, 1602\)"):
         unpack(SPECS[0], grids.observations, np.array([0]))
     with pytest.raises(ValueError, match="give as many as rows"):

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from evolution.dqn.experience import Experience
 from gridsim.car.vehicle import Action
 from gridsim.envs.env import GridSimVectorEnv
 
@@ -14,3 +15,8 @@ def drive(env: GridSimVectorEnv, steps: int, seed: int) -> np.ndarray:
     if env.action_space.dtype == np.float32:
         return rng.uniform([-0.2, -0.3], [1.0, 0.3], (steps, env.num_envs, 2)).astype(np.float32)
     return rng.choice([Action.ACCELERATE, Action.NONE, Action.LEFT, Action.RIGHT], (steps, env.num_envs))
+
+
+def to_bytes(experience: Experience) -> bytes:
+    """All bits of experience, to be compared."""
+    return b"".join(array.tobytes() for array in experience)
