@@ -23,7 +23,7 @@ import llvmlite.binding
 import numpy as np
 
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
-from cluster.workers.pool import answer
+from cluster.workers.pool import NOBODY, answer
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import EPISODE, Limits, trajectory
 from evolution.networks.policy import Observation, PolicySpec
@@ -33,10 +33,9 @@ from gridsim.car.ego import FIELDS
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import views
 from gridsim.jit import CACHE_FOLDER, CONFIG
-from gridsim.maps.map import blank, sample_starts
+from gridsim.maps.map import Map, blank, sample_starts
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
-from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
-from gridsim.traffic.world import LANE, spawn
+from gridsim.traffic.world import spawn
 
 STEPS = 1  # of the episodes that are driven to compile what drives them
 
@@ -91,56 +90,35 @@ def begin(settings: RunSettings) -> Warming:
     return warming
 
 
-def _absent(traffic: int) -> np.ndarray:
-    """Worlds float32 [1, traffic, fields] of cars that are not there."""
-    worlds = np.zeros((1, traffic, TRAFFIC_FIELDS), dtype=np.float32)
-    worlds[:, :, LANE] = -1.0
-    return worlds
+def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray, Limits]:
+    """The smallest drive: configuration, a map without a road, a genome of zeros, an episode, its traffic, limits."""
+    config, genome = SimConfig(), np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)
+    road, episodes = blank(config), np.zeros(1, dtype=EPISODE)
+    worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config.traffic)
+    return config, road, genome, episodes, worlds, Limits(1.0, STEPS)
 
 
 def compile_kernels(policy: str, traffic: int, command: str) -> None:
     """Compile, or load from the cache, what evaluates members, and for the DQN also what collects experience."""
+    config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
     made = recipes(2)
     made["kind"] = Kind.NEW
-    config = SimConfig()
-    task = Task(
-        policy=policy,
-        parents=np.zeros((1, PolicySpec.parse(policy).size), dtype=np.float32),
-        key=1,
-        mutation=Mutation(),
-        episodes=np.zeros(1, dtype=EPISODE),
-        worlds=_absent(traffic),
-        maps=(),
-        limits=Limits(1.0, STEPS),
-        config=config,
-    )
-    answer(Worker(), task, [blank(config)], made, 0, 1)
+    task = Task(policy, genome[None], 1, Mutation(), episodes, worlds, (), limits, config)
+    answer(Worker(), task, [road], made, 0, 1)
     if command == DqnSettings.command:
-        Worker().collect(
-            CollectTask(
-                policy=policy,
-                weights=task.parents[0].copy(),
-                episodes=task.episodes,
-                worlds=task.worlds,
-                maps=(),
-                epsilons=np.zeros(1, dtype=np.float32),
-                keys=np.zeros(1, dtype=np.uint64),
-                limits=task.limits,
-                config=config,
-            ),
-            [blank(config)], 0, 1,
-        )  # fmt: skip
+        epsilons, keys = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.uint64)
+        collecting = CollectTask(policy, genome, episodes, worlds, (), epsilons, keys, limits, config)
+        answer(Worker(), collecting, [road], NOBODY, 0, 1)
 
 
 def compile_film(policy: str, traffic: int) -> None:
     """The same for pictures and films of a drive."""
     from gridsim.view.render import Renderer
 
-    config, spec = SimConfig(), PolicySpec.parse(policy)
-    road, genome, world = blank(config), np.zeros(spec.size, dtype=np.float32), _absent(traffic)
-    start = np.zeros(5, dtype=np.float32)
-    _, cars, worlds = trajectory(spec, genome, road, start, Limits(1.0, STEPS), config, world[0])
-    ranges = views(road, cars, worlds, config)
+    config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
+    start = episodes["start"][0]
+    _, cars, others = trajectory(PolicySpec.parse(policy), genome, road, start, limits, config, worlds[0])
+    ranges = views(road, cars, others, config)
     Renderer(road, (64, 64)).draw(np.zeros(FIELDS, dtype=np.float32), ranges=ranges[0], path=cars[:, :2], text="0")
 
 
@@ -174,8 +152,9 @@ def compile_everything() -> None:
         print(warming.done.name, flush=True)
 
 
-def main(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
+def main(part: str, scenario: str, policy: str, cars: str, command: str) -> None:
     """What the process does."""
+    traffic = int(cars)
     if part == "kernels":
         compile_kernels(policy, traffic, command)
         print("ready", flush=True)
@@ -189,5 +168,5 @@ def main(part: str, scenario: str, policy: str, traffic: int, command: str) -> N
 if __name__ == "__main__":
     if sys.argv[1:] == ["everything"]:
         compile_everything()
-        sys.exit()
-    main(sys.argv[1], sys.argv[2], sys.argv[3], int(sys.argv[4]), sys.argv[5])
+    else:
+        main(*sys.argv[1:])
