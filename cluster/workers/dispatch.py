@@ -59,6 +59,7 @@ class Dispatch:
         self._not_before: dict[int, float] = {}
         self._suspects: set[int] = set()  # lost with a worker
         self._narrowest: set[int] = set()  # pieces of one member
+        self._copied: set[int] = set()  # late, and sent to a second worker
 
     def finished(self) -> bool:
         """Whether every chunk is answered, or lost."""
@@ -83,14 +84,14 @@ class Dispatch:
         """Seconds that what a worker is at is expected to take; 0 where it holds nothing of this call."""
         return self._expected_s(self.parts[self.at(worker)]) if self._held.get(worker) else 0.0
 
-    def give(self, idle: Sequence[int], now: float, quiet: bool) -> Iterator[tuple[int, int]]:
+    def give(self, idle: Sequence[int], now: float) -> Iterator[tuple[int, int]]:
         """Yield (worker, chunk) of all that is to be sent now.
 
-        The last ones only go to who has nothing to do. So do suspects, and nothing is queued behind them.
+        The last ones only go to who has nothing to do. So do suspects, and nothing is queued behind them. All answers
+        that have come are to be taken before, so that it is known what is late.
 
         Args:
             idle: workers that have nothing at all to do; who holds something of this call is known.
-            quiet: whether nobody has an answer that is not yet taken: else nothing is known to be late.
         """
         left = deque(idle)
         while left and (chunk := self._next(now)) is not None:
@@ -101,8 +102,9 @@ class Dispatch:
                 first = self._todo[0]
                 if self._suspects.isdisjoint((first, held[0].chunk)):
                     yield self._send(worker, self._todo.popleft(), now)
-        if left and quiet and not self._todo:
+        if left and not self._todo:
             for worker, chunk in zip(left, self._late(now), strict=False):
+                self._copied.add(chunk)
                 yield self._send(worker, chunk, now)
 
     def answered(self, worker: int, now: float) -> int | None:
@@ -130,8 +132,9 @@ class Dispatch:
             if self._settled[chunk]:
                 continue
             self._suspects.add(chunk)
-            if any(h.chunk == chunk for others in self._held.values() for h in others):
-                continue  # its copy goes on
+            if chunk in self._copied:
+                self._copied.remove(chunk)
+                continue  # the other copy goes on
             if (whole := self._is_whole(chunk)) and self._kills[chunk] >= MAX_KILLS:
                 lost = self._lose(chunk)
                 continue
@@ -208,10 +211,9 @@ class Dispatch:
 
     def _late(self, now: float) -> list[int]:
         """Chunks that one worker alone holds, and too long; so is what waits behind such a one."""
-        holders = Counter(h.chunk for held in self._held.values() for h in held)
         found: list[tuple[float, int]] = []
-        for held in self._held.values():
-            since = held[0].since if held else now
-            if now - since > LATE_S and now - since > LATE * self._expected_s(self.parts[held[0].chunk]):
-                found += [(since, h.chunk) for h in held if not self._settled[h.chunk] and holders[h.chunk] == 1]
+        for held in filter(None, self._held.values()):
+            since = held[0].since
+            if now - since > max(LATE_S, LATE * self._expected_s(self.parts[held[0].chunk])):
+                found += [(since, h.chunk) for h in held if not self._settled[h.chunk] and h.chunk not in self._copied]
         return [chunk for _, chunk in sorted(found)]

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 import os
 import shutil
 import threading
@@ -31,7 +32,6 @@ from cluster.workers.actor import Actor, Name, Shared
 from cluster.workers.dispatch import BACKOFF_S, MAX_KILLS, Dispatch
 from cluster.workers.pool import (
     FINER,
-    LARGEST_S,
     METRE_S,
     NOBODY,
     BuildMap,
@@ -68,9 +68,8 @@ from evolution.episodes.rollout import Limits
 
 CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
-UNKNOWN_S = 10.0  # that a chunk may take where nothing is known of such tasks
 MUTE = 10.0  # times what its chunk should take at most, in which a worker that is only slow has answered
-FIRST_S = 600.0  # for a worker's first answer: it may have to compile the kernels
+FIRST_S = 600.0  # added to patience for a worker's first answer: it may have to compile the kernels
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill cost fewer
 MAX_FAILED_STARTS = 3  # in a row, each by an exception, while nobody else is up
 MAX_PAUSE_S = 5.0  # before a worker that did not come up is started again
@@ -88,8 +87,7 @@ class _Slot:
     serial: int = 0  # of the last task that it was told of
     maps: set[Name] = field(default_factory=set)  # that it was told of
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (serial of the task, answer), oldest first
-    heard: float = 0.0  # when it last answered, or was given something to do; by time.monotonic
-    proven: bool = False  # whether it has ever answered
+    heard: float = 0.0  # when it last answered, or was given something to do; until its first answer FIRST_S later
     start_at: float = 0.0  # where there is no actor
 
 
@@ -102,7 +100,6 @@ class _Call:
     dispatch: Dispatch
     recipes: np.ndarray
     brought: Outcome | Collected
-    measured: bool  # whether it is known how long such chunks take
 
 
 class RayPool:
@@ -182,33 +179,30 @@ class RayPool:
         def expected_s(part: Chunk) -> float:
             done, total = brought.progress()
             if not done:
-                return metres(task, part) * metre_s if kind in self._metre_s else UNKNOWN_S
+                return metres(task, part) * metre_s if kind in self._metre_s else math.inf
             return metres(task, part) * max(metre_s, sum(brought.busy_s.values()) * total / (done * whole))
 
         parts = cut(task, asked, finer * self._asked, metre_s)
         dispatch = Dispatch(parts, isinstance(task, CollectTask), expected_s)
         self._serial += 1
         task_ref, brought.broadcast_bytes = self._shared.put(task)
-        call = _Call(task, task_ref, dispatch, recipes, brought, kind in self._metre_s)
-        nobody_since, quiet = time.monotonic(), False
+        call = _Call(task, task_ref, dispatch, recipes, brought)
+        nobody_since = time.monotonic()
 
         while not dispatch.finished():
             now = time.monotonic()
             for slot in self._slots:
                 if slot.actor is None and slot.start_at <= now:
                     self._start(slot)
-                elif slot.sent and now - slot.heard > self._patience_s:
-                    self._give_up_on_the_mute(slot, call)
-                elif slot.pid and slot.hello and now - slot.heard > FIRST_S:
-                    self._replace(slot)
+                elif slot.pid and now - slot.heard > self._patience_s:
+                    self._replace_if_mute(slot, call, now - slot.heard)
             idle = [slot.number for slot in self._slots if slot.pid and not slot.hello and not slot.sent]
-            for number, chunk in dispatch.give(idle, now, quiet):
+            for number, chunk in dispatch.give(idle, now):
                 self._send(self._slots[number], chunk, call)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
             answered = self._answered(waiting, bool(meanwhile and self.pids()), dispatch.pause_s(now))
-            quiet = not answered
             for slot in answered:
                 if slot.hello:
                     self._greet(slot, call)
@@ -232,7 +226,7 @@ class RayPool:
         part = call.dispatch.parts[chunk]
         columns, recipes = part.columns, call.recipes[part.rows]
         if not slot.sent:
-            slot.heard = time.monotonic()
+            slot.heard = max(slot.heard, time.monotonic())
         answered = slot.actor.run.remote(self._serial, recipes, columns.start, columns.stop, *self._news(slot, call))
         slot.sent.append((self._serial, answered))
         call.brought.bytes_down += recipes.nbytes
@@ -279,7 +273,7 @@ class RayPool:
         except ray.exceptions.RayError as error:
             return self._bury(slot, call, reason(error), is_to_blame(error))
         slot.sent.popleft()
-        slot.heard, slot.proven = time.monotonic(), True
+        slot.heard = time.monotonic()
         # What an earlier call has left is nobody's any more: a second copy, or what was interrupted.
         chunk = call.dispatch.answered(slot.number, slot.heard) if serial == self._serial else None
         if chunk is not None:
@@ -306,14 +300,12 @@ class RayPool:
         self._replace(slot)
         return bool(lost)
 
-    def _give_up_on_the_mute(self, slot: _Slot, call: _Call) -> None:
-        """Replace a worker that has not answered for too long, and for longer than its chunk could take."""
+    def _replace_if_mute(self, slot: _Slot, call: _Call, silent_s: float) -> None:
+        """Replace a worker that owes an answer, and has been silent for longer than its chunk could take."""
         import ray
 
-        serial, ref = slot.sent[0]
-        silent_s = time.monotonic() - slot.heard
-        slow_s = MUTE * max(LARGEST_S, call.dispatch.expected_s(slot.number)) if slot.proven else FIRST_S
-        if serial == self._serial and (not call.measured or silent_s <= slow_s):
+        ref = slot.hello or (slot.sent[0][1] if slot.sent else None)
+        if ref is None or silent_s <= MUTE * call.dispatch.expected_s(slot.number):
             return
         if not ray.wait([ref], timeout=0.0)[0]:  # it may have been us who did not listen
             self._bury(slot, call, f"it did not answer for {silent_s:.0f} s")
@@ -417,7 +409,7 @@ class RayPool:
                 raise PoolError(f"no worker can be started: {reason(error)}{self._logs()}") from error
             self._replace(slot, min(BACKOFF_S * 2.0**self._failed_starts, MAX_PAUSE_S))
         else:
-            slot.heard, self._failed_starts, self._last_words = time.monotonic(), 0, ""
+            slot.heard, self._failed_starts, self._last_words = time.monotonic() + FIRST_S, 0, ""
             prepared = slot.serial > 0
             slot.hello = None if prepared else slot.actor.prepare.remote(self._serial, *self._news(slot, call))
 

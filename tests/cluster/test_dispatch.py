@@ -46,9 +46,9 @@ class World:
             (r, c) for r in range(part.rows.start, part.rows.stop) for c in range(part.columns.start, part.columns.stop)
         ]
 
-    def give(self, quiet: bool = False) -> list[tuple[int, int]]:
+    def give(self) -> list[tuple[int, int]]:
         idle = [worker for worker, queue in self.queues.items() if not queue]
-        given = list(self.dispatch.give(idle, self.now, quiet))
+        given = list(self.dispatch.give(idle, self.now))
         for worker, chunk in given:
             self.queues[worker].append(chunk)
             assert len(self.queues[worker]) <= QUEUE
@@ -96,7 +96,7 @@ def test_everything_is_brought_once_but_those_that_kill(
     for _ in range(20_000):
         if world.dispatch.finished():
             break
-        world.give(quiet=rng.random() < 0.5)
+        world.give()
         world.now += rng.choice([0.01, 0.5, 3.0])
         busy = world.busy()
         if not busy:
@@ -135,14 +135,14 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     """Validation gives one member's episodes to many: what another has, or is at, goes with it."""
     parts = [*rows(1)] + [Chunk(slice(0, 1), slice(k, k + 1)) for k in (1, 2, 3)] + [Chunk(slice(1, 2), slice(0, 4))]
     dispatch = new(parts)
-    assert [chunk for _, chunk in dispatch.give([0, 1, 2], 0.0, False)] == [0, 1, 2]
+    assert [chunk for _, chunk in dispatch.give([0, 1, 2], 0.0)] == [0, 1, 2]
     assert dispatch.answered(2, 0.1) == 2
     for _ in range(MAX_KILLS - 1):
         assert dispatch.died(0, 0.2) == []
-        assert [chunk for _, chunk in dispatch.give([0], 5.0, False)] == [0]
+        assert [chunk for _, chunk in dispatch.give([0], 5.0)] == [0]
     assert dispatch.died(0, 5.1) == [0, 1, 3]
     assert dispatch.answered(1, 5.2) is None, "it is not asked for any more"
-    assert list(dispatch.give([0, 1], 5.3, False)) == [(0, 4)]
+    assert list(dispatch.give([0, 1], 5.3)) == [(0, 4)]
     assert dispatch.answered(0, 5.4) == 4
     assert dispatch.finished()
 
@@ -153,12 +153,12 @@ def test_a_member_s_long_chunk_is_cut_before_it_is_lost(kills: bool) -> None:
     long = Chunk(slice(4, 5), slice(100, 356))
     dispatch = new([long, *rows(1)])
     for now in (0.0, 1.0):
-        assert list(dispatch.give([0], now, False)) == [(0, 0)]
+        assert list(dispatch.give([0], now)) == [(0, 0)]
         assert dispatch.died(0, now + 0.3) == []
     deaths, lost = 2, []
     pieces: list[Chunk] = []
     while not dispatch.finished():
-        ((_, chunk),) = dispatch.give([0], 100.0 * (deaths + len(pieces)), False)
+        ((_, chunk),) = dispatch.give([0], 100.0 * (deaths + len(pieces)))
         if kills and dispatch.parts[chunk].rows == long.rows:
             lost = dispatch.died(0, 100.0 * (deaths + len(pieces)))
             deaths += 1
@@ -179,7 +179,7 @@ def test_a_member_s_long_chunk_is_cut_before_it_is_lost(kills: bool) -> None:
 def test_the_first_time_at_once_then_after_pauses_that_double() -> None:
     dispatch, now, pauses = new(rows(1, 1)), 100.0, []
     for _ in range(8):
-        while not (given := list(dispatch.give([0], now, False))):
+        while not (given := list(dispatch.give([0], now))):
             pauses.append(dispatch.pause_s(now))
             now += pauses[-1]
         assert given == [(0, 0)] or dispatch.answered(0, now) == 1
@@ -193,29 +193,29 @@ def test_the_first_time_at_once_then_after_pauses_that_double() -> None:
 def test_who_waits_does_not_hold_up_the_others() -> None:
     dispatch = new(rows(1, 1))
     for _ in range(2):
-        assert list(dispatch.give([0], 1.0, False)) == [(0, 0)]
+        assert list(dispatch.give([0], 1.0)) == [(0, 0)]
         dispatch.died(0, 1.0, blamed=False)
-    assert list(dispatch.give([0], 1.0, False)) == [(0, 1)]
+    assert list(dispatch.give([0], 1.0)) == [(0, 1)]
     assert dispatch.pause_s(1.0) == pytest.approx(BACKOFF_S)
 
 
 def test_nothing_is_queued_with_a_suspect() -> None:
     """So that the next time it is clear who killed. What waited behind a dead worker's chunk is a suspect too."""
     dispatch = new(rows(*[5] * 9))
-    assert [chunk for _, chunk in dispatch.give([0, 1], 0.0, False)] == [0, 1, 2, 3]
+    assert [chunk for _, chunk in dispatch.give([0, 1], 0.0)] == [0, 1, 2, 3]
     dispatch.died(0, 0.1)
-    assert list(dispatch.give([0], 0.1, False)) == [(0, 0)]
-    assert list(dispatch.give([], 0.2, False)) == []
+    assert list(dispatch.give([0], 0.1)) == [(0, 0)]
+    assert list(dispatch.give([], 0.2)) == []
     assert dispatch.answered(1, 0.2) == 1
     assert dispatch.answered(1, 0.3) == 3
-    assert list(dispatch.give([1], 0.3, False)) == [(1, 2)]
+    assert list(dispatch.give([1], 0.3)) == [(1, 2)]
     assert dispatch.answered(0, 0.4) == 0
-    assert list(dispatch.give([0], 0.4, False)) == [(0, 4), (0, 5)]
+    assert list(dispatch.give([0], 0.4)) == [(0, 4), (0, 5)]
 
 
 def test_the_last_chunks_go_to_who_has_nothing_to_do() -> None:
     dispatch = new(rows(*[5] * 5))
-    given = list(dispatch.give([0, 1], 0.0, False))
+    given = list(dispatch.give([0, 1], 0.0))
     assert given == [(0, 0), (1, 1), (0, 2)], "two are left for two workers"
 
 
@@ -225,21 +225,20 @@ class TestStragglers:
     def stalled(self, expected_s: float = 0.1) -> Dispatch:
         """Worker 0 holds chunks 0 and 2, and the others are done."""
         dispatch = new(rows(5, 5, 5, 5, 5), expected_s=expected_s)
-        assert list(dispatch.give([0, 1], 0.0, False)) == [(0, 0), (1, 1), (0, 2)]
+        assert list(dispatch.give([0, 1], 0.0)) == [(0, 0), (1, 1), (0, 2)]
         assert dispatch.answered(1, 0.1) == 1
-        assert list(dispatch.give([1], 0.1, False)) == [(1, 3)]
+        assert list(dispatch.give([1], 0.1)) == [(1, 3)]
         assert dispatch.answered(1, 0.2) == 3
-        assert list(dispatch.give([1], 0.2, False)) == [(1, 4)]
+        assert list(dispatch.give([1], 0.2)) == [(1, 4)]
         assert dispatch.answered(1, 0.3) == 4
         return dispatch
 
     def test_idle_workers_take_copies_of_what_is_late_and_of_what_waits_behind_it(self) -> None:
         dispatch = self.stalled()
-        assert list(dispatch.give([1], LATE_S, True)) == []
+        assert list(dispatch.give([1], LATE_S)) == []
         late = LATE_S + 0.1
-        assert list(dispatch.give([1], late, False)) == [], "there may be answers that nobody has looked at"
-        assert list(dispatch.give([1, 2, 3], late, True)) == [(1, 0), (2, 2)]
-        assert list(dispatch.give([3], late + 9.0, True)) == [], "one extra copy each"
+        assert list(dispatch.give([1, 2, 3], late)) == [(1, 0), (2, 2)]
+        assert list(dispatch.give([3], late + 9.0)) == [], "one extra copy each"
         assert dispatch.answered(1, late + 0.1) == 0
         assert dispatch.answered(2, late + 0.1) == 2
         assert dispatch.finished()
@@ -250,42 +249,42 @@ class TestStragglers:
 
     def test_what_was_expected_to_take_longer_is_not_late_yet(self) -> None:
         dispatch = self.stalled(expected_s=2.0)
-        assert list(dispatch.give([1], LATE * 2.0, True)) == []
-        assert list(dispatch.give([1], LATE * 2.0 + 0.1, True)) == [(1, 0)]
+        assert list(dispatch.give([1], LATE * 2.0)) == []
+        assert list(dispatch.give([1], LATE * 2.0 + 0.1)) == [(1, 0)]
 
     def test_the_slow_one_may_still_be_first(self) -> None:
         dispatch = self.stalled()
-        assert list(dispatch.give([1], 3.0, True)) == [(1, 0)]
+        assert list(dispatch.give([1], 3.0)) == [(1, 0)]
         assert dispatch.answered(0, 3.1) == 0
-        assert list(dispatch.give([], 3.2, True)) == []
+        assert list(dispatch.give([], 3.2)) == []
         assert dispatch.answered(0, 3.3) == 2
         assert dispatch.finished(), "the copy is not waited for"
         assert dispatch.answered(1, 4.0) is None
 
     def test_a_chunk_whose_copy_goes_on_is_not_sent_again(self) -> None:
         dispatch = self.stalled()
-        assert list(dispatch.give([1], 3.0, True)) == [(1, 0)]
+        assert list(dispatch.give([1], 3.0)) == [(1, 0)]
         assert dispatch.died(0, 3.1) == []
-        assert list(dispatch.give([0], 3.1, True)) == [(0, 2)], "what waited behind it is"
+        assert list(dispatch.give([0], 3.1)) == [(0, 2)], "what waited behind it is"
         assert dispatch.died(1, 3.2) == []
         assert dispatch.waiting() > 0, "now it is, in pieces: it was there twice"
 
     def test_nobody_is_late_while_there_is_something_else_to_do(self) -> None:
         dispatch = new(rows(5, 5))
-        assert list(dispatch.give([0], 0.0, False)) == [(0, 0)]
-        assert list(dispatch.give([1, 2], 9.0, True)) == [(1, 1), (2, 0)]
+        assert list(dispatch.give([0], 0.0)) == [(0, 0)]
+        assert list(dispatch.give([1, 2], 9.0)) == [(1, 1), (2, 0)]
         dispatch = new(rows(5, 5))
-        assert list(dispatch.give([0], 0.0, False)) == [(0, 0)]
-        assert list(dispatch.give([1], 9.0, True)) == [(1, 1)]
-        assert list(dispatch.give([], 9.0, True)) == []
+        assert list(dispatch.give([0], 0.0)) == [(0, 0)]
+        assert list(dispatch.give([1], 9.0)) == [(1, 1)]
+        assert list(dispatch.give([], 9.0)) == []
 
 
 def test_deaths_in_a_row_are_counted_until_somebody_answers() -> None:
     dispatch = new(rows(9, 9, 9))
     for k in range(4):
-        list(dispatch.give([0], 10.0 * k, False))
+        list(dispatch.give([0], 10.0 * k))
         dispatch.died(0, 10.0 * k)
         assert dispatch.deaths == k + 1
-    list(dispatch.give([0], 100.0, False))
+    list(dispatch.give([0], 100.0))
     dispatch.answered(0, 100.1)
     assert dispatch.deaths == 0
