@@ -117,7 +117,7 @@ def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     assert served.codes["after"] == 0
     assert re.fullmatch(
         rf"{COMMAND}: warning: not logged to MLflow at {served.uri}: \d+ rows? \(step [\d to]*{GENERATIONS - 1}\), "
-        rf"\d+ files, the model, the status FINISHED: [^\n]*; send it later with: {COMMAND} --resume runs/after\n",
+        rf"\d+ files, the model, the status FINISHED: [^\n]*; send it later with: \S*{COMMAND} --resume runs/after\n",
         err,
     )
     folder = served.cwd / "runs/after"
