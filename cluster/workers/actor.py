@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cluster.workers.pool import NOBODY, BuildMap, answer
+from cluster.workers.pool import BuildMap, answer
 from cluster.workers.worker import CollectTask, Task, Worker
+from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
 Name = tuple[str, int]
@@ -54,14 +55,17 @@ class Actor:
 
     def prepare(self, serial: int, *news: Any) -> int:
         """Take up a first task and load its kernels, of nobody: who dies of that has not died of a chunk."""
-        self.run(serial, NOBODY, 0, 0, *news)
+        self.run(serial, b"", 0, 0, *news)
         return os.getpid()
 
     def run(
-        self, serial: int, recipes: np.ndarray, first: int, stop: int,
+        self, serial: int, payload: bytes, first: int, stop: int,
         names: Sequence[Name] = (), gone: Sequence[Name] = (), task: Task | CollectTask | None = None, *maps: Any,
-    ) -> tuple[Any, ...]:  # fmt: skip
-        """What `pool.answer` says; `names` and all after it are for a worker that does not have the task yet."""
+    ) -> bytes:  # fmt: skip
+        """What `pool.answer` says to the recipes `payload`, pickled: Ray is slower with arrays than with bytes.
+
+        `names` and all after it are for a worker that does not have the task yet.
+        """
         if task is not None:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:
@@ -70,7 +74,8 @@ class Actor:
         if self._task is None or serial != self._serial:
             raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
         mine = [self._maps[name] for name in self._task.maps]
-        return answer(self._worker, self._task, mine, recipes, first, stop)
+        recipes = np.frombuffer(payload, RECIPE)
+        return pickle.dumps(answer(self._worker, self._task, mine, recipes, first, stop), protocol=5)
 
 
 class Shared:

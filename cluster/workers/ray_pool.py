@@ -18,6 +18,7 @@ import importlib
 import logging
 import math
 import os
+import pickle
 import shutil
 import threading
 import time
@@ -224,12 +225,12 @@ class RayPool:
 
     def _send(self, slot: _Slot, chunk: int, call: _Call) -> None:
         part = call.dispatch.parts[chunk]
-        columns, recipes = part.columns, call.recipes[part.rows]
+        columns, raw = part.columns, call.recipes[part.rows].tobytes()
         if not slot.sent:
             slot.heard = max(slot.heard, time.monotonic())
-        answered = slot.actor.run.remote(self._serial, recipes, columns.start, columns.stop, *self._news(slot, call))
+        answered = slot.actor.run.remote(self._serial, raw, columns.start, columns.stop, *self._news(slot, call))
         slot.sent.append((self._serial, answered))
-        call.brought.bytes_down += recipes.nbytes
+        call.brought.bytes_down += len(raw)
 
     def _news(self, slot: _Slot, call: _Call) -> list[Any]:
         """What a worker has to be told of the task, which then counts as told."""
@@ -261,7 +262,7 @@ class RayPool:
 
         serial, ref = slot.sent[0]
         try:
-            answer = ray.get(ref)
+            raw = ray.get(ref)
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
             if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
@@ -277,8 +278,8 @@ class RayPool:
         # What an earlier call has left is nobody's any more: a second copy, or what was interrupted.
         chunk = call.dispatch.answered(slot.number, slot.heard) if serial == self._serial else None
         if chunk is not None:
-            call.brought.add(slot.number, call.dispatch.parts[chunk], *answer)
-            call.brought.bytes_up += sum(part.nbytes for part in answer[:-1])
+            call.brought.add(slot.number, call.dispatch.parts[chunk], *pickle.loads(raw))
+            call.brought.bytes_up += len(raw)
         return chunk is not None
 
     def _bury(self, slot: _Slot, call: _Call, reason: str, blamed: bool = True) -> bool:

@@ -47,10 +47,6 @@ class Experience(NamedTuple):
     rewards: np.ndarray  # float32 [rows]
     ends: np.ndarray  # uint8 [rows], End
 
-    @property
-    def nbytes(self) -> int:
-        return sum(array.nbytes for array in self)
-
 
 def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
     """What a row of `Experience.observations` is for such a policy."""

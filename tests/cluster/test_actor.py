@@ -1,5 +1,7 @@
 """Both ends of what is sent to an actor, joined without Ray: maps are put into the store once, and within bounds."""
 
+import pickle
+
 import numpy as np
 import pytest
 from test_pool import MAPS, Answering, drive_task, make_recipes, make_task
@@ -62,16 +64,16 @@ def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps() -> None:
     episodes = len(task.episodes)
     everything, some, others = (Chunk(slice(*rows), slice(0, episodes)) for rows in ((0, 20), (0, 8), (8, 20)))
     parts, whole = new_outcome(task, recipes, [everything]), new_outcome(task, recipes, [everything])
-    parts.add(0, some, *actor.run(1, recipes[:8], 0, episodes, MAPS, (), task, *arrays))
-    parts.add(0, others, *actor.run(1, recipes[8:], 0, episodes))
-    whole.add(0, everything, *actor.run(2, recipes, 0, episodes, (), (), task))
+    parts.add(0, some, *pickle.loads(actor.run(1, recipes[:8].tobytes(), 0, episodes, MAPS, (), task, *arrays)))
+    parts.add(0, others, *pickle.loads(actor.run(1, recipes[8:].tobytes(), 0, episodes)))
+    whole.add(0, everything, *pickle.loads(actor.run(2, recipes.tobytes(), 0, episodes, (), (), task)))
     assert parts.results.tobytes() == whole.results.tobytes() == outcome.results.tobytes()
 
 
 def test_a_chunk_of_another_task_is_refused() -> None:
     actor = Actor(Answering)
     with pytest.raises(RuntimeError, match="a chunk of task 1 came to a worker that has task 0"):
-        actor.run(1, make_recipes(2), 0, 2)
-    actor.run(1, make_recipes(2), 0, 2, (), (), make_task())
+        actor.run(1, make_recipes(2).tobytes(), 0, 2)
+    actor.run(1, make_recipes(2).tobytes(), 0, 2, (), (), make_task())
     with pytest.raises(RuntimeError, match="a chunk of task 2 came to a worker that has task 1"):
-        actor.run(2, make_recipes(2), 0, 2)
+        actor.run(2, make_recipes(2).tobytes(), 0, 2)

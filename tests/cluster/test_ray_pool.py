@@ -161,7 +161,7 @@ def test_results_progress_and_what_is_sent(pool: RayPool) -> None:
     assert told[-1] == (512, 512)
     assert outcome.retries == 0
     assert outcome.bytes_down == 512 * RECIPE.itemsize
-    assert outcome.bytes_up == outcome.results.nbytes
+    assert outcome.results.nbytes < outcome.bytes_up < outcome.results.nbytes + 600 * len(told)
     assert 8 * 311 * 4 < outcome.broadcast_bytes < 8 * 311 * 4 + 2000
     assert set(outcome.busy_s) <= {0, 1}
     assert len(set(pool.pids())) == pool.workers() <= 2
@@ -311,7 +311,8 @@ def test_experience_keeps_its_order_and_a_killed_worker_costs_its_chunk_alone(
     # The answer to the chunk before it may have been on its way when the worker died; nothing is sent with a suspect.
     assert repeated <= times + min(times, 1), "what else was sent to the worker had not been begun"
     assert times <= collected.retries <= 2 * times
-    assert collected.bytes_up == 12 * 400 + wanted.experience.nbytes
+    sent = 12 * 400 + len(to_bytes(wanted.experience))
+    assert sent < collected.bytes_up < sent + 1000 * len(told)
 
 
 def test_an_exception_while_collecting_names_the_episodes(pool: RayPool, folder: Path) -> None:
