@@ -14,9 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 from cluster.workers.pool import PoolError
 
@@ -38,7 +36,6 @@ OWN_ENVIRONMENT = {
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
 }
-LEAN: dict[str, Any] = {"no_monitor": True, "include_log_monitor": False}
 TOKEN = secrets.token_hex(32)
 _ends_at_once = threading.Event()
 AUTH_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
@@ -161,28 +158,6 @@ def abandon(thread: threading.Thread, booted: threading.Event) -> bool:
             os.kill(process, signal.SIGKILL)
     shutil.rmtree(ports[-1].parent, ignore_errors=True)
     return True
-
-
-@contextlib.contextmanager
-def lean_head(node: Any, parameter: Any) -> Iterator[None]:
-    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
-
-    Ray has no setting for that, so this replaces private names while `ray.init` runs.
-
-    Args:
-        node: `ray._private.node.Node`.
-        parameter: the module `ray._private.parameter`.
-    """
-
-    def no_api_server(self: Any, **_: Any) -> None:
-        self._webui_url = ""
-
-    before = node.start_api_server, parameter.RayParams
-    node.start_api_server, parameter.RayParams = no_api_server, partial(parameter.RayParams, **LEAN)
-    try:
-        yield
-    finally:
-        node.start_api_server, parameter.RayParams = before
 
 
 @contextlib.contextmanager

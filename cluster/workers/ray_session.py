@@ -6,18 +6,18 @@ import contextlib
 import importlib
 import logging
 import os
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from cluster.workers import shipping
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_address import (
     AUTH_ENVIRONMENT,
-    LEAN,
     OWN_ENVIRONMENT,
     TOKEN,
     environment,
     has_token,
-    lean_head,
     probe,
 )
 
@@ -32,7 +32,7 @@ def check_address(address: str) -> str:
         address = os.environ.get("RAY_ADDRESS") or "auto"
     if address == "auto":
         logging.getLogger("ray").setLevel(logging.CRITICAL)
-        services = importlib.import_module("ray._private.services")
+        services = _private("services")
         try:
             address = services.canonicalize_bootstrap_address("auto")
         except ConnectionError:
@@ -77,13 +77,33 @@ def join(address: str) -> None:
         ray.init(address=address, runtime_env=env, log_to_driver=False, logging_level=logging.CRITICAL)
 
 
-def _lean_head() -> contextlib.AbstractContextManager[None]:
-    """Start Ray's head without the helpers that a run has no use for; with them where this version is another."""
-    with contextlib.suppress(ImportError, AttributeError, TypeError):
-        node, parameter = (importlib.import_module(f"ray._private.{name}") for name in ("node", "parameter"))
-        parameter.RayParams(**LEAN)
-        return lean_head(node.Node, parameter)
-    return contextlib.nullcontext()
+def _private(name: str) -> Any:
+    return importlib.import_module(f"ray._private.{name}")
+
+
+@contextlib.contextmanager
+def _lean_head() -> Iterator[None]:
+    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
+
+    Ray has no setting for that, so this replaces private names while `ray.init` runs; not in a version without them.
+    """
+    try:
+        node, parameter = map(_private, ("node", "parameter"))
+        before = node.Node.start_api_server, parameter.RayParams
+        lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
+        lean()
+    except (ImportError, AttributeError, TypeError):
+        yield
+        return
+
+    def no_api_server(self: Any, **_: Any) -> None:
+        self._webui_url = ""
+
+    node.Node.start_api_server, parameter.RayParams = no_api_server, lean
+    try:
+        yield
+    finally:
+        node.Node.start_api_server, parameter.RayParams = before
 
 
 def forget_token() -> None:
