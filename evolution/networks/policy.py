@@ -18,7 +18,7 @@ import numpy as np
 from evolution.networks.dense import dense
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
-from gridsim.sensing.grid import CELLS
+from gridsim.sensing.grid import CELLS, MAX_FRAMES
 
 RAYS = 31
 INPUTS = RAYS + 1  # and the speed
@@ -133,7 +133,6 @@ KERNEL_2, STRIDE_2 = 4, 2
 SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
 SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
 LANES = 8  # channels and units come in multiples of it, so that layers are whole vectors
-MAX_FRAMES = 8
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ from gridsim.envs.observing import Observer, row
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
-from gridsim.sensing.grid import grids
+from gridsim.sensing.grid import MAX_FRAMES, grids
 from gridsim.traffic.world import LANE
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             map_seed: seed of the first of them; the others' follow.
             traffic: other cars in each car's world; None is as many as the scenario has by default.
             observation: `rays`, `grid` or `image`.
-            frames: grids that make an observation, 1 to 16.
+            frames: grids that make an observation, 1 to 8.
             motion: whether rays also tell the motion of what they meet.
             steering: whether the steering angle is told beside them.
             actions: `discrete` or `continuous`.
@@ -123,8 +123,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         ):
             if value not in known:
                 raise ValueError(f"{name} must be {' or '.join(str(k) for k in known)}, not {value!r}")
-        if not 1 <= frames <= 16 or (frames > 1 and observation == "rays"):
-            raise ValueError(f"frames must be 1 to 16, and more than 1 only for grids, not {frames}")
+        if not 1 <= frames <= MAX_FRAMES or (frames > 1 and observation == "rays"):
+            raise ValueError(f"frames must be 1 to {MAX_FRAMES}, and more than 1 only for grids, not {frames}")
         for name, asked in (("motion", motion), ("steering", steering)):
             if asked and observation != "rays":
                 raise ValueError(f"{name} is seen beside rays; leave it out with observation={observation!r}")

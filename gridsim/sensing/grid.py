@@ -27,6 +27,7 @@ _F, _I, _N = np.float32, np.int32, np.uint64
 
 CELLS = 80  # along each side
 CELL = 0.5  # m
+MAX_FRAMES = 8  # that an observation is made of
 #: Codes of a cell, dark to bright in a picture; divided by 255 they are what a network sees.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
 HALF_DIAGONAL = _F(CELL * math.sqrt(0.5))  # m
