@@ -8,7 +8,54 @@ from typing import NamedTuple
 
 import numpy as np
 
+_F = np.float32
+
 FILE_SPEEDS = (5.0, 12.0)  # m/s, the speed interval of a map from a file that names none
+START_SPEED = 0.0  # m/s; at rest, so that a car that never accelerates or brakes does not get far
+SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
+REENTRY = _F(12.0)  # m driven; a return to a cell of ground within it still counts as the same visit
+
+# The reward of Trasnea et al. (2019).
+PROGRESS_SHARE = 0.15  # weight of the distance, and also of the speed
+CLEARANCE_SHARE = 0.7  # weight of the shortest ray
+CRASH_REWARD = -1.0
+
+# Lanes. Own choices, unless a source is named.
+BEND_COMFORT = 2.0  # m/s2, lateral acceleration that `Lanes.limits` allows
+CROSSING_GAP = 2.9  # m between two lanes' centre lines below which cars on them, 2 m wide, may touch
+
+# Traffic, beside `TrafficConfig`. These are float32 because kernels read them as globals. Own choices, tuned so that
+# traffic neither collides nor blocks junctions, unless a source is named.
+TRAFFIC_PACE = 0.5  # share of the sum of the speed interval's ends that is traffic's speed on a straight: the middle
+SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of the lane's: least, and range above it
+SPAWN_SPEED = _F(0.5)  # of the desired speed, at the start of an episode
+LANE_CHANGE_PERIOD = _F(10.0)  # control steps between two decisions whether to change lanes
+LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a change of lanes
+NEIGHBOUR_LANE = _F(3.75)  # m to the middle of a neighbouring lane; only the highway has them
+NEIGHBOUR_HALF_WIDTH = _F(2.8)  # m from that middle within which the ego car counts as on that lane ...
+NEIGHBOUR_WIDENING = _F(0.004)  # 1/m, and so much more per square metre of distance, since roads bend
+LOOK_AHEAD = _F(8.0)  # m that a car looks ahead at standstill, beyond the jam distance ...
+LOOK_AHEAD_TIME = _F(1.5)  # s, and the way it drives in that time, beside its comfortable braking distance
+CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
+STOP_LINE_GAP = _F(
+    0.25
+)  # m before a junction's line at which a car waits; short, as another junction may end behind it
+EGO_DODGE_SLOPE = _F(0.12)  # m to the right for each m of way, on a path that dodges the oncoming ego car
+PATH_SAMPLE = _F(1.25)  # m between points of a path that are tested; below half a car's width plus CAUTION
+
+# How traffic meets the ego car.
+MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
+MEETING_OVER = _F(-4.0)  # m ahead (so behind) from which on the ego car has passed
+SAME_WAY_COSINE = _F(0.3)  # of the angle between headings above which both go the same way, or merge
+FORESIGHT = _F(3.0)  # s for which a car predicts the ego car's motion
+FORESIGHT_STEP = _F(0.25)  # s between predicted positions, at least
+EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predicted collision
+CONTACT_DISTANCE = _F(6.0)  # m between the middles of two cars within which they may touch
+
+# Junctions.
+CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
+EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
+EGO_SECTOR_COSINE = _F(0.6)  # of the angle from its heading within which the ego car may be soon
 
 
 @dataclass(frozen=True)

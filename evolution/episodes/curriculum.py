@@ -20,6 +20,7 @@ import numpy as np
 
 from evolution.episodes.rollout import EPISODE, Limits
 from evolution.episodes.starts import Episodes, lane_starts
+from evolution.search.base import SearchConfig
 from gridsim.car.ego import End
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
@@ -42,7 +43,7 @@ class CurriculumConfig:
     maps: int = 16  # training maps
     first_maps: int = 4  # of these, how many the first generation meets ...
     map_generations: int = 4  # ... and after how many there is one more, so that none needs to be waited for
-    groups: int = 8  # of members, each with episodes of its own
+    groups: int = SearchConfig.groups  # of members, each with episodes of its own
     starts: int = 1  # new episodes of a group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, their length

@@ -24,9 +24,9 @@ class SearchConfig:
     population: int = 256  # members of a generation
     groups: int = 8  # of members, each of which meets episodes of its own
     tournament: int = 8  # members of a tournament
-    sigma: float = 0.5  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
+    sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
     elites: int = 8  # members that go on unmodified
-    mutation_rate: float = 0.03  # share of genes that mutate
+    mutation_rate: float = Mutation.rate  # share of genes that mutate
 
     def check(self) -> None:
         """Raises: ValueError with one line for parameters that do not fit each other."""

@@ -12,6 +12,7 @@ from enum import IntEnum
 import numpy as np
 
 from gridsim.car.vehicle import act, advance, path_curvature
+from gridsim.config import REENTRY, SUBSTEP
 from gridsim.jit import leaf
 from gridsim.maps.roads import VISIT_CELL, clearance
 from gridsim.sensing.boxes import cast_boxes, hits_box, nearest_box, stands_ahead
@@ -35,8 +36,6 @@ CELL = 12  # index of the visit cell the car is in
 FRESH = 13  # 1 where this cell's ground is new
 FIELDS = 14
 
-SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
-_REENTRY = _F(12.0)  # m: coming back to a cell so soon is the same visit, not a second one
 _VISIT_SCALE = _F(1.0 / VISIT_CELL)
 
 
@@ -171,7 +170,7 @@ def move(road, constants, car, visits, world, acceleration):
     if _F(cell) != car[CELL]:
         gap = odometer - visits[cell]
         car[CELL] = _F(cell)
-        if gap > _REENTRY:
+        if gap > REENTRY:
             car[FRESH] = _ONE if gap > constants.revisit else _ZERO
     visits[cell] = odometer
     gained = _ZERO

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from gridsim.config import CLEARANCE_SHARE, CRASH_REWARD, PROGRESS_SHARE
 from gridsim.jit import njit
 
 _F = np.float32
-PROGRESS_SHARE = 0.15  # of the distance, and as much of the speed
-CLEARANCE_SHARE = 0.7
-CRASH_REWARD = -1.0
 
 
 # A leaf whose sums are not reordered, nor divisions replaced: it rounds the same in all kernels that it is part of.

@@ -27,8 +27,8 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gridsim.config import FILE_SPEEDS, SimConfig, VehicleConfig
-from gridsim.maps.map import START_SPEED, Map
+from gridsim.config import FILE_SPEEDS, START_SPEED, SimConfig, VehicleConfig
+from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
 from gridsim.maps.roads import (

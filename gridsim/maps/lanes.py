@@ -13,13 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import VehicleConfig
+from gridsim.config import BEND_COMFORT, CROSSING_GAP, VehicleConfig
 from gridsim.jit import njit
 from gridsim.maps.roads import Lanes, Strips
 
 LANE_STEP = 1.0  # m between points of a lane, at most
-CROSSING_GAP = 2.9  # m between two lanes' centre lines below which their cars, 2 m wide, may touch
-COMFORT = 2.0  # m/s2, lateral acceleration that `Lanes.limits` allows
 FORKS = 3  # successors of a lane at most: straight on, left and right
 _SAME = 0.01  # m and rad within which an end and a beginning are one
 
@@ -225,5 +223,5 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         crossing_offsets=np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
         crossings=np.nonzero(cross)[1].astype(np.int32),
         junction=cross.any(axis=1).astype(np.uint8),
-        limits=np.minimum(np.sqrt(COMFORT / np.maximum(sharpest, 1e-9)), fastest).astype(np.float32),
+        limits=np.minimum(np.sqrt(BEND_COMFORT / np.maximum(sharpest, 1e-9)), fastest).astype(np.float32),
     )

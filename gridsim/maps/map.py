@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.config import SimConfig
+from gridsim.config import START_SPEED, SimConfig
 from gridsim.jit import njit
 from gridsim.maps.network import Network, make_network, network_of_lanes
 from gridsim.maps.roads import (
@@ -23,7 +23,6 @@ from gridsim.maps.roads import (
     freeze,
 )
 
-START_SPEED = 0.0  # m/s: who never accelerates or brakes must not get far
 ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
 
 

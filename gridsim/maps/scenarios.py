@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gridsim.config import FILE_SPEEDS, SimConfig
+from gridsim.config import FILE_SPEEDS, TRAFFIC_PACE, SimConfig
 from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
 from gridsim.maps.generators.highway import highway_layout
@@ -28,7 +28,6 @@ from gridsim.maps.roads import (
 TRAINING_SEED = 0  # first seed of the maps that are trained on
 VALIDATION_SEED = 1_000_000  # ... that choose the champion
 HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
-TRAFFIC_PACE = 0.5  # traffic's speed on a straight as a share of the interval's two ends together: its middle
 
 
 @dataclass(frozen=True)

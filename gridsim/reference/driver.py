@@ -17,13 +17,13 @@ import numpy as np
 
 from gridsim.car.ego import COS, FIELDS, IDLE, SIN, SPEED, STEERING, STEPS, End, X, Y, control, place
 from gridsim.car.vehicle import act, path_curvature
-from gridsim.config import Constants, SimConfig, constants
+from gridsim.config import LANE_CHANGE_PERIOD, Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import lane_length, turned, wrapped
 from gridsim.maps.roads import VISIT_CELL, freeze
 from gridsim.reference.routes import ReferenceConfig, Route, plan
-from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, follow, idm
+from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, follow, horizon, idm
 from gridsim.traffic.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
 
 _F, _I = np.float32, np.int32
@@ -302,7 +302,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
     for j in range(n):
         for field in range(world.shape[1]):
             others[j, field] = world[j, field]
-    me[HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_TWO * drivers.comfort))
+    me[HORIZON] = horizon(drivers, speed)
     me[GAP], me[LEAD], me[SHIFT] = _F(1e9), _ZERO, _F(memory[BLEND])
     touch = _F(1e9)  # m to where another car is in the way
     for side in range(2):
@@ -333,7 +333,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
         at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
         me[FACTOR] = wish / network.speeds[at]
         me[PACE] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD])
-        me[CLOCK] = _F(_I(car[STEPS]) % _I(10))  # it thinks of another lane once a second
+        me[CLOCK] = _F(_I(car[STEPS]) % _I(LANE_CHANGE_PERIOD))
         change_lanes(network, drivers, others, n, nobody)
         if _I(me[LANE]) != lane:
             memory[LEFT_RAIL] = rail

@@ -13,11 +13,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import Constants, SimConfig, constants
+from gridsim.config import (
+    CAUTION,
+    EGO_DODGE_SLOPE,
+    LANE_CHANGE_PERIOD,
+    LANE_CHANGE_SIGHT,
+    LOOK_AHEAD,
+    LOOK_AHEAD_TIME,
+    NEIGHBOUR_HALF_WIDTH,
+    NEIGHBOUR_LANE,
+    NEIGHBOUR_WIDENING,
+    PATH_SAMPLE,
+    STOP_LINE_GAP,
+    Constants,
+    SimConfig,
+    constants,
+)
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import away, is_junction, lane_length, turned, wrapped
 from gridsim.traffic.encounters import meets, moved_over, room_beside, runs_into
-from gridsim.traffic.junctions import CAUTION, may_enter
+from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import (
     AFTER,
     ALONG,
@@ -35,7 +50,6 @@ from gridsim.traffic.world import (
     SHIFT,
     SIN,
     SPEED,
-    THINKING,
     X,
     Y,
     choose_lane,
@@ -45,10 +59,7 @@ from gridsim.traffic.world import (
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
-_LINE = _F(0.25)  # m that a car waits before a junction's line; further back its rear may be in the junction before
-_LENGTH = _F(5.0)  # m, added to a car's horizon: another car's middle is further away than its rear
-_EASE = _F(0.12)  # m to the right a m of way that a path is thought to go there
-_SAMPLE = _F(1.25)  # m between the points of a path that are looked at, less than half a car's width and its caution
+_REACH = _F(5.0)  # m beyond a car's horizon to search, since positions are of cars' middles and gaps end at their rears
 
 
 class Drivers(NamedTuple):
@@ -109,6 +120,12 @@ def idm(drivers, speed, desired, gap, leader):
 
 
 @leaf
+def horizon(drivers, speed):
+    """How far ahead (m) a car at a speed (m/s) looks."""
+    return drivers.jam + LOOK_AHEAD + speed * (LOOK_AHEAD_TIME + speed / (_F(2.0) * drivers.comfort))
+
+
+@leaf
 def _ahead(network, car, other):
     """Way (m) from a car to one on its lane or on one of the two that come then; 1e9 if it is on none, or behind."""
     lane, along = other[LANE], other[ALONG]
@@ -161,7 +178,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < _ZERO:
                     return travelled
-                hop = max(free, _SAMPLE)  # nothing can be in the way any sooner
+                hop = max(free, PATH_SAMPLE)  # nothing can be in the way any sooner
                 along += hop
                 travelled += hop
         along -= length
@@ -187,7 +204,7 @@ def follow(network, drivers, car, other, is_ego):
         looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
     if not looked:
         near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
-        more = _EASE if is_ego and meets(network, car, other) else _ZERO
+        more = EGO_DODGE_SLOPE if is_ego and meets(network, car, other) else _ZERO
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, more)
     if at < car[GAP]:
         car[GAP], car[LEAD] = at, along
@@ -209,18 +226,18 @@ def _see(network, drivers, world, ego):
     cars = world.shape[0]
     for i in range(cars):
         speed = world[i, SPEED]
-        world[i, HORIZON] = drivers.jam + _F(8.0) + speed * (_F(1.5) + speed / (_F(2.0) * drivers.comfort))
+        world[i, HORIZON] = horizon(drivers, speed)
         world[i, GAP], world[i, LEAD] = _F(1e9), _ZERO
     ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
-        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + _LENGTH
+        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + _REACH
         for j in range(i):
             if world[j, LANE] < _ZERO:
                 continue
             dx, dy = away(world[j, X] - x, network.width), away(world[j, Y] - y, network.height)
-            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _LENGTH
+            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _REACH
             if squared < far * far:
                 follow(network, drivers, world[i], world[j], False)
             if squared < other_far * other_far:
@@ -246,7 +263,7 @@ def change_lanes(network, drivers, world, i, ego):
     if car[CLOCK] > _ZERO:
         car[CLOCK] -= _ONE
         return
-    car[CLOCK] = THINKING - _ONE
+    car[CLOCK] = LANE_CHANGE_PERIOD - _ONE
     lane = _I(car[LANE])
     if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
         _choose_neighbour(network, drivers, world, i, ego)
@@ -275,7 +292,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
                 continue
             dx, dy = other[X] - car[X], other[Y] - car[Y]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-            if dx * dx + dy * dy > _F(10000.0):
+            if dx * dx + dy * dy > LANE_CHANGE_SIGHT * LANE_CHANGE_SIGHT:
                 continue
             if j < world.shape[0]:
                 there = _I(other[LANE])
@@ -295,8 +312,8 @@ def _choose_neighbour(network, drivers, world, i, ego):
             else:
                 ahead = dx * car[COS] + dy * car[SIN]  # of the ego car, which is on no lane
                 aside = dy * car[COS] - dx * car[SIN]
-                sideways = _F(3.75) if side == 0 else _F(-3.75)
-                if abs(aside - sideways) > _F(2.8) + _F(0.004) * ahead * ahead:
+                sideways = NEIGHBOUR_LANE if side == 0 else -NEIGHBOUR_LANE
+                if abs(aside - sideways) > NEIGHBOUR_HALF_WIDTH + NEIGHBOUR_WIDENING * ahead * ahead:
                     continue
             if abs(ahead) < _F(2.0) * drivers.half_length + drivers.jam:
                 free = False
@@ -388,7 +405,7 @@ def flow(network, drivers, world, ego):
                 if may_enter(network, drivers, world, i, ego):
                     car[PERMIT] = car[NEXT]
                 else:
-                    pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - _LINE, _ZERO))
+                    pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - STOP_LINE_GAP, _ZERO))
         car[PACE] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:

@@ -8,6 +8,15 @@ import numpy as np
 
 from gridsim.car.ego import STEERING
 from gridsim.car.vehicle import advance, path_curvature
+from gridsim.config import (
+    CONTACT_DISTANCE,
+    EMERGENCY_BRAKING,
+    FORESIGHT,
+    FORESIGHT_STEP,
+    MEETING_DISTANCE,
+    MEETING_OVER,
+    SAME_WAY_COSINE,
+)
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, turned, wrapped
 from gridsim.sensing.boxes import boxes_touch
@@ -16,22 +25,14 @@ from gridsim.traffic.world import AFTER, ALONG, COS, LANE, NEXT, SHIFT, SIN, SPE
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
-_FAR = _F(35.0)  # m from which on it keeps to the right
-_PAST = _F(-4.0)  # m ahead: then both have passed each other
-_TOWARDS = _F(0.3)  # cosine of the angle between the headings of who goes the same way, or turns into it
-_FORESEEN = _F(3.0)  # s
-_TICK = _F(0.25)  # s between the moments that are looked at
-_BRAKING = _F(6.0)  # m/s2 with which it would stop before it is run into
-_NEAR = _F(6.0)  # m between their middles within which two cars may touch
-
 
 @leaf
 def meets(network, car, ego):
     """Whether the ego car, not far ahead, comes towards a car or crosses its way."""
-    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > _TOWARDS:
+    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE:
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
-    return dx * dx + dy * dy < _FAR * _FAR and dx * car[COS] + dy * car[SIN] > _PAST
+    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > MEETING_OVER
 
 
 @leaf
@@ -69,9 +70,9 @@ def runs_into(network, drivers, car, ego):
     t = _ZERO
     while True:
         # Nothing can touch any sooner.
-        hop = max((math.sqrt(dx * dx + dy * dy) - _NEAR) / (car[SPEED] + abs(speed)), _TICK)
+        hop = max((math.sqrt(dx * dx + dy * dy) - CONTACT_DISTANCE) / (car[SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
-        if t > _FORESEEN:
+        if t > FORESIGHT:
             return _F(1e9)
         way = car[SPEED] * t
         while way - begin >= length:
@@ -89,7 +90,7 @@ def runs_into(network, drivers, car, ego):
         px, py = moved_over(network, k, k + _N(1), right)
         x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
         dx, dy = turned(x - px, network.width), turned(y - py, network.height)
-        if dx * dx + dy * dy > _NEAR * _NEAR:
+        if dx * dx + dy * dy > CONTACT_DISTANCE * CONTACT_DISTANCE:
             continue
         ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]
         ux, uy = ux - network.points[k, 0], uy - network.points[k, 1]
@@ -98,5 +99,5 @@ def runs_into(network, drivers, car, ego):
         if boxes_touch(drivers, dx, dy, ux, uy, cosine, sine):
             ahead = dx * ux + dy * uy
             at = way + ahead - drivers.half_width
-            stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (_F(2.0) * _BRAKING)
+            stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (_F(2.0) * EMERGENCY_BRAKING)
             return max(at, _ZERO) if ahead >= _ZERO or stops else _F(1e9)

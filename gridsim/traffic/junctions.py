@@ -9,17 +9,13 @@ import math
 
 import numpy as np
 
+from gridsim.config import CAUTION, CROSSING_TIME, EGO_CLEARANCE, EGO_SECTOR_COSINE
 from gridsim.jit import leaf
 from gridsim.maps.network import is_junction, lane_length, turned, wrapped
 from gridsim.traffic.world import AFTER, ALONG, COS, HORIZON, LANE, NEXT, PAST, PERMIT, SIN, SPEED, X, Y
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF = _F(0.0), _F(0.5)
-
-CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
-_CROSSING_TIME = _F(7.0)  # s, what it takes from a standstill to leave a junction (critical gaps of drivers: 6 to 7)
-_NEAR = _F(7.0)  # m around the ego car where nobody enters a junction
-_AHEAD = _F(0.6)  # cosine of the angle from its heading within which it may get to before long
 
 
 @leaf
@@ -58,7 +54,9 @@ def _awaits(network, lane, ego, way):
         squared = dx * dx + dy * dy
         if squared < way * way:
             forward = dx * ego[COS] + dy * ego[SIN]
-            if squared < _NEAR * _NEAR or (forward > _ZERO and forward * forward > _AHEAD * _AHEAD * squared):
+            if squared < EGO_CLEARANCE * EGO_CLEARANCE or (
+                forward > _ZERO and forward * forward > EGO_SECTOR_COSINE * EGO_SECTOR_COSINE * squared
+            ):
                 return True
     return False
 
@@ -121,7 +119,7 @@ def may_enter(network, drivers, world, i, ego):
         dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
         forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
         same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
-        way = _NEAR + _CROSSING_TIME * max(ego[SPEED], _ZERO)
+        way = EGO_CLEARANCE + CROSSING_TIME * max(ego[SPEED], _ZERO)
         far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
         if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < _F(2.5))):
             if not is_junction(network, here) and _awaits(network, lane, ego, way):

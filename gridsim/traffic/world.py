@@ -11,13 +11,13 @@ import math
 
 import numpy as np
 
-from gridsim.config import TrafficConfig
+from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, TrafficConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import Network, wrapped
 
 _F, _I, _U = np.float32, np.int32, np.uint64
-_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+_ZERO, _ONE = _F(0.0), _F(1.0)
 
 # Fields of a traffic car's state; X to SPEED are where the ego car's are.
 X, Y = 0, 1  # m, centre of mass
@@ -41,7 +41,6 @@ FIELDS = 20
 
 _MOST = 1 << 24  # float32 holds all whole numbers up to it
 _FASTEST = 40.0  # m/s; nobody drives as fast on any map, and nobody passes a whole lane in a control period
-THINKING = _F(10.0)  # control steps from one thought of another lane to the next
 
 
 @leaf
@@ -109,7 +108,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
         car = world[i]
         car[:] = _ZERO
         car[LANE], car[PAST], car[PERMIT] = -_ONE, -_ONE, -_ONE
-        car[CLOCK] = _F(i) % THINKING  # not all at once
+        car[CLOCK] = _F(i) % LANE_CHANGE_PERIOD  # not all at once
         for _ in range(60):
             draws += 1
             bits = mix(key + _U(draws) * GOLDEN)
@@ -124,11 +123,11 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
                 car[SEED] = _F(mix(bits) >> _U(40))
-                car[FACTOR] = _F(0.9) + _F(0.3) * uniform(mix(bits + GOLDEN))
+                car[FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
                 car[NEXT] = _F(choose_lane(network, lane, car))
                 car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
                 at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-                car[SPEED] = _HALF * car[FACTOR] * network.speeds[at]
+                car[SPEED] = SPAWN_SPEED * car[FACTOR] * network.speeds[at]
                 break
             car[LANE] = -_ONE
 

@@ -14,9 +14,9 @@ import gridsim.maps.generators.city as city
 import gridsim.maps.generators.curved as curved
 import gridsim.maps.generators.highway as highway
 from gridsim.car.ego import collides
-from gridsim.config import SimConfig, constants
+from gridsim.config import BEND_COMFORT, CROSSING_GAP, SimConfig, constants
 from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
-from gridsim.maps.lanes import COMFORT, CROSSING_GAP, LANE_STEP, Path, backwards, beside, end_of, lay_lanes
+from gridsim.maps.lanes import LANE_STEP, Path, backwards, beside, end_of, lay_lanes
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearance, clearance_nodes
 from gridsim.maps.scenarios import REGISTRY, build
@@ -110,7 +110,7 @@ def test_limits_keep_lateral_acceleration_within_comfort(laid):
         for i in range(len(m.lanes)):
             turn = np.abs(np.diff(headings(m.lanes.lane(i))[1:-1]))  # inside, where pieces are not cut short
             curvature = turn.max(initial=0.0) / m.lanes.steps[i]
-            assert curvature * m.lanes.limits[i] ** 2 <= COMFORT * 1.03 + 0.1  # float32 points: 1e-4 rad a step
+            assert curvature * m.lanes.limits[i] ** 2 <= BEND_COMFORT * 1.03 + 0.1  # float32 points: 1e-4 rad a step
             assert 3.0 < m.lanes.limits[i] <= 30.0
 
 
