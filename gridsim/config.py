@@ -39,7 +39,7 @@ LOOK_AHEAD_TIME = _F(1.5)  # s, and the way it drives in that time, beside its c
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 STOP_LINE_GAP = _F(
     0.25
-)  # m before a junction's line at which a car waits; short, as another junction may end behind it
+)  # m before a junction's line at which a car waits; if longer, its rear might be in a junction behind
 EGO_DODGE_SLOPE = _F(0.12)  # m to the right for each m of way, on a path that dodges the oncoming ego car
 PATH_SAMPLE = _F(1.25)  # m between points of a path that are tested; below half a car's width plus CAUTION
 

@@ -27,7 +27,7 @@ from gridsim.envs.simulator import views
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import LANE
-from gridsim.view.render import Renderer, between
+from gridsim.view.render import Renderer, interpolate
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, FPS, SECONDS = (640, 360), 15, 20.0  # of champion.mp4, which a run waits for: a second or two of one core
@@ -95,8 +95,8 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
     k = min(int(at), len(drive.cars) - 2) if len(drive.cars) > 1 else 0
     following = min(k + 1, len(drive.cars) - 1)
     part = at - k
-    car = between(drive.cars[k], drive.cars[following], part, drive.scenario)
-    boxes = between(drive.boxes[k], drive.boxes[following], part, drive.scenario) if drive.boxes.shape[1] else None
+    car = interpolate(drive.cars[k], drive.cars[following], part, drive.scenario)
+    boxes = interpolate(drive.boxes[k], drive.boxes[following], part, drive.scenario) if drive.boxes.shape[1] else None
     ranges, then = drive.ranges[k], drive.ranges[following]
     # A ray that leaps from one thing to another is shown on either, never between them.
     ranges = np.where(np.abs(then - ranges) < 3.0, ranges + part * (then - ranges), ranges if part < 0.5 else then)

@@ -20,7 +20,7 @@ from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
 from evolution.dqn.replay import PriorityConfig, Replay
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import Limits
-from gridsim.maps.scenarios import map_of
+from gridsim.maps.scenarios import seed_of_map
 
 COLUMNS = (
     "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean", "network/success_rate",
@@ -122,7 +122,7 @@ class Dqn(Learning):
             weights=_finite(self.learner.weights, self.learner.updates),
             episodes=episodes.rows,
             worlds=episodes.worlds,
-            maps=tuple((s.scenario, map_of(s.scenario, seed)) for seed in episodes.maps),
+            maps=tuple((s.scenario, seed_of_map(s.scenario, seed)) for seed in episodes.maps),
             epsilons=self._epsilons(n),
             keys=keys,
             limits=Limits(self.curriculum.goal, EPISODE_STEPS),

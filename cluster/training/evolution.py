@@ -54,7 +54,7 @@ class Evolution(Learning):
         else:
             self.search = Recombination(self.spec, s.search_config(), s.seed)
         if self.initial is not None:
-            self.search.begin_with(self.initial)
+            self.search.start_from(self.initial)
 
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
         """Scores float64 [n]; what is not a number loses."""
@@ -109,12 +109,12 @@ class Evolution(Learning):
             alone = slice(n, n + 1), slice(e * len(groups), e * len(groups) + len(followed.rows))
             led = driven.results[alone][0]
             led_score = float(self._score(driven.results[alone], curriculum.leader_limits().target)[0])
-            curriculum.followed(followed, led, driven.rewound[alone[1]], driven.worlds[alone[1]])
+            curriculum.learn_from_leader(followed, led, driven.rewound[alone[1]], driven.worlds[alone[1]])
         self.search.tell(score)
         if len(self.trials):
             self._judge(driven.results[on_trial], driven.lost[on_trial.rows])
             if self.champion is not None:
-                self.search.carry(self.champion.genome)
+                self.search.keep_champion(self.champion.genome)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         row = {
             "fitness/best": led_score if np.isfinite(led_score) else -1.0,
@@ -131,7 +131,7 @@ class Evolution(Learning):
         }
         self.history.append(row)
         if self._promising():
-            self.trials.enter(self.search.candidates(), self.generation - 1)
+            self.trials.add_candidates(self.search.candidates(), self.generation - 1)
         return row
 
     def _promising(self) -> bool:
@@ -204,7 +204,7 @@ class Evolution(Learning):
             raise ValueError("it has no genomes to go on with")
         self.search.generation = generation
         if self.champion is not None:
-            self.search.carry(self.champion.genome)
+            self.search.keep_champion(self.champion.genome)
         curriculum.crashes, curriculum.crash_worlds, curriculum.target = _crashes(crashes), worlds, target
 
 

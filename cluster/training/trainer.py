@@ -43,7 +43,7 @@ from evolution.search.breeding import Kind, Mutation
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import build, map_of
+from gridsim.maps.scenarios import build, seed_of_map
 
 MAX_TRIED = 4  # members that are on validation's first stage at once
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
@@ -201,7 +201,7 @@ class Learning(ABC):
     def _settle_trials(self) -> None:
         self._finish_trials()
         if not self.solved:
-            self.trials.enter(self.latest(), self.steps - 1)
+            self.trials.add_candidates(self.latest(), self.steps - 1)
             self._finish_trials()
 
     def _finish_trials(self) -> None:
@@ -231,7 +231,7 @@ class Learning(ABC):
             mutation=bred.mutation,
             episodes=episodes.rows,
             worlds=episodes.worlds,
-            maps=tuple((self.settings.scenario, map_of(self.settings.scenario, seed)) for seed in episodes.maps),
+            maps=tuple((self.settings.scenario, seed_of_map(self.settings.scenario, seed)) for seed in episodes.maps),
             limits=limits,
             config=self.sim,
         )
@@ -254,7 +254,7 @@ class Learning(ABC):
 
     def _trial(self) -> tuple[Episodes, list[Chunk]]:
         """Validation's episodes, and who of `trials` drives which of them."""
-        episodes = self.curriculum.validation().within(self.curriculum.goal_limits())
+        episodes = self.curriculum.validation().with_limits(self.curriculum.goal_limits())
         stage, k = self.curriculum.config.first_validation, len(self.trials.first)
         parts = [
             Chunk(slice(k, len(self.trials)), slice(stage, len(episodes.rows))),

@@ -82,27 +82,27 @@ def ages(experience: Experience) -> np.ndarray:
 
 
 @leaf
-def fixed(value):
+def to_fixed_point(value):
     """A network's input in fixed point: the nearest int16, clipped."""
     return np.int16(min(max(math.floor(value * UNITS + _F(0.5)), _LEAST), _GREATEST))
 
 
 @leaf
-def keep_rays(inputs, row):
+def store_rays(inputs, row):
     """Keep the inputs float32 [inputs or more] of a network on rays as row int16 [inputs]."""
     for i in range(row.shape[0]):
-        row[i] = fixed(inputs[i])
+        row[i] = to_fixed_point(inputs[i])
 
 
 @leaf
-def keep_grid(grid, speed, row):
+def store_grid(grid, speed, row):
     """Keep a grid uint8 [6400] and a speed (m/s) as row uint8 [1602]."""
     for i in range(_FRAME):
         byte = 0
         for j in range(4):  # the codes 0, 127 and 255 become 0, 1 and 2
             byte |= (int(grid[4 * i + j]) + 1 >> 7) << 2 * j
         row[i] = byte
-    bits = int(fixed(speed / SPEED_SCALE - _F(1.0))) & 0xFFFF
+    bits = int(to_fixed_point(speed / SPEED_SCALE - _F(1.0))) & 0xFFFF
     row[_FRAME], row[_FRAME + 1] = bits & 0xFF, bits >> 8
 
 

@@ -224,7 +224,7 @@ class Replay:
         ):
             _put(ring, first, new[rows - kept :])
         self.added += rows
-        lost = self._forget_torn()
+        lost = self._exclude_incomplete_stacks()
         self.transitions = int(np.count_nonzero(self._ahead[: len(self)]))
         if self.prioritised is not None:
             leaves = self._tree[len(self._tree) // 2 :][: self.capacity]
@@ -236,7 +236,7 @@ class Replay:
                 _raise_sums(self._tree, 0, first + kept - self.capacity - 1)
             _set_leaves(self._tree, lost, np.zeros(len(lost), dtype=np.float32))
 
-    def _forget_torn(self) -> np.ndarray:
+    def _exclude_incomplete_stacks(self) -> np.ndarray:
         """Take from what can be drawn the oldest rows whose earlier frames are gone; their places int64."""
         oldest = self.added - len(self)
         places = (oldest + np.arange(min(self._frames - 1, len(self)))) % self.capacity

@@ -10,22 +10,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evolution.dqn.experience import NO_ACTION, Experience, empty, join, keep_grid, keep_rays
+from evolution.dqn.experience import NO_ACTION, Experience, empty, join, store_grid, store_rays
 from evolution.episodes.rollout import (
     RESULT,
     Limits,
-    advance,
-    bounds_of,
     checked_worlds,
-    choose,
-    closing_of,
-    eye_of,
-    make_room,
-    note,
+    choose_action,
+    control_step,
+    episode_setup,
+    kernel_world,
+    make_closing,
+    make_grid_buffers,
+    make_workspace,
+    observe,
     packed_genome,
-    see,
-    settings_on,
-    world_of,
+    simulations_on,
+    write_result,
 )
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import DISTANCE, SPEED, place
@@ -50,29 +50,29 @@ def _explore(key, step, epsilon, actions):
 
 
 @leaf
-def _keep(car, room, eye, row):
+def _keep(car, workspace, grid_buffers, row):
     """Keep what was seen as a row of observations."""
-    if eye is None:
-        keep_rays(room.scratch, row)
+    if grid_buffers is None:
+        store_rays(workspace.scratch, row)
     else:
-        keep_grid(eye.grid, car[SPEED], row)
+        store_grid(grid_buffers.grid, car[SPEED], row)
 
 
 @njit(nogil=True)
-def _collect(setting, packed, layers, bounds, traffic, closing, eye, epsilon, key, kept, results, column):
+def _collect(simulation, packed, layers, setup, traffic, closing, grid_buffers, epsilon, key, kept, results, column):
     """One episode; fills the first rows of `kept` and results[column]. Returns: its control steps."""
-    room = make_room(setting, layers, 0, 0)
+    workspace = make_workspace(simulation, layers, 0, 0)
     world = None if traffic is None else traffic.copy()
-    road, constants, car = setting.road, setting.constants, room.car
+    road, constants, car = simulation.road, simulation.constants, workspace.car
     observations, actions, rewards, ends = kept
     key = mix(key)
-    place(road, bounds.start, car, room.visits)
+    place(road, setup.start, car, workspace.visits)
     end = 0
     steps = 0
-    see(setting, car, world, room, closing, eye)
-    _keep(car, room, eye, observations[0])
+    observe(simulation, car, world, workspace, closing, grid_buffers)
+    _keep(car, workspace, grid_buffers, observations[0])
     while end == 0:
-        action = choose(packed, layers, car, room, eye, steps == 0)
+        action = choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
         if action < 0:  # not a number: what is left is lost, as in `rollout`
             end = _IDLE
             if steps > 0:
@@ -82,24 +82,24 @@ def _collect(setting, packed, layers, bounds, traffic, closing, eye, epsilon, ke
         if explored >= 0:
             action = explored
         before = car[DISTANCE]
-        end = advance(setting, bounds, car, room.visits, world, action, steps)
-        see(setting, car, world, room, closing, eye)
+        end = control_step(simulation, setup, car, workspace.visits, world, action, steps)
+        observe(simulation, car, world, workspace, closing, grid_buffers)
         gained = car[DISTANCE] - before
         actions[steps], ends[steps] = action, end
         rewards[steps] = reward(
-            room.ranges, constants.ray_range, car[SPEED], gained, end, road.speed_high, constants.dt
+            workspace.ranges, constants.ray_range, car[SPEED], gained, end, road.speed_high, constants.dt
         )
         steps += 1
-        _keep(car, room, eye, observations[steps])
+        _keep(car, workspace, grid_buffers, observations[steps])
     actions[steps], rewards[steps], ends[steps] = NO_ACTION, _F(0.0), 0
-    note(car, end, results[column])
+    write_result(car, end, results[column])
     return steps
 
 
 def collect(
     spec: PolicySpec,
     weights: np.ndarray,
-    scenarios: Sequence[Map],
+    road_maps: Sequence[Map],
     episodes: np.ndarray,
     epsilons: np.ndarray,
     keys: np.ndarray,
@@ -111,7 +111,7 @@ def collect(
 
     Args:
         weights: float32 [spec.size].
-        scenarios: the maps that the episodes index.
+        road_maps: the maps that the episodes index.
         episodes: EPISODE [e].
         epsilons: float32 [e], each episode's share of random actions, which are uniform over all.
         keys: uint64 [e], of each episode's random numbers.
@@ -130,22 +130,22 @@ def collect(
             raise ValueError(f"{name} are one for each of {len(episodes)} episodes, not {values.shape}")
     if not ((epsilons >= 0.0) & (epsilons <= 1.0)).all():
         raise ValueError("epsilons are shares, from 0 to 1")
-    eye, worlds = eye_of(spec, config), checked_worlds(episodes, limits, worlds)
-    packed = freeze(packed_genome(freeze(weights.astype(np.float32, copy=False)), spec.layers, eye))
-    settings, closing = settings_on(scenarios, config), closing_of(spec, config)
+    grid_buffers, worlds = make_grid_buffers(spec, config), checked_worlds(episodes, limits, worlds)
+    packed = freeze(packed_genome(freeze(weights.astype(np.float32, copy=False)), spec.layers, grid_buffers))
+    simulations, closing = simulations_on(road_maps, config), make_closing(spec, config)
     longest = int(max(episodes["steps"].max(initial=0), limits.steps))
     kept = empty(spec, longest + 1)
     results = np.zeros(len(episodes), dtype=RESULT)
     parts = []
     for k, episode in enumerate(episodes):
         steps = _collect(
-            settings[episode["map"]],
+            simulations[episode["map"]],
             packed,
             spec.layers,
-            bounds_of(episode, limits),
-            world_of(worlds, k),
+            episode_setup(episode, limits),
+            kernel_world(worlds, k),
             closing,
-            eye,
+            grid_buffers,
             _F(epsilons[k]),
             _U(keys[k]),
             kept,

@@ -180,11 +180,13 @@ class Curriculum:
 
     def leader_episodes(self, generation: int) -> Episodes:
         """What the leader drives beside a generation; the states before its crashes are wanted back."""
-        episodes = self._drawn(generation, self.config.leader_episodes, 2).within(self.leader_limits())
+        episodes = self._drawn(generation, self.config.leader_episodes, 2).with_limits(self.leader_limits())
         episodes.rows["rewind"] = self.config.rewind
         return episodes
 
-    def followed(self, episodes: Episodes, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray) -> None:
+    def learn_from_leader(
+        self, episodes: Episodes, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray
+    ) -> None:
         """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
 
         Args: `leader_episodes`; RESULT [e]; the states some steps before each end, float32 [e, 5], and the traffic of
@@ -245,7 +247,7 @@ class Trials:
     def __len__(self) -> int:
         return len(self.first) + len(self.last)
 
-    def enter(self, genomes: np.ndarray, generation: int) -> None:
+    def add_candidates(self, genomes: np.ndarray, generation: int) -> None:
         """Let those of [k, genes] try who did not lately."""
         digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
         new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]

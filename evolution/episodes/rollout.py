@@ -1,4 +1,4 @@
-"""Episodes of whole populations: the fused loop sense -> network -> act -> advance, until done.
+"""Episodes of whole populations: the fused loop sense -> network -> act -> control_step, until done.
 
 With `collecting`, which shares the parts of that loop, the only user of the simulator within `evolution`. Pure
 functions: what is returned depends on the arguments alone.
@@ -46,7 +46,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road, freeze
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.sensing.rays import LANES, fan
+from gridsim.sensing.rays import SIMD_RAYS, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
@@ -72,30 +72,30 @@ class Limits:
     steps: int
 
 
-class Eye(NamedTuple):
+class GridBuffers(NamedTuple):
     """What a policy on the occupancy grid needs beside its genome."""
 
     table: GridTable
-    room: convnet.Scratch
+    scratch: convnet.Scratch
     grid: np.ndarray  # uint8 [cells]
 
 
-def eye_of(spec: PolicySpec, config: SimConfig) -> Eye | None:
+def make_grid_buffers(spec: PolicySpec, config: SimConfig) -> GridBuffers | None:
     """None for a policy on rays. Raises: ValueError if it sees another number of them."""
     if isinstance(spec, CnnSpec):
-        return Eye(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
+        return GridBuffers(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
     if config.sensors.rays != RAYS:
         raise ValueError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
     return None
 
 
-def closing_of(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
-    """Room for the motion that a policy sees, if it sees any."""
+def make_closing(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
+    """Workspace for the motion that a policy sees, if it sees any."""
     sees = isinstance(spec, MlpSpec) and spec.motion
     return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
 
 
-class Setting(NamedTuple):
+class Simulation(NamedTuple):
     """What the episodes on a map have in common, as the kernels read it."""
 
     road: Road
@@ -106,14 +106,14 @@ class Setting(NamedTuple):
     rays: int
 
 
-def settings_on(scenarios: Sequence[Map], config: SimConfig) -> list[Setting]:
-    """The settings of episodes on these maps."""
+def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
+    """The simulations of episodes on these maps."""
     k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return [Setting(s.road, s.network, k, others, rays, config.sensors.rays) for s in scenarios]
+    return [Simulation(s.road, s.network, k, others, rays, config.sensors.rays) for s in road_maps]
 
 
-class Bounds(NamedTuple):
+class EpisodeSetup(NamedTuple):
     """Where an episode begins and where it ends if nothing happens."""
 
     start: np.ndarray  # float32 [5]
@@ -121,12 +121,12 @@ class Bounds(NamedTuple):
     steps: int
 
 
-class Room(NamedTuple):
+class Workspace(NamedTuple):
     """What an episode is driven in; it is used again for the next."""
 
     car: np.ndarray  # float32 [FIELDS]
     visits: np.ndarray  # float32 [cells]
-    beams: np.ndarray  # float32 [3, LANES]
+    beams: np.ndarray  # float32 [3, SIMD_RAYS]
     ranges: np.ndarray  # float32 [rays]
     scratch: np.ndarray  # float32, of the network
     ring: np.ndarray  # float32 [n, FIELDS], left with the last n states: that of step k in row k % n
@@ -149,14 +149,14 @@ def _copy_world(world, kept):
 
 
 @njit
-def make_room(setting, layers, rows, cars):
-    """Room that keeps the last `rows` states of a car and of so many others."""
-    road = setting.road
-    return Room(
+def make_workspace(simulation, layers, rows, cars):
+    """Workspace that keeps the last `rows` states of a car and of so many others."""
+    road = simulation.road
+    return Workspace(
         np.empty(FIELDS, dtype=np.float32),
         np.empty(int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL), dtype=np.float32),
-        np.empty((3, LANES), dtype=np.float32),
-        np.empty(setting.rays, dtype=np.float32),
+        np.empty((3, SIMD_RAYS), dtype=np.float32),
+        np.empty(simulation.rays, dtype=np.float32),
         np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
@@ -164,9 +164,9 @@ def make_room(setting, layers, rows, cars):
 
 
 @njit
-def packed_genome(genome, layers, eye):
+def packed_genome(genome, layers, grid_buffers):
     """A genome as its network reads it."""
-    if eye is not None:
+    if grid_buffers is not None:
         return genome
     packed = np.empty(packed_size(layers), dtype=np.float32)
     pack(genome, layers, packed)
@@ -174,68 +174,68 @@ def packed_genome(genome, layers, eye):
 
 
 @leaf
-def see(setting, car, world, room, closing, eye):
-    """What a car senses: its ranges, and then the network's inputs in `room.scratch`, or the grid in an Eye."""
-    look(setting.road, setting.constants, setting.fan, car, world, room.beams, room.ranges, closing)
-    if eye is None:
-        encode(room.ranges, closing, car[SPEED], car[STEERING], room.scratch)
+def observe(simulation, car, world, workspace, closing, grid_buffers):
+    """What a car senses: its ranges, and then the network's inputs in `workspace.scratch`, or the grid."""
+    look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.beams, workspace.ranges, closing)
+    if grid_buffers is None:
+        encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
     else:
-        fill_grid(eye.table, room.ranges, eye.grid)
+        fill_grid(grid_buffers.table, workspace.ranges, grid_buffers.grid)
 
 
 @leaf
-def choose(packed, layers, car, room, eye, begun):
+def choose_action(packed, layers, car, workspace, grid_buffers, begun):
     """Index of the action for what was seen, which is overwritten; -1 where the network gives no number."""
-    if eye is None:
-        return decide(packed, layers, room.scratch)
-    convnet.push(eye.grid, begun, eye.room)
-    return convnet.decide(packed, layers, car[SPEED], eye.room)
+    if grid_buffers is None:
+        return decide(packed, layers, workspace.scratch)
+    convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
+    return convnet.decide(packed, layers, car[SPEED], grid_buffers.scratch)
 
 
 @leaf
-def advance(setting, bounds, car, visits, world, action, steps):
+def control_step(simulation, setup, car, visits, world, action, steps):
     """One control period of the car and its world, the episode's steps-th from 0. Returns: End as a number."""
     if world is not None:
-        flow(setting.network, setting.drivers, world, car)
-    end = drive(setting.road, setting.constants, car, visits, world, action)
+        flow(simulation.network, simulation.drivers, world, car)
+    end = drive(simulation.road, simulation.constants, car, visits, world, action)
     if end == 0:
-        if car[DISTANCE] >= bounds.target:
+        if car[DISTANCE] >= setup.target:
             return 3
-        if steps + 1 >= bounds.steps:
+        if steps + 1 >= setup.steps:
             return 4
     return end
 
 
 @njit
-def _run(setting, packed, layers, bounds, room, world, closing, eye):
-    """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there is an Eye.
+def _run(simulation, packed, layers, setup, workspace, world, closing, grid_buffers):
+    """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there are GridBuffers.
 
     What may be None is an argument of its own: Numba leaves out the branches that it rules out for those alone.
 
     Returns: End as a number.
     """
-    car = room.car
-    place(setting.road, bounds.start, car, room.visits)
-    keep = room.ring.shape[0]
+    car = workspace.car
+    place(simulation.road, setup.start, car, workspace.visits)
+    keep = workspace.ring.shape[0]
     end = 0
     steps = 0
     while end == 0:
-        see(setting, car, world, room, closing, eye)
-        action = choose(packed, layers, car, room, eye, steps == 0)
+        observe(simulation, car, world, workspace, closing, grid_buffers)
+        action = choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
         if action < 0:  # not a number: the genome loses what is left
             end = 2
             break
         if keep > 0:
-            _copy(car, room.ring[steps % keep])
+            _copy(car, workspace.ring[steps % keep])
             if world is not None:
-                _copy_world(world, room.world_ring[steps % keep])
-        end = advance(setting, bounds, car, room.visits, world, action, steps)
+                _copy_world(world, workspace.world_ring[steps % keep])
+        end = control_step(simulation, setup, car, workspace.visits, world, action, steps)
         steps += 1
     return end
 
 
 @leaf
-def note(car, end, row):
+def write_result(car, end, row):
     """Fill a RESULT."""
     row["distance"] = car[DISTANCE]
     row["paced"] = car[PACED]
@@ -244,23 +244,25 @@ def note(car, end, row):
 
 
 @njit(nogil=True)
-def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, results, rewound, rewound_worlds):
+def _rollout(
+    simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, results, rewound, rewound_worlds
+):
     """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results [n].
 
     If rewind > 0 also rewound [n, 5] and rewound_worlds [n, cars, fields].
     """
-    room = make_room(setting, layers, rewind, 0 if traffic is None else traffic.shape[0])
-    car = room.car
+    workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0])
+    car = workspace.car
     for i in range(genomes.shape[0]):
-        packed = packed_genome(genomes[i], layers, eye)
+        packed = packed_genome(genomes[i], layers, grid_buffers)
         world = None if traffic is None else traffic.copy()
-        end = _run(setting, packed, layers, bounds, room, world, closing, eye)
-        note(car, end, results[i])
+        end = _run(simulation, packed, layers, setup, workspace, world, closing, grid_buffers)
+        write_result(car, end, results[i])
         if rewind > 0:
             row_back = max(int(car[STEPS]) - rewind, 0) % rewind
-            back = room.ring[row_back]
+            back = workspace.ring[row_back]
             if traffic is not None:
-                _copy_world(room.world_ring[row_back], rewound_worlds[i])
+                _copy_world(workspace.world_ring[row_back], rewound_worlds[i])
             rewound[i, 0] = back[X]
             rewound[i, 1] = back[Y]
             rewound[i, 2] = math.atan2(back[SIN], back[COS])
@@ -268,10 +270,10 @@ def _rollout(setting, genomes, layers, bounds, traffic, closing, eye, rewind, re
             rewound[i, 4] = back[STEERING]
 
 
-def bounds_of(episode: np.void, limits: Limits) -> Bounds:
+def episode_setup(episode: np.void, limits: Limits) -> EpisodeSetup:
     """Where an EPISODE begins and ends."""
     target, steps = episode["target"] or limits.target, episode["steps"] or limits.steps
-    return Bounds(freeze(episode["start"].copy()), _F(target), int(steps))
+    return EpisodeSetup(freeze(episode["start"].copy()), _F(target), int(steps))
 
 
 def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
@@ -293,7 +295,7 @@ def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | No
     return worlds
 
 
-def world_of(worlds: np.ndarray, k: int) -> np.ndarray | None:
+def kernel_world(worlds: np.ndarray, k: int) -> np.ndarray | None:
     """The k-th of worlds as kernels take it."""
     return freeze(worlds[k].copy()) if worlds.shape[1] else None
 
@@ -301,7 +303,7 @@ def world_of(worlds: np.ndarray, k: int) -> np.ndarray | None:
 def evaluate(
     spec: PolicySpec,
     genomes: np.ndarray,
-    scenarios: Sequence[Map],
+    road_maps: Sequence[Map],
     episodes: np.ndarray,
     limits: Limits,
     config: SimConfig,
@@ -311,7 +313,7 @@ def evaluate(
 
     Args:
         genomes: float32 [n, spec.size].
-        scenarios: the maps that the episodes index.
+        road_maps: the maps that the episodes index.
         episodes: EPISODE [e].
         worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
 
@@ -321,7 +323,7 @@ def evaluate(
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
-    eye, worlds = eye_of(spec, config), checked_worlds(episodes, limits, worlds)
+    grid_buffers, worlds = make_grid_buffers(spec, config), checked_worlds(episodes, limits, worlds)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     # By columns: the kernel fills one at a time.
     results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
@@ -329,16 +331,16 @@ def evaluate(
     k = int(kept[-1]) + 1 if len(kept) else 0
     rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
-    settings = settings_on(scenarios, config)
+    simulations = simulations_on(road_maps, config)
     for column, episode in enumerate(episodes):
         _rollout(
-            settings[episode["map"]],
+            simulations[episode["map"]],
             genomes,
             spec.layers,
-            bounds_of(episode, limits),
-            world_of(worlds, column),
-            closing_of(spec, config),
-            eye,
+            episode_setup(episode, limits),
+            kernel_world(worlds, column),
+            make_closing(spec, config),
+            grid_buffers,
             int(episode["rewind"]),
             results[column],
             rewound[kept[column]],
@@ -355,7 +357,7 @@ def no_traffic(episodes: int) -> np.ndarray:
 def trajectory(
     spec: PolicySpec,
     genome: np.ndarray,
-    scenario: Map,
+    road_map: Map,
     start: np.ndarray,
     limits: Limits,
     config: SimConfig,
@@ -368,13 +370,13 @@ def trajectory(
     `gridsim.car.ego`, and the traffic then, float32 [steps + 1, cars, world.FIELDS]).
     """
     result, states, worlds = _trajectory(
-        settings_on([scenario], config)[0],
+        simulations_on([road_map], config)[0],
         freeze(genome),
         spec.layers,
-        Bounds(freeze(start), _F(limits.target), limits.steps),
+        EpisodeSetup(freeze(start), _F(limits.target), limits.steps),
         None if world is None or not len(world) else freeze(world.copy()),
-        closing_of(spec, config),
-        eye_of(spec, config),
+        make_closing(spec, config),
+        make_grid_buffers(spec, config),
     )
     row = np.zeros((), dtype=RESULT)
     row["distance"], row["paced"], row["steps"], row["end"] = result
@@ -382,12 +384,14 @@ def trajectory(
 
 
 @njit(nogil=True)
-def _trajectory(setting, genome, layers, bounds, traffic, closing, eye):
-    room = make_room(setting, layers, bounds.steps + 1, 0 if traffic is None else traffic.shape[0])
-    car = room.car
+def _trajectory(simulation, genome, layers, setup, traffic, closing, grid_buffers):
+    workspace = make_workspace(simulation, layers, setup.steps + 1, 0 if traffic is None else traffic.shape[0])
+    car = workspace.car
     world = None if traffic is None else traffic.copy()
-    end = _run(setting, packed_genome(genome, layers, eye), layers, bounds, room, world, closing, eye)
-    _copy(car, room.ring[int(car[STEPS])])
+    end = _run(
+        simulation, packed_genome(genome, layers, grid_buffers), layers, setup, workspace, world, closing, grid_buffers
+    )
+    _copy(car, workspace.ring[int(car[STEPS])])
     if traffic is not None:
-        _copy_world(world, room.world_ring[int(car[STEPS])])
-    return (car[DISTANCE], car[PACED], car[STEPS], end), room.ring, room.world_ring
+        _copy_world(world, workspace.world_ring[int(car[STEPS])])
+    return (car[DISTANCE], car[PACED], car[STEPS], end), workspace.ring, workspace.world_ring

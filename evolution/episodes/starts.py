@@ -20,7 +20,7 @@ class Episodes(NamedTuple):
     rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
     worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
 
-    def within(self, limits: Limits) -> Episodes:
+    def with_limits(self, limits: Limits) -> Episodes:
         """The same, each with its own target and limit: these where it had none."""
         rows = self.rows.copy()
         rows["target"] = np.where(rows["target"] > 0, rows["target"], limits.target)
@@ -39,13 +39,13 @@ class Episodes(NamedTuple):
 
 
 def lane_starts(
-    scenarios: Sequence[Map],
+    road_maps: Sequence[Map],
     maps: np.ndarray,
     rng: np.random.Generator,
     traffic: int = 0,
     config: TrafficConfig | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes that start uniformly over the lanes of `scenarios[maps[k]]`, at rest, with so many other cars.
+    """Episodes that start uniformly over the lanes of `road_maps[maps[k]]`, at rest, with so many other cars.
 
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
     """
@@ -53,12 +53,12 @@ def lane_starts(
     episodes["map"] = maps
     for m in np.unique(maps):
         of = np.flatnonzero(episodes["map"] == m)
-        episodes["start"][of] = sample_starts(scenarios[m], len(of), rng)
+        episodes["start"][of] = sample_starts(road_maps[m], len(of), rng)
     if traffic:
         worlds = np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
         for m in np.unique(maps):
             of = np.flatnonzero(episodes["map"] == m)
             starts = episodes["start"][of]
-            worlds[of] = spawn(scenarios[m].network, starts, traffic, keys[of], config or TrafficConfig())
+            worlds[of] = spawn(road_maps[m].network, starts, traffic, keys[of], config or TrafficConfig())
     return episodes, worlds

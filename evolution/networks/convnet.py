@@ -16,12 +16,12 @@ from evolution.networks.dense import tile
 from evolution.networks.policy import (
     KERNEL_1,
     KERNEL_2,
-    LANES,
     SIDE_1,
     SIDE_2,
     SPEED_SCALE,
     STRIDE_1,
     STRIDE_2,
+    UNIT_MULTIPLE,
     CnnSpec,
 )
 from gridsim.jit import leaf, njit
@@ -32,12 +32,12 @@ _F = np.float32
 _CODE = _F(1.0 / 255.0)
 _AREA = CELLS * CELLS
 _HALF_ROW = (SIDE_1 + 1) // 2  # two tiles make a row of 19; they share its middle
-_WIDE, _WIDEST = 2 * LANES, 4 * LANES
+_WIDE, _WIDEST = 2 * UNIT_MULTIPLE, 4 * UNIT_MULTIPLE
 
-_convolve_1, _convolve_1_wide = tile(_HALF_ROW, LANES, True), tile(_HALF_ROW, _WIDE, True)
-_convolve_2, _convolve_2_wide = tile(SIDE_2, LANES, True), tile(SIDE_2, _WIDE, True)
-_dense, _dense_wide = tile(1, LANES, True), tile(1, _WIDEST, True)
-_linear = tile(1, LANES, False)
+_convolve_1, _convolve_1_wide = tile(_HALF_ROW, UNIT_MULTIPLE, True), tile(_HALF_ROW, _WIDE, True)
+_convolve_2, _convolve_2_wide = tile(SIDE_2, UNIT_MULTIPLE, True), tile(SIDE_2, _WIDE, True)
+_dense, _dense_wide = tile(1, UNIT_MULTIPLE, True), tile(1, _WIDEST, True)
+_linear = tile(1, UNIT_MULTIPLE, False)
 
 
 class Scratch(NamedTuple):
@@ -58,9 +58,9 @@ def scratch(spec: CnnSpec) -> Scratch:
 
 
 @leaf
-def push(grid, begun, room):
+def push(grid, begun, scratch):
     """Make grid uint8 [6400] the newest frame; where an episode has just `begun` it is all of them."""
-    frames = room.frames
+    frames = scratch.frames
     older = frames.shape[0] - _AREA
     for i in range(older):
         frames[i] = frames[i + _AREA]
@@ -72,8 +72,8 @@ def push(grid, begun, room):
 
 
 @leaf
-def forward(genome, layers, speed, room):
-    """Outputs of the network for the frames in `room` and a speed in m/s; left in `room.outputs`.
+def forward(genome, layers, speed, scratch):
+    """Outputs of the network for the frames in `scratch` and a speed in m/s; left in `scratch.outputs`.
 
     Args: genome float32 [genes]; layers of `CnnSpec.layers`. Any not-a-number stays one and reaches the outputs.
     """
@@ -85,14 +85,14 @@ def forward(genome, layers, speed, room):
             if one % _WIDE == 0:
                 for c in range(0, one, _WIDE):
                     _convolve_1_wide(
-                        room.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
-                        genome, c, one, bias + c, room.first, to + c, one,
+                        scratch.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
+                        genome, c, one, bias + c, scratch.first, to + c, one,
                     )  # fmt: skip
             else:
-                for c in range(0, one, LANES):
+                for c in range(0, one, UNIT_MULTIPLE):
                     _convolve_1(
-                        room.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
-                        genome, c, one, bias + c, room.first, to + c, one,
+                        scratch.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
+                        genome, c, one, bias + c, scratch.first, to + c, one,
                     )  # fmt: skip
     start = bias + one
     bias = start + KERNEL_2 * KERNEL_2 * one * two
@@ -101,34 +101,39 @@ def forward(genome, layers, speed, room):
         if two % _WIDE == 0:
             for c in range(0, two, _WIDE):
                 _convolve_2_wide(
-                    room.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
-                    genome, start + c, two, bias + c, room.second, to + c, two,
+                    scratch.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
+                    genome, start + c, two, bias + c, scratch.second, to + c, two,
                 )  # fmt: skip
         else:
-            for c in range(0, two, LANES):
+            for c in range(0, two, UNIT_MULTIPLE):
                 _convolve_2(
-                    room.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
-                    genome, start + c, two, bias + c, room.second, to + c, two,
+                    scratch.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
+                    genome, start + c, two, bias + c, scratch.second, to + c, two,
                 )  # fmt: skip
     start = bias + two
     inputs = SIDE_2 * SIDE_2 * two + 1
-    room.second[inputs - 1] = speed / SPEED_SCALE - _F(1.0)
+    scratch.second[inputs - 1] = speed / SPEED_SCALE - _F(1.0)
     bias = start + inputs * units
     if units % _WIDEST == 0:
         for c in range(0, units, _WIDEST):
-            _dense_wide(room.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, room.dense, c, 0)
+            _dense_wide(
+                scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0
+            )
     else:
-        for c in range(0, units, LANES):
-            _dense(room.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, room.dense, c, 0)
+        for c in range(0, units, UNIT_MULTIPLE):
+            _dense(scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0)
     start = bias + units
-    _linear(room.dense, 0, 0, 1, 0, 1, 0, units, genome, start, LANES, start + units * LANES, room.outputs, 0, 0)
+    _linear(
+        scratch.dense, 0, 0, 1, 0, 1, 0, units,
+        genome, start, UNIT_MULTIPLE, start + units * UNIT_MULTIPLE, scratch.outputs, 0, 0,
+    )  # fmt: skip
 
 
 @leaf
-def decide(genome, layers, speed, room):
+def decide(genome, layers, speed, scratch):
     """Index of the greatest output, the first of equals; -1 where an output is not a number."""
-    forward(genome, layers, speed, room)
-    outputs = room.outputs
+    forward(genome, layers, speed, scratch)
+    outputs = scratch.outputs
     best, action = outputs[0], 0
     number = best == best
     for k in range(1, outputs.shape[0]):
@@ -140,11 +145,11 @@ def decide(genome, layers, speed, room):
 
 
 @njit
-def _act_on(genome, layers, frames, speeds, room, actions):
+def _act_on(genome, layers, frames, speeds, scratch, actions):
     for n in range(frames.shape[0]):
         for k in range(frames.shape[1]):
-            push(frames[n, k], False, room)
-        actions[n] = decide(genome, layers, speeds[n], room)
+            push(frames[n, k], False, scratch)
+        actions[n] = decide(genome, layers, speeds[n], scratch)
 
 
 def act_on(

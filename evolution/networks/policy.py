@@ -61,9 +61,9 @@ class PolicySpec(ABC):
         if match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
             hidden = tuple(int(n) for n in match.groups()[:3]) if match[1] else CnnSpec.hidden
             spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
-            if any(n < LANES or n % LANES for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
+            if any(n < UNIT_MULTIPLE or n % UNIT_MULTIPLE for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
                 raise ValueError(
-                    f"policy {text!r}: layers of a cnn have {LANES} units or a multiple of it, "
+                    f"policy {text!r}: layers of a cnn have {UNIT_MULTIPLE} units or a multiple of it, "
                     f"and it sees 1 to {MAX_FRAMES} frames"
                 )
             if spec.size > MAX_GENES:
@@ -132,7 +132,7 @@ KERNEL_1, STRIDE_1 = 8, 4
 KERNEL_2, STRIDE_2 = 4, 2
 SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
 SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
-LANES = 8  # channels and units come in multiples of it, so that layers are whole vectors
+UNIT_MULTIPLE = 8  # channels and units come in multiples of it, so that layers are whole vectors
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class SearchConfig:
             raise ValueError(f"the mutation rate must be 0 to 1, not {self.mutation_rate}")
 
 
-class Asked(NamedTuple):
+class Generation(NamedTuple):
     """A generation to be evaluated."""
 
     parents: np.ndarray  # float32 [p, genes], the rows that recipes name
@@ -59,13 +59,13 @@ class Search(ABC):
         config.check()
         self.spec, self.config, self.seed = spec, config, seed
         self.generation = 0  # generations that are done
-        self.asked: Asked | None = None
+        self.asked: Generation | None = None
 
     @abstractmethod
-    def begin_with(self, genome: np.ndarray) -> None:
+    def start_from(self, genome: np.ndarray) -> None:
         """Begin with a genome float32 [genes] in place of random ones."""
 
-    def carry(self, champion: np.ndarray) -> None:  # noqa: B027
+    def keep_champion(self, champion: np.ndarray) -> None:  # noqa: B027
         """Carry a champion float32 [genes] among the elites, where the search has a place for it."""
 
     @abstractmethod
@@ -85,12 +85,12 @@ class Search(ABC):
         """The inverse of `state`. Raises: KeyError, TypeError, ValueError where it does not fit this search."""
 
     @abstractmethod
-    def _ask(self, key: int) -> Asked: ...
+    def _ask(self, key: int) -> Generation: ...
 
     @abstractmethod
-    def _tell(self, asked: Asked, scores: np.ndarray) -> None: ...
+    def _tell(self, asked: Generation, scores: np.ndarray) -> None: ...
 
-    def ask(self) -> Asked:
+    def ask(self) -> Generation:
         """The next generation. Raises: RuntimeError when the last one's scores were not told yet."""
         if self.asked is not None:
             raise RuntimeError("ask() was called twice; tell() the scores first")

@@ -17,7 +17,7 @@ from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
 from evolution.search.base import (
     Arrays,
-    Asked,
+    Generation,
     Search,
     SearchConfig,
     checked,
@@ -59,10 +59,10 @@ class Recombination(Search):
         self.sigma = config.sigma
         self.champion: np.ndarray | None = None
 
-    def begin_with(self, genome: np.ndarray) -> None:
+    def start_from(self, genome: np.ndarray) -> None:
         self.centre = self.average = genome.astype(np.float64)
 
-    def carry(self, champion: np.ndarray) -> None:
+    def keep_champion(self, champion: np.ndarray) -> None:
         self.champion = champion
 
     def leader(self) -> np.ndarray | None:
@@ -75,13 +75,13 @@ class Recombination(Search):
         """Standard deviation of each gene, float64 [genes]."""
         return self.sigma * gene_scales(self.spec) * np.sqrt(self.variances)
 
-    def _ask(self, key: int) -> Asked:
+    def _ask(self, key: int) -> Generation:
         n = self.config.population
         made = recipes(n)
         if not len(self.centre):
             made["kind"] = Kind.NEW
             none = np.zeros((0, self.spec.size), dtype=np.float32)
-            return Asked(none, made, key, Mutation(), split(n, self.config.groups))
+            return Generation(none, made, key, Mutation(), split(n, self.config.groups))
         other = self.average if self.champion is None else self.champion
         rows = np.stack([self.centre, self.steps(), other]).astype(np.float32)
         made["kind"], made["seed"] = Kind.COPY, 0
@@ -90,11 +90,11 @@ class Recombination(Search):
         made["kind"][_ELITES:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
         made["a"][_ELITES:], made["b"][_ELITES:] = _CENTRE, _STEPS
         made["seed"][_ELITES:] = child // 2
-        return Asked(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
+        return Generation(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
 
-    def _tell(self, asked: Asked, scores: np.ndarray) -> None:
+    def _tell(self, asked: Generation, scores: np.ndarray) -> None:
         if not len(self.centre):  # begin with the best score, although groups met different episodes
-            self.begin_with(self.genomes(np.array([scores.argmax()]))[0])
+            self.start_from(self.genomes(np.array([scores.argmax()]))[0])
             return
         weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
         effective = 1.0 / float((weights**2).sum())  # mu_eff

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import Arrays, Asked, Search, SearchConfig, checked, ranks, recipes, split, tournaments
+from evolution.search.base import Arrays, Generation, Search, SearchConfig, checked, ranks, recipes, split, tournaments
 from evolution.search.breeding import Kind, Mutation
 
 PARENTS = 64  # size of the mating pool, which bounds what is broadcast
@@ -23,7 +23,7 @@ class TwoParents(Search):
         self.parents = np.zeros((0, spec.size), dtype=np.float32)  # the best first; elites, then the mating pool
         self.elites = 0  # rows of `parents` that are elites
 
-    def begin_with(self, genome: np.ndarray) -> None:
+    def start_from(self, genome: np.ndarray) -> None:
         self.elites = min(1, self.config.elites)
         self.parents = np.stack([genome] * (self.elites + 1)).astype(np.float32)
 
@@ -33,7 +33,7 @@ class TwoParents(Search):
     def candidates(self) -> np.ndarray:
         return self.parents[:1]
 
-    def _ask(self, key: int) -> Asked:
+    def _ask(self, key: int) -> Generation:
         config, rng = self.config, self._rng(1)
         n, pool = config.population, np.arange(self.elites, len(self.parents))
         made = recipes(n)
@@ -45,9 +45,9 @@ class TwoParents(Search):
         for name, values in (("kind", Kind.COPY), ("a", np.arange(self.elites)), ("b", 0)):
             made[name][: self.elites] = values
         groups = split(n, config.groups)
-        return Asked(self.parents, made, key, Mutation(config.mutation_rate, config.sigma), groups)
+        return Generation(self.parents, made, key, Mutation(config.mutation_rate, config.sigma), groups)
 
-    def _tell(self, asked: Asked, scores: np.ndarray) -> None:
+    def _tell(self, asked: Generation, scores: np.ndarray) -> None:
         standing = np.where(np.isneginf(scores), -1.0, ranks(scores, asked.groups))
         best = np.argsort(-standing, kind="stable")[: self.config.elites]
         winners = tournaments(standing, self.config.tournament, PARENTS, self._rng(2))

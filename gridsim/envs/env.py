@@ -319,7 +319,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         state, table = self.simulator.state, self._observer.table
         m = int(state.maps[i])
         view = self._views.get(m)
-        if view is None or view.scenario is not self.simulator.scenarios[m]:
+        if view is None or view.road_map is not self.simulator.scenarios[m]:
             view = self._views[m] = Renderer(self.simulator.scenarios[m], RENDER_SIZE, config=self.config)
         others = state.worlds[i][state.worlds[i][:, LANE] >= 0.0]
         speed, distance = float(state.cars[i, SPEED]), float(state.cars[i, DISTANCE])

@@ -13,7 +13,7 @@ from gridsim.counter import GOLDEN, mix
 from gridsim.jit import njit
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
-from gridsim.maps.scenarios import build, is_map_file, map_of
+from gridsim.maps.scenarios import build, is_map_file, seed_of_map
 
 _U = np.uint64
 #: The maps that environments of this process were built for, as long as one of them has them.
@@ -103,7 +103,7 @@ class Episodes:
 
     def _map(self, seed: int) -> int:
         """Index among `maps` of the map of a seed, built where it is not there yet."""
-        seed = map_of(self.scenario, seed)
+        seed = seed_of_map(self.scenario, seed)
         if seed not in self._index:
             self.maps.append(shared_map(self.scenario, seed, self.config))
             self._index[seed] = len(self.maps) - 1

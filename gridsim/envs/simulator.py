@@ -18,7 +18,7 @@ from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
 from gridsim.maps.roads import VISIT_CELL, Road
-from gridsim.sensing.rays import LANES, fan
+from gridsim.sensing.rays import SIMD_RAYS, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic.world import check_worlds, spawn
@@ -43,7 +43,7 @@ def _place_some(road, constants, fan, order, which, starts, cars, visits, worlds
 @njit(nogil=True)
 def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
-    beams = np.empty((3, LANES), dtype=np.float32)
+    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
         road = road_of(atlas, row)
         _place_some(
@@ -120,7 +120,7 @@ def _control_all(
 
     Cars are taken in `order`; runs int64 [maps, 3] says which map of the atlas a stretch of it is on: row, from, to.
     """
-    beams = np.empty((3, LANES), dtype=np.float32)
+    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
         _control_some(
             road_of(atlas, row),
@@ -378,7 +378,7 @@ class Simulator:
 
 @njit(nogil=True)
 def _views(road, constants, fan, cars, worlds, ranges):
-    beams = np.empty((3, LANES), dtype=np.float32)
+    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for i in range(cars.shape[0]):
         look(road, constants, fan, cars[i], worlds[i], beams, ranges[i], None)
 

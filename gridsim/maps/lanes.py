@@ -35,7 +35,7 @@ def end_of(path: Path) -> tuple[float, float, float]:
     """Pose (m, m, rad) where a path ends."""
     pose = path[:3]
     for length, curvature in path.pieces:
-        pose = _on(*pose, length, curvature)
+        pose = _pose_after(*pose, length, curvature)
     return pose
 
 
@@ -47,7 +47,7 @@ def beside(path: Path, offset: float) -> list[Path]:
         scale = 1.0 - offset * curvature
         piece = (length * scale, curvature / scale)
         result.append(Path(x - offset * math.sin(heading), y + offset * math.cos(heading), heading, (piece,)))
-        pose = _on(x, y, heading, length, curvature)
+        pose = _pose_after(x, y, heading, length, curvature)
     return result
 
 
@@ -75,7 +75,7 @@ def strips_along(path: Path, half_width: float) -> Strips:
     lines, arcs = [], []
     for length, curvature in path.pieces:
         x, y, heading = pose
-        pose = _on(x, y, heading, length, curvature)
+        pose = _pose_after(x, y, heading, length, curvature)
         if curvature == 0.0:
             lines.append([x, y, pose[0], pose[1], half_width])
         else:
@@ -99,7 +99,7 @@ def through_square(turn: int, half: float, offset: float) -> tuple[tuple[float, 
 
 
 @njit
-def _on(x, y, heading, length, curvature):
+def _pose_after(x, y, heading, length, curvature):
     """Pose after so many metres of constant curvature."""
     half = 0.5 * length * curvature
     chord = length * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
@@ -117,11 +117,11 @@ def _sample(starts, pieces, piece_offsets, steps, offsets):
         for i in range(offsets[lane + 1] - offsets[lane]):
             s = i * steps[lane]
             while piece < last and s > passed + pieces[piece, 0]:
-                x, y, heading = _on(x, y, heading, pieces[piece, 0], pieces[piece, 1])
+                x, y, heading = _pose_after(x, y, heading, pieces[piece, 0], pieces[piece, 1])
                 passed += pieces[piece, 0]
                 piece += 1
             # One by one: an assignment of slices takes two seconds to compile.
-            end_x, end_y, end_heading = _on(x, y, heading, s - passed, pieces[piece, 1])
+            end_x, end_y, end_heading = _pose_after(x, y, heading, s - passed, pieces[piece, 1])
             ends[lane, 0], ends[lane, 1], ends[lane, 2] = end_x, end_y, end_heading
             points[offsets[lane] + i, 0], points[offsets[lane] + i, 1] = end_x, end_y
     return points, ends

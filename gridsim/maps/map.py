@@ -150,19 +150,19 @@ def _starts_at(points, mileage, shares, speed, starts):
         starts[k, 2], starts[k, 3], starts[k, 4] = math.atan2(dy, dx), speed, 0.0
 
 
-def starts_at(scenario: Map, shares: np.ndarray) -> np.ndarray:
+def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
     """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
 
     A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it. Of a map
     without lanes, the starts at these shares of `Map.starts`.
     """
-    if not len(scenario.lanes):
-        return scenario.starts[(np.asarray(shares) * len(scenario.starts)).astype(np.intp)]
+    if not len(road_map.lanes):
+        return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(freeze(scenario.lanes.points), scenario.mileage, shares, np.float32(START_SPEED), starts)
+    _starts_at(freeze(road_map.lanes.points), road_map.mileage, shares, np.float32(START_SPEED), starts)
     return starts
 
 
-def sample_starts(scenario: Map, count: int, rng: np.random.Generator) -> np.ndarray:
+def sample_starts(road_map: Map, count: int, rng: np.random.Generator) -> np.ndarray:
     """Starts float32 [count, 5] uniformly over the lanes, as `starts_at` gives them."""
-    return starts_at(scenario, rng.random(count))
+    return starts_at(road_map, rng.random(count))

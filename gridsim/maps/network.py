@@ -178,14 +178,14 @@ def wrapped(difference, side):
 
 
 @leaf
-def away(difference, side):
+def torus_distance(difference, side):
     """How far that is, either way."""
     size = abs(difference)
     return min(size, side - size)
 
 
 @leaf
-def turned(difference, side):
+def wrapped_any(difference, side):
     """The same for any difference: lanes' points are not wrapped."""
     # NumPy's floor is a float32; that of `math` is an int64, whose product with a float32 is a float64.
     return difference - np.floor(difference / side + _HALF) * side

@@ -105,7 +105,7 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
 # ----------------------------------------------------------------------------------------------------- the starts
 
 
-def _at(nodes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _clearance_at(nodes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Clearance (m) at points, as kernels read it."""
     grid = [np.asarray(y) * CELLS_PER_M, np.asarray(x) * CELLS_PER_M]
     return ndimage.map_coordinates(nodes, grid, order=1, mode="grid-wrap")
@@ -118,14 +118,14 @@ def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: 
     u, v = (points.ravel() for points in np.meshgrid(along, across))
     x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
     c, s = np.cos(heading), np.sin(heading)
-    return np.all(_at(nodes, x + u * c - v * s, y + u * s + v * c) >= 0.0, axis=1)
+    return np.all(_clearance_at(nodes, x + u * c - v * s, y + u * s + v * c) >= 0.0, axis=1)
 
 
-def _straight(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, reach: float) -> np.ndarray:
+def _way_ahead(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, reach: float) -> np.ndarray:
     """How far (m, `reach` at most) a car could go straight on from poses [n, 3]: float64 [n]."""
     steps = np.arange(1, round(reach / _NODE) + 1) * _NODE
     x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
-    free = _at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading)) >= vehicle.width / 2
+    free = _clearance_at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading)) >= vehicle.width / 2
     return np.where(free.all(axis=1), reach, np.argmin(free, axis=1) * _NODE)
 
 
@@ -152,20 +152,20 @@ def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig
     ways = np.empty((len(points), len(angles)))
     for k, angle in enumerate(angles):
         there, back = (np.column_stack([points, np.full(len(points), angle + turn)]) for turn in (0.0, math.pi))
-        ways[:, k] = np.minimum(_straight(nodes, there, vehicle, 50.0), _straight(nodes, back, vehicle, 50.0))
+        ways[:, k] = np.minimum(_way_ahead(nodes, there, vehicle, 50.0), _way_ahead(nodes, back, vehicle, 50.0))
     return angles[np.argmax(ways, axis=1)]
 
 
-def _longest(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
+def _widest_heading(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
     """The heading (rad) with the longest way straight on from a pose's point, amid those that are like it."""
     headings = np.arange(72) * math.pi / 36
-    ways = _straight(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
+    ways = _way_ahead(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
     best = int(np.argmax(ways))
     sector = best + np.arange(-6, 7)
     return float((sector * math.pi / 36)[ways[sector % 72] >= 0.9 * ways[best]].mean())
 
 
-def _parts(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Connected parts: labels of nodes, 0 is none, and the part of each label; over the sides of the field as well."""
     labels, count = ndimage.label(wide)
     seams = np.concatenate([np.stack([labels[0], labels[-1]]), np.stack([labels[:, 0], labels[:, -1]])], axis=1)
@@ -177,7 +177,7 @@ def _parts(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def road_length(nodes: np.ndarray) -> float:
     """About how many m of road hang together: the largest part's area over its width. Within 10 % for a ring."""
     road = nodes > 0.0
-    labels, group = _parts(road)
+    labels, group = _components(road)
     middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
     area = np.bincount(group[labels[road]]) * _NODE**2
     part = group[labels[middle]]
@@ -187,14 +187,14 @@ def road_length(nodes: np.ndarray) -> float:
 
 def _large(wide: np.ndarray) -> np.ndarray:
     """Which nodes belong to a connected part that extends some tens of metres; over the sides of the field as well."""
-    labels, group = _parts(wide)
+    labels, group = _components(wide)
     boxes = ndimage.find_objects(labels)
     size = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
     extent = np.bincount(group, weights=size)
     return wide & (extent[group] >= _EXTENT)[labels]
 
 
-def _evenly(items: np.ndarray, count: int) -> np.ndarray:
+def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
     """So many of the items at most, evenly over their order."""
     return items[np.linspace(0, len(items) - 1, count).round().astype(int)] if len(items) > count else items
 
@@ -216,17 +216,17 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     row, column = np.nonzero(ridge & (coherence >= _COHERENCE))
     along = np.column_stack([column * _NODE, row * _NODE, angle[row, column]])
     row, column = np.nonzero(ridge)
-    points = _evenly(np.column_stack([column, row]) * _NODE, _STARTS)
+    points = _spread_sample(np.column_stack([column, row]) * _NODE, _STARTS)
     choices: tuple[Callable[[], np.ndarray], ...] = (
-        lambda: _evenly(along, 4 * _STARTS),
+        lambda: _spread_sample(along, 4 * _STARTS),
         lambda: np.column_stack([points, _open_headings(nodes, points, vehicle)]),
     )
     for choice in choices:
         ahead = choice()
         poses = np.concatenate([ahead, ahead + _BACK])
-        poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & (_straight(nodes, poses, vehicle, _AHEAD) >= _AHEAD)]
+        poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & (_way_ahead(nodes, poses, vehicle, _AHEAD) >= _AHEAD)]
         if len(poses):
-            return _evenly(poses, _STARTS)
+            return _spread_sample(poses, _STARTS)
     raise ValueError(
         f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
         f"check the resolution and what is bright"
@@ -245,9 +245,11 @@ def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig
         inside = bool((pose[:2] >= 0.0).all() and (pose[:2] < size).all())
         if inside and math.isnan(pose[2]):
             column, row = (pose[:2] * CELLS_PER_M).round().astype(int) % nodes.shape[::-1]
-            pose[2] = angle[row, column] if coherence[row, column] >= _COHERENCE else _longest(nodes, pose, vehicle)
+            pose[2] = (
+                angle[row, column] if coherence[row, column] >= _COHERENCE else _widest_heading(nodes, pose, vehicle)
+            )
             ways = np.array([pose, pose + _BACK])
-            pose[:] = ways[np.argmax(_straight(nodes, ways, vehicle, 50.0))]
+            pose[:] = ways[np.argmax(_way_ahead(nodes, ways, vehicle, 50.0))]
         if not inside or not _fits(nodes, pose[None], vehicle, _TOUCH)[0]:
             raise ValueError(
                 f"starts: at {pose[0]:g} m, {pose[1]:g} m from the lower left corner a car is not all on the road"

@@ -29,7 +29,7 @@ THIN_WALL = 3.0  # m: a plain ray may pass what is thinner
 MEMORY_LIMIT_CELLS = 1 << 24  # nodes of a field; above this a map is refused
 
 _F, _I, _U = np.float32, np.int32, np.uint32
-_LANES = 16  # cones of the ray start table that are marched side by side
+_SIMD_CONES = 16  # cones of the ray start table that are marched side by side
 
 
 class Road(NamedTuple):
@@ -256,7 +256,7 @@ def _ray_starts(nodes, columns, rows, ray_range):
     turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
     turn_y = _F(rows * math.ceil(ray_range * CELLS_PER_M / rows) + 0.5)
     # Cones are marched side by side, so that the inner loop becomes vector code; finished ones do not move.
-    cones = (HEADING_BINS + _LANES - 1) // _LANES * _LANES
+    cones = (HEADING_BINS + _SIMD_CONES - 1) // _SIMD_CONES * _SIMD_CONES
     c, s = np.empty(cones, dtype=np.float32), np.empty(cones, dtype=np.float32)
     for b in range(cones):
         angle = (b + 0.5) * 2.0 * math.pi / HEADING_BINS
@@ -269,11 +269,11 @@ def _ray_starts(nodes, columns, rows, ray_range):
                 continue
             x, y = _F((i + 0.5) * k) + turn_x, _F((j + 0.5) * k) + turn_y
             t[:] = _F(0.0)
-            for first in range(0, cones, _LANES):
+            for first in range(0, cones, _SIMD_CONES):
                 going = _I(1)
                 while going:
                     going = _I(0)
-                    for b in range(first, first + _LANES):
+                    for b in range(first, first + _SIMD_CONES):
                         # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
                         column = _I(x + t[b] * c[b]) & mask_x
                         line = _I(y + t[b] * s[b]) & mask_y

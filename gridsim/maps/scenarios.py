@@ -77,7 +77,7 @@ def speed_interval(name: str) -> tuple[float, float]:
     return REGISTRY[name].speed_interval if name in REGISTRY else FILE_SPEEDS
 
 
-def map_of(name: str, seed: int) -> int:
+def seed_of_map(name: str, seed: int) -> int:
     """The seed that stands for the map of a seed: a file has one map."""
     return 0 if is_map_file(name) else seed
 

@@ -20,32 +20,46 @@ from gridsim.car.vehicle import act, path_curvature
 from gridsim.config import LANE_CHANGE_PERIOD, Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.map import Map
-from gridsim.maps.network import lane_length, turned, wrapped
+from gridsim.maps.network import lane_length, wrapped, wrapped_any
 from gridsim.maps.roads import VISIT_CELL, freeze
 from gridsim.reference.routes import ReferenceConfig, Route, plan
-from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, follow, horizon, idm
-from gridsim.traffic.world import AFTER, ALONG, CLOCK, FACTOR, GAP, HORIZON, LANE, LEAD, NEXT, PACE, PAST, PERMIT, SHIFT
+from gridsim.traffic.behaviour import Drivers, change_lanes, drivers, flow, horizon, idm, update_gap
+from gridsim.traffic.world import (
+    ACCELERATION,
+    ALONG,
+    GAP,
+    HORIZON,
+    JUNCTION_BEHIND,
+    LANE,
+    LANE_TIMER,
+    LEAD_SPEED,
+    NEXT,
+    PERMIT,
+    SECOND_NEXT,
+    SHIFT,
+    SPEED_FACTOR,
+)
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE, _TWO = _F(0.0), _F(0.5), _F(1.0), _F(2.0)
 
 # What the driver keeps in mind of a drive, float64.
 POINT = 0  # index of the route's point behind the car
-OWED = 1  # rad of heading that its actions have not yet given
+HEADING_OWED = 1  # rad of heading that its actions have not yet given
 RAIL = 2  # which of the lanes abreast it is on
-BLEND = 3  # m to the left of that rail it still aims at, while it changes lanes
-LEFT_RAIL = 4  # the rail it comes from
-FIELDS_KEPT = 5
+RAIL_OFFSET = 3  # m to the left of that rail it still aims at, while it changes lanes
+OLD_RAIL = 4  # the rail it comes from
+MEMORY_FIELDS = 5
 
 _CAUTION = 0.3  # m, on every side of a car that waits
-_KEEP = _F(2.5)  # m before where paths meet at which it waits
-_NUDGE = _F(2.0)  # m of these that it then uses, bit by bit
-_BORED = _F(8.0)  # control steps of standing after which it moves up a bit, so as not to be idle
-_LEAD_TIME = _F(1.0)  # s that it must be first there to go first
-_USUAL = _F(4.0)  # m/s that another car may soon go
-_SLOW = _F(0.2)  # m/s below which another car waits
-_FIRM = _F(5.0)  # m/s2 of braking that it counts on
-_ASIDE = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
+_STOP_BEFORE = _F(2.5)  # m before where paths meet at which it waits
+_CREEP = _F(2.0)  # m of these that it then uses, bit by bit
+_CREEP_AFTER = _F(8.0)  # control steps of standing after which it moves up a bit, so as not to be idle
+_GO_FIRST_TIME = _F(1.0)  # s that it must be first there to go first
+_LIKELY_SPEED = _F(4.0)  # m/s that another car may soon go
+_WAITING_SPEED = _F(0.2)  # m/s below which another car waits
+_FIRM_BRAKING = _F(5.0)  # m/s2 of braking that it counts on
+_CROSSING_MARGIN = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
 
 
 class Conflicts(NamedTuple):
@@ -65,7 +79,7 @@ class Tuning(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Drive:
+class ReferenceDrive:
     """An episode of the reference driver: its states before each of n control periods, and how it ended.
 
     Attributes:
@@ -107,8 +121,8 @@ def _find_conflicts(network, half_length, half_width, enter, free):
                 length = math.hypot(ux, uy)
                 ux, uy = ux / length, uy / length
                 for q in range(network.offsets[other], network.offsets[other + 1] - 1):
-                    dx = turned(network.points[q, 0] - network.points[p, 0], network.width)
-                    dy = turned(network.points[q, 1] - network.points[p, 1], network.height)
+                    dx = wrapped_any(network.points[q, 0] - network.points[p, 0], network.width)
+                    dy = wrapped_any(network.points[q, 1] - network.points[p, 1], network.height)
                     if abs(dx * ux + dy * uy) < half_length and abs(dy * ux - dx * uy) < half_width:
                         vx = network.points[q + 1, 0] - network.points[q, 0]
                         vy = network.points[q + 1, 1] - network.points[q, 1]
@@ -132,9 +146,9 @@ def _find_meetings(network, enter, meet):
                     meet[c] = enter[back]
 
 
-def conflicts(scenario: Map, sim: SimConfig) -> Conflicts:
+def conflicts(road_map: Map, sim: SimConfig) -> Conflicts:
     """Where the lanes of a map meet."""
-    network, vehicle = scenario.network, sim.vehicle
+    network, vehicle = road_map.network, sim.vehicle
     enter, meet = np.zeros_like(network.clear), np.zeros_like(network.clear)
     free = network.clear.copy()
     # A car that stands further back leaves the others room for half their width, and for caution.
@@ -172,8 +186,8 @@ def _progress(network, route, rail, k, x, y):
         ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
         uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
         length = max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-        dx = turned(x - route.points[rail, k, 0], network.width)
-        dy = turned(y - route.points[rail, k, 1], network.height)
+        dx = wrapped_any(x - route.points[rail, k, 0], network.width)
+        dy = wrapped_any(y - route.points[rail, k, 1], network.height)
         along = (dx * ux + dy * uy) / length
         if along <= length or k >= last:
             return k, route.arc[rail, k] + along, (dy * ux - dx * uy) / length
@@ -192,8 +206,8 @@ def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
     ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
     uy = route.points[rail, k + 1, 1] - route.points[rail, k, 1]
     norm = blend / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
-    dx = turned(x - norm * uy - car[X], network.width)
-    dy = turned(y + norm * ux - car[Y], network.height)
+    dx = wrapped_any(x - norm * uy - car[X], network.width)
+    dy = wrapped_any(y + norm * ux - car[Y], network.height)
     forward, left = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
     distance = max(math.sqrt(forward * forward + left * left), _F(0.1))
     tangent = (left / distance) / max(distance / (_TWO * constants.rear_axle) + forward / distance, _F(0.1))
@@ -233,14 +247,14 @@ def _choose_action(constants, car, curvature, acceleration, owed):
 
 
 @leaf
-def _seat(network, route, rail, m, s, car, me):
+def _as_traffic_car(network, route, rail, m, s, car, me):
     """Write the ego car down as a traffic car on lane m of a rail, s m along it."""
     last = _I(route.lanes.shape[1] - 1)
     me[X], me[Y], me[COS], me[SIN], me[SPEED] = car[X], car[Y], car[COS], car[SIN], max(car[SPEED], _ZERO)
-    me[PAST], me[PERMIT] = -_ONE, -_ONE
+    me[JUNCTION_BEHIND], me[PERMIT] = -_ONE, -_ONE
     me[LANE] = route.lanes[rail, m]
     me[NEXT] = route.lanes[rail, min(m + _I(1), last)]
-    me[AFTER] = route.lanes[rail, min(m + _I(2), last)]
+    me[SECOND_NEXT] = route.lanes[rail, min(m + _I(2), last)]
     length = lane_length(network, _I(me[LANE]))
     me[ALONG] = min(max(s - route.arc[rail, route.offsets[m]], _ZERO), length)
 
@@ -251,12 +265,12 @@ def _give_way(network, conflicts, drivers, me, world):
     speed, allowed, least = me[SPEED], drivers.acceleration, _F(1e9)
     ahead = -me[ALONG]  # m to the beginning of the lane
     for turn in range(3):
-        lane = _I(me[LANE] if turn == 0 else (me[NEXT] if turn == 1 else me[AFTER]))
+        lane = _I(me[LANE] if turn == 0 else (me[NEXT] if turn == 1 else me[SECOND_NEXT]))
         if ahead > me[HORIZON]:
             break
         for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
-            way = ahead + conflicts.enter[c] - _KEEP
-            if way < -_NUDGE or way > me[HORIZON]:
+            way = ahead + conflicts.enter[c] - _STOP_BEFORE
+            if way < -_CREEP or way > me[HORIZON]:
                 continue  # in the middle of it one goes on
             other = network.crossings[c]
             for j in range(world.shape[0]):
@@ -266,7 +280,7 @@ def _give_way(network, conflicts, drivers, me, world):
                     at = world[j, ALONG]
                 elif _I(world[j, PERMIT]) == other:
                     at = world[j, ALONG] - lane_length(network, _I(world[j, LANE]))
-                elif _I(world[j, PAST]) == other:
+                elif _I(world[j, JUNCTION_BEHIND]) == other:
                     at = world[j, ALONG] + lane_length(network, other)
                 else:
                     continue
@@ -274,13 +288,13 @@ def _give_way(network, conflicts, drivers, me, world):
                 if rest <= _ZERO:
                     continue
                 time = rest / max(world[j, SPEED], _HALF)
-                stops = speed * speed < _TWO * _FIRM * way  # it still can, should the other one not go on
+                stops = speed * speed < _TWO * _FIRM_BRAKING * way  # it still can, should the other one not go on
                 if stops and speed * (time + _HALF) < way:
                     continue  # it has gone by then
-                if world[j, SPEED] < _SLOW and speed < _ONE:
+                if world[j, SPEED] < _WAITING_SPEED and speed < _ONE:
                     continue  # it waits, for the ego car perhaps
-                before = (conflicts.meet[c] - at) / max(world[j, SPEED], _USUAL)
-                if way / max(speed, _ONE) + _LEAD_TIME < before:
+                before = (conflicts.meet[c] - at) / max(world[j, SPEED], _LIKELY_SPEED)
+                if way / max(speed, _ONE) + _GO_FIRST_TIME < before:
                     continue  # it comes later, and brakes for the ego car
                 if way < _ZERO or not stops:
                     slower = -drivers.braking
@@ -292,7 +306,7 @@ def _give_way(network, conflicts, drivers, me, world):
 
 
 @leaf
-def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others):
+def _adapt_to_traffic(network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others):
     """The acceleration (m/s2) that the other cars leave of a wanted one, and a change of lanes where it pays."""
     n = _I(world.shape[0])
     me, nobody = others[n], others[n + 1]
@@ -303,42 +317,42 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
         for field in range(world.shape[1]):
             others[j, field] = world[j, field]
     me[HORIZON] = horizon(drivers, speed)
-    me[GAP], me[LEAD], me[SHIFT] = _F(1e9), _ZERO, _F(memory[BLEND])
+    me[GAP], me[LEAD_SPEED], me[SHIFT] = _F(1e9), _ZERO, _F(memory[RAIL_OFFSET])
     touch = _F(1e9)  # m to where another car is in the way
     for side in range(2):
-        if side == 0 and memory[BLEND] == 0.0:
+        if side == 0 and memory[RAIL_OFFSET] == 0.0:
             continue  # only who changes lanes minds the one it comes from too
-        on = rail if side == 1 else _I(memory[LEFT_RAIL])
-        _seat(network, route, on, m, s, car, me)
+        on = rail if side == 1 else _I(memory[OLD_RAIL])
+        _as_traffic_car(network, route, on, m, s, car, me)
         for j in range(n):
             if world[j, LANE] >= _ZERO:
                 dx, dy = wrapped(world[j, X] - car[X], network.width), wrapped(world[j, Y] - car[Y], network.height)
                 if math.sqrt(dx * dx + dy * dy) - _F(5.0) < me[HORIZON]:
                     before = me[GAP]
-                    follow(network, drivers, me, world[j], False)
+                    update_gap(network, drivers, me, world[j], False)
                     along = me[COS] * world[j, COS] + me[SIN] * world[j, SIN]
                     if me[GAP] < before:
                         touch = min(touch, me[GAP])
                         if along < _F(0.7):
-                            me[GAP] = max(me[GAP] - _ASIDE, drivers.half_length)
+                            me[GAP] = max(me[GAP] - _CROSSING_MARGIN, drivers.half_length)
     wish = max(bend, _ONE)
     if me[GAP] < _F(1e8):
-        acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD]))
+        acceleration = min(acceleration, idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD_SPEED]))
     allowed, way = _give_way(network, conflicts, drivers, me, world)
     acceleration = min(acceleration, allowed)
-    if car[IDLE] >= _BORED and way > -_NUDGE and touch > drivers.half_length + _F(0.1):
+    if car[IDLE] >= _CREEP_AFTER and way > -_CREEP and touch > drivers.half_length + _F(0.1):
         acceleration = drivers.acceleration  # standing too long is idleness in this world
     if route.lanes.shape[0] > 1:
         lane = _I(me[LANE])
         at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
-        me[FACTOR] = wish / network.speeds[at]
-        me[PACE] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD])
-        me[CLOCK] = _F(_I(car[STEPS]) % _I(LANE_CHANGE_PERIOD))
+        me[SPEED_FACTOR] = wish / network.speeds[at]
+        me[ACCELERATION] = idm(drivers, speed, wish, me[GAP] - drivers.half_length, me[LEAD_SPEED])
+        me[LANE_TIMER] = _F(_I(car[STEPS]) % _I(LANE_CHANGE_PERIOD))
         change_lanes(network, drivers, others, n, nobody)
         if _I(me[LANE]) != lane:
-            memory[LEFT_RAIL] = rail
+            memory[OLD_RAIL] = rail
             memory[RAIL] = rail + 1 if _I(me[LANE]) == network.right[lane] else rail - 1
-            memory[BLEND] = me[SHIFT]
+            memory[RAIL_OFFSET] = me[SHIFT]
     return acceleration
 
 
@@ -346,7 +360,7 @@ def _mind_others(network, conflicts, drivers, route, memory, k, s, car, bend, ac
 def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others):
     """The driver's action for one control period.
 
-    Args: what it keeps in mind float64 [FIELDS_KEPT], changed; `others` [cars + 2, world.FIELDS] is scratch, of which
+    Args: what it keeps in mind float64 [MEMORY_FIELDS], changed; `others` [cars + 2, world.FIELDS] is scratch, of which
     the last row is 0.
     """
     rail = _I(memory[RAIL])
@@ -357,14 +371,14 @@ def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, 
     bend = route.speeds[rail, to] + part * (route.speeds[rail, to + 1] - route.speeds[rail, to])
     acceleration = min(max((bend - speed) / constants.dt, -constants.braking), constants.acceleration)
     if world.shape[0] > 0:
-        acceleration = _mind_others(
+        acceleration = _adapt_to_traffic(
             network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others
         )  # fmt: skip
-    rail, blend = _I(memory[RAIL]), _F(memory[BLEND])
+    rail, blend = _I(memory[RAIL]), _F(memory[RAIL_OFFSET])
     curvature = _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
     way = drivers.shift * constants.dt
-    memory[BLEND] = blend - min(max(blend, -way), way)
-    action, memory[OWED] = _choose_action(constants, car, curvature, acceleration, _F(memory[OWED]))
+    memory[RAIL_OFFSET] = blend - min(max(blend, -way), way)
+    action, memory[HEADING_OWED] = _choose_action(constants, car, curvature, acceleration, _F(memory[HEADING_OWED]))
     return action
 
 
@@ -376,7 +390,7 @@ def _drive(
     cells = int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
     car, visits = np.empty(FIELDS, dtype=np.float32), np.empty(cells, dtype=np.float32)
     others = np.zeros((world.shape[0] + 2, world.shape[1]), dtype=np.float32)
-    memory = np.zeros(FIELDS_KEPT)
+    memory = np.zeros(MEMORY_FIELDS)
     memory[RAIL], memory[POINT] = route.rail, route.first
     place(road, start, car, visits)
     steps, end = 0, 0
@@ -397,8 +411,8 @@ def _drive(
 class ReferenceDriver:
     """Drives a batch of cars, each on a route of its own: `reset`, then `act` once each control period."""
 
-    def __init__(self, scenarios: Sequence[Map], sim: SimConfig | None = None, config: ReferenceConfig | None = None):
-        self.scenarios = scenarios
+    def __init__(self, road_maps: Sequence[Map], sim: SimConfig | None = None, config: ReferenceConfig | None = None):
+        self.road_maps = road_maps
         self.sim, self.config = sim or SimConfig(), config or ReferenceConfig()
         self._constants: Constants = constants(self.sim)
         self._traffic: Drivers = drivers(self.sim)
@@ -410,23 +424,23 @@ class ReferenceDriver:
         self._conflicts: dict[int, Conflicts] = {}
         self._maps = np.zeros(0, dtype=np.int64)
         self._routes: list[Route] = []
-        self._memory = np.zeros((0, FIELDS_KEPT))
+        self._memory = np.zeros((0, MEMORY_FIELDS))
 
     def reset(
         self, starts: np.ndarray, maps: np.ndarray | int, seeds: Sequence[int], length: float | None = None
     ) -> None:
-        """Begin drives at starts float32 [n, 5] on `scenarios[maps[k]]`, with turns at junctions from seeds [n].
+        """Begin drives at starts float32 [n, 5] on `road_maps[maps[k]]`, with turns at junctions from seeds [n].
 
         Routes are `length` m long, or as long as the target and a tenth.
         """
         length = 1.1 * self.sim.episode.target if length is None else length
         self._maps = np.broadcast_to(np.asarray(maps, dtype=np.int64), len(starts))
-        self._conflicts = {m: conflicts(self.scenarios[m], self.sim) for m in np.unique(self._maps).tolist()}
+        self._conflicts = {m: conflicts(self.road_maps[m], self.sim) for m in np.unique(self._maps).tolist()}
         self._routes = [
-            plan(self.scenarios[m], start, length, seed, self.config)
+            plan(self.road_maps[m], start, length, seed, self.config)
             for m, start, seed in zip(self._maps.tolist(), starts, seeds, strict=True)
         ]
-        self._memory = np.zeros((len(starts), FIELDS_KEPT))
+        self._memory = np.zeros((len(starts), MEMORY_FIELDS))
         self._memory[:, RAIL] = [route.rail for route in self._routes]
         self._memory[:, POINT] = [route.first for route in self._routes]
 
@@ -436,7 +450,7 @@ class ReferenceDriver:
         return np.array(
             [
                 _decide(
-                    self.scenarios[m].network, self._conflicts[m], self._constants, self._drivers, self._tuning,
+                    self.road_maps[m].network, self._conflicts[m], self._constants, self._drivers, self._tuning,
                     route, memory, car, world, others,
                 )
                 for m, route, memory, car, world in zip(
@@ -448,13 +462,13 @@ class ReferenceDriver:
 
     def drive(
         self,
-        scenario: Map,
+        road_map: Map,
         start: np.ndarray,
         world: np.ndarray,
         seed: int,
         target: float | None = None,
         max_steps: int | None = None,
-    ) -> Drive:
+    ) -> ReferenceDrive:
         """A whole episode from a start float32 [5] in the traffic float32 [cars, world.FIELDS] around it.
 
         Ends as `simulator.Simulator`'s episodes do; `target` (m) and `max_steps` are the configuration's unless given.
@@ -462,17 +476,17 @@ class ReferenceDriver:
         episode = self.sim.episode
         target = episode.target if target is None else target
         max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
-        found = conflicts(scenario, self.sim)
-        route = plan(scenario, start, 1.1 * target, seed, self.config)
+        found = conflicts(road_map, self.sim)
+        route = plan(road_map, start, 1.1 * target, seed, self.config)
         log = np.empty((max_steps, 8))
         car, steps, end = _drive(
-            scenario.road, scenario.network, found, self._constants, self._traffic,
+            road_map.road, road_map.network, found, self._constants, self._traffic,
             self._drivers, self._tuning, route,
             np.asarray(start, dtype=np.float32), np.float32(target), max_steps,
             np.array(world, dtype=np.float32), log,
         )  # fmt: skip
         log = log[:steps]
-        return Drive(
+        return ReferenceDrive(
             time=np.arange(steps) * episode.control_period,
             pose=log[:, :3].astype(np.float32),
             speed=log[:, 3].astype(np.float32),

@@ -170,7 +170,7 @@ def poses_of(states: np.ndarray) -> np.ndarray:
     return np.stack([states[:, X], states[:, Y], heading, states[:, SPEED], states[:, STEERING]], axis=1)
 
 
-def driven(poses: np.ndarray, scenario: Map) -> Driven:
+def driven(poses: np.ndarray, road_map: Map) -> Driven:
     """A drive's path from its poses [n, 5] at the control steps, as `poses_of` gives them.
 
     What was reversed, and as many metres after it, is left out: a reference only drives forward. So is standing, where
@@ -181,7 +181,7 @@ def driven(poses: np.ndarray, scenario: Map) -> Driven:
     poses = np.asarray(poses, dtype=np.float64)
     if poses.ndim != 2 or poses.shape[1] != 5 or not np.isfinite(poses).all():
         raise ValueError(f"a drive is finite poses [n, 5], not {poses.shape}")
-    points = unwrapped(poses[:, :2], float(scenario.road.width), float(scenario.road.height))
+    points = unwrapped(poses[:, :2], float(road_map.road.width), float(road_map.road.height))
     way = np.hypot(*np.diff(points, axis=0).T)
     forward = np.concatenate([[0.0], np.cumsum(np.where(poses[1:, 3] + poses[:-1, 3] < 0.0, -way, way))])
     furthest = np.maximum.accumulate(forward)
@@ -195,7 +195,7 @@ def driven(poses: np.ndarray, scenario: Map) -> Driven:
 
 
 def error_series(
-    path: Driven, scenario: Map, config: ReferenceConfig | None = None, sim: SimConfig | None = None
+    path: Driven, road_map: Map, config: ReferenceConfig | None = None, sim: SimConfig | None = None
 ) -> Series:
     """A drive beside the reference driver's profile along its path.
 
@@ -207,7 +207,7 @@ def error_series(
     where on the reference could not have stopped, since what it would have braked for there was not driven.
     """
     config = config or ReferenceConfig()
-    interval = float(scenario.road.speed_low), float(scenario.road.speed_high)
+    interval = float(road_map.road.speed_low), float(road_map.road.speed_high)
     found = profile(path.points, interval, float(path.speed[0]), config, sim)
     speed, steering = found.speed_at(path.arc), found.steering_at(path.arc)
     unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * config.braking) > path.arc[-1])
@@ -215,14 +215,14 @@ def error_series(
     return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
 
 
-def error_series_beside(path: Driven, recorded: Driven, scenario: Map, row: int = 0) -> tuple[Series, float]:
+def error_series_beside(path: Driven, recorded: Driven, road_map: Map, row: int = 0) -> tuple[Series, float]:
     """A drive beside a recorded one of which it began at point `row`, as far as it follows it.
 
     Each of the agent's places is compared with the recorded path's nearest further on. They part where the agent is
     more than APART beside that path, or TURNED; the TURN before it is left out, and what is after the recording's end.
     Returns: (the series, empty if nothing is left; m along the recording that the agent came).
     """
-    sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     points = path.points - np.round((path.points[0] - recorded.points[row]) / sides) * sides
     steps = np.diff(recorded.points, axis=0)
     k, last = min(row, len(steps) - 1), len(steps) - 1

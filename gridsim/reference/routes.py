@@ -147,10 +147,10 @@ def unwrapped(points: np.ndarray, width: float, height: float) -> np.ndarray:
     return np.concatenate([points[:1], points[0] + np.cumsum(step, axis=0)])
 
 
-def locate(scenario: Map, start: np.ndarray) -> tuple[int, float]:
+def locate(road_map: Map, start: np.ndarray) -> tuple[int, float]:
     """The lane that a start (x, y, heading, ...) is on, and the m along it: nearest in place and heading."""
-    lanes = scenario.lanes
-    sides = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    lanes = road_map.lanes
+    sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     ahead = np.diff(lanes.points.astype(np.float64), axis=0)
     away = np.asarray(start[:2], dtype=np.float64) - lanes.points[:-1]
     away -= np.round(away / sides) * sides
@@ -165,17 +165,17 @@ def locate(scenario: Map, start: np.ndarray) -> tuple[int, float]:
     return lane, float((point - lanes.offsets[lane] + part[point]) * lanes.steps[lane])
 
 
-def _abreast(scenario: Map, lane: int) -> list[int]:
+def _abreast(road_map: Map, lane: int) -> list[int]:
     """A lane and those beside it, from left to right."""
-    while scenario.lanes.left[lane] >= 0:
-        lane = int(scenario.lanes.left[lane])
+    while road_map.lanes.left[lane] >= 0:
+        lane = int(road_map.lanes.left[lane])
     row = [lane]
-    while scenario.lanes.right[row[-1]] >= 0:
-        row.append(int(scenario.lanes.right[row[-1]]))
+    while road_map.lanes.right[row[-1]] >= 0:
+        row.append(int(road_map.lanes.right[row[-1]]))
     return row
 
 
-def plan(scenario: Map, start: np.ndarray, length: float, seed: int, config: ReferenceConfig | None = None) -> Route:
+def plan(road_map: Map, start: np.ndarray, length: float, seed: int, config: ReferenceConfig | None = None) -> Route:
     """A route of so many m or more from a start float32 [5] on, with random turns at junctions.
 
     No scenario has a loop of lanes so short that what is driven again counts nothing, so that any turn will do.
@@ -183,20 +183,20 @@ def plan(scenario: Map, start: np.ndarray, length: float, seed: int, config: Ref
     Raises: ValueError on a map without lanes.
     """
     config = config or ReferenceConfig()
-    lanes = scenario.lanes
+    lanes = road_map.lanes
     if not len(lanes):
-        raise ValueError(f"the reference driver needs lanes; {scenario.name} has none")
+        raise ValueError(f"the reference driver needs lanes; {road_map.name} has none")
     rng = np.random.default_rng(np.random.SeedSequence([seed, 29]))
-    lane, along = locate(scenario, start)
+    lane, along = locate(road_map, start)
     chosen, ahead = [lane], float(lanes.lengths[lane]) - along
     while ahead < length or len(chosen) < 3:
         onward = lanes.successors[chosen[-1]]
         chosen.append(int(rng.choice(onward[onward >= 0])))
         ahead += float(lanes.lengths[chosen[-1]])
-    rows = np.array([_abreast(scenario, lane) for lane in chosen], dtype=np.int32).T
+    rows = np.array([_abreast(road_map, lane) for lane in chosen], dtype=np.int32).T
     rail = int(np.flatnonzero(rows[:, 0] == lane)[0])
     counts = np.diff(lanes.offsets)[rows[0]] - 1
-    sides = np.float64(scenario.road.width), np.float64(scenario.road.height)
+    sides = np.float64(road_map.road.width), np.float64(road_map.road.height)
     points = np.stack(
         [
             unwrapped(np.concatenate([*(lanes.lane(i)[:-1] for i in row), lanes.lane(row[-1])[-1:]]), *sides)
@@ -204,7 +204,7 @@ def plan(scenario: Map, start: np.ndarray, length: float, seed: int, config: Ref
         ]
     )
     arc = np.stack([_arc_length(rail_points) for rail_points in points])
-    top = top_speed((float(scenario.road.speed_low), float(scenario.road.speed_high)), config)
+    top = top_speed((float(road_map.road.speed_low), float(road_map.road.speed_high)), config)
     speeds = np.empty_like(arc)
     for r in range(len(rows)):
         curvature = np.abs(curvature_along(points[r], arc[r], config.window))

@@ -25,7 +25,7 @@ from gridsim.maps.roads import (
     START_CELLS_PER_M,
     START_UNITS,
 )
-from gridsim.sensing.simd import LANES, march_intrinsic
+from gridsim.sensing.simd import SIMD_RAYS, march_intrinsic
 
 _F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
 _SCALE = _F(CELLS_PER_M)
@@ -52,9 +52,9 @@ AMONG_THIN_WALLS = (24, _F(0.9), True)
 def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:
     """Directions of the rays from the heading: float32 [3, lanes] of cosine, sine, and bins from the first ray's.
 
-    `lanes` is count rounded up to whole blocks of LANES; a lane without a ray of its own repeats the last one.
+    `lanes` is count rounded up to whole blocks of SIMD_RAYS; a lane without a ray of its own repeats the last one.
     """
-    ray = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
+    ray = np.minimum(np.arange(-(-count // SIMD_RAYS) * SIMD_RAYS), count - 1)
     angle = first + step * ray
     bins = step * ray * HEADING_BINS / (2.0 * math.pi)
     table = np.stack([np.cos(angle), np.sin(angle), bins]).astype(np.float32)
@@ -64,14 +64,14 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
 
 @leaf
 def march(field, columns, rows, px0, py0, reach, beams, how):
-    """Move each of LANES rays from its start range to the edge of the road.
+    """Move each of SIMD_RAYS rays from its start range to the edge of the road.
 
-    Args: packed field with its sides; origin in cells; reach m; beams float32 [3, LANES]: direction x, direction y and
-    range, the start on entry and the result on return, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
+    Args: packed field with its sides; origin in cells; reach m; beams float32 [3, SIMD_RAYS]: direction x, direction
+    y and range, the start on entry and the result on return, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
     """
     steps, leap, look_back = how
     mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
-    for r in range(LANES):
+    for r in range(SIMD_RAYS):
         dx, dy, t = beams[0, r], beams[1, r], beams[2, r]
         safe = t  # m, up to which the way is known to be free, but for gaps
         for _ in range(steps):
@@ -134,7 +134,7 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
     """Ranges of all rays from a point, in m.
 
     Args: fan of `fan()`, first ray's angle from the heading (rad), reach m, position m, heading as cosine and sine;
-    beams float32 [3, LANES], overwritten.
+    beams float32 [3, SIMD_RAYS], overwritten.
     Writes: ranges float32 [rays], in [0, reach].
     """
     px0, py0 = x * _SCALE, y * _SCALE
@@ -150,8 +150,8 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
     known = _F(1.0 / START_UNITS) if row >= 0 else _F(0.0)
     rays = ranges.shape[0]
     # Unsigned indices: a signed one might count from the end, and that check would keep this from being vector code.
-    zero, one, two, lanes = _N(0), _N(1), _N(2), _N(LANES)
-    for block in range(0, fan.shape[1], LANES):
+    zero, one, two, lanes = _N(0), _N(1), _N(2), _N(SIMD_RAYS)
+    for block in range(0, fan.shape[1], SIMD_RAYS):
         at = _N(block)
         for r in range(lanes):
             beams[zero, r] = cosine * fan[zero, at + r] - sine * fan[one, at + r]
@@ -163,5 +163,5 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
             fast_march_thin(road.field, columns, road.rows, px0, py0, reach, beams)
         else:
             fast_march(road.field, columns, road.rows, px0, py0, reach, beams)
-        for r in range(min(rays - block, LANES)):
+        for r in range(min(rays - block, SIMD_RAYS)):
             ranges[block + r] = beams[2, r]

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
-LANES = 32
+SIMD_RAYS = 32
 
 
 def march_intrinsic(
@@ -33,7 +33,7 @@ def march_intrinsic(
 
     Without a gap steps are not looked back at, and no code for that is emitted.
 
-    beams float32 [3, LANES], C-contiguous: direction x, direction y, and the range, which is read and written.
+    beams float32 [3, SIMD_RAYS], C-contiguous: direction x, direction y, and the range, which is read and written.
     """
 
     @intrinsic
@@ -42,18 +42,18 @@ def march_intrinsic(
 
         def codegen(context, builder, sig, args):
             f32, i32 = ir.FloatType(), ir.IntType(32)
-            vf, vi = ir.VectorType(f32, LANES), ir.VectorType(i32, LANES)
+            vf, vi = ir.VectorType(f32, SIMD_RAYS), ir.VectorType(i32, SIMD_RAYS)
 
             def splat(value: ir.Value, vector: ir.VectorType) -> ir.Value:
                 single = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(i32, 0))
-                zeros = ir.Constant(ir.VectorType(i32, LANES), [0] * LANES)
+                zeros = ir.Constant(ir.VectorType(i32, SIMD_RAYS), [0] * SIMD_RAYS)
                 return builder.shuffle_vector(single, ir.Constant(vector, ir.Undefined), zeros)
 
             def const(value: float) -> ir.Constant:
-                return ir.Constant(vf, [value] * LANES)
+                return ir.Constant(vf, [value] * SIMD_RAYS)
 
             def iconst(value: int) -> ir.Constant:
-                return ir.Constant(vi, [value] * LANES)
+                return ir.Constant(vi, [value] * SIMD_RAYS)
 
             flags = ("contract", "nsz", "arcp")
 
@@ -74,11 +74,11 @@ def march_intrinsic(
             columns_v = splat(columns, vi)
             x0, y0, limit = splat(args[3], vf), splat(args[4], vf), splat(args[5], vf)
             floor_of = cgutils.get_or_insert_function(
-                builder.module, ir.FunctionType(vf, [vf]), f"llvm.floor.v{LANES}f32"
+                builder.module, ir.FunctionType(vf, [vf]), f"llvm.floor.v{SIMD_RAYS}f32"
             )
 
             def beam(k: int) -> ir.Value:
-                at = builder.gep(beams_data, [ir.Constant(i32, k * LANES)])
+                at = builder.gep(beams_data, [ir.Constant(i32, k * SIMD_RAYS)])
                 return builder.bitcast(at, vf.as_pointer())
 
             dx, dy = (builder.load(beam(k), align=4) for k in (0, 1))
@@ -101,7 +101,7 @@ def march_intrinsic(
             row = builder.and_(builder.fptosi(fy, vi), mask_y)
             index = builder.add(builder.mul(row, columns_v), column)
             word: ir.Value = ir.Constant(vi, ir.Undefined)
-            for lane in range(LANES):
+            for lane in range(SIMD_RAYS):
                 at = builder.extract_element(index, ir.Constant(i32, lane))
                 value = builder.load(builder.gep(field_data, [builder.zext(at, ir.IntType(64))]))
                 word = builder.insert_element(word, value, ir.Constant(i32, lane))
@@ -141,7 +141,7 @@ def march_intrinsic(
                 t_next = builder.select(builder.fcmp_ordered(">", t_next, safe_next), t_next, safe_next)
                 t_next = builder.select(blind, seen, t_next)
                 active = builder.or_(active, blind)
-            bits = ir.IntType(LANES)
+            bits = ir.IntType(SIMD_RAYS)
             any_active = builder.icmp_unsigned("!=", builder.bitcast(active, bits), ir.Constant(bits, 0))
             k_next = builder.add(k, one)
             more = builder.and_(any_active, builder.icmp_unsigned("<", k_next, ir.Constant(i32, steps)))

@@ -30,26 +30,26 @@ from gridsim.config import (
     constants,
 )
 from gridsim.jit import leaf, njit
-from gridsim.maps.network import away, is_junction, lane_length, turned, wrapped
-from gridsim.traffic.encounters import meets, moved_over, room_beside, runs_into
+from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
+from gridsim.traffic.encounters import meets_ego, room_to_right, shifted_right, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import (
-    AFTER,
+    ACCELERATION,
     ALONG,
-    CLOCK,
     COS,
-    FACTOR,
     GAP,
     HORIZON,
+    JUNCTION_BEHIND,
     LANE,
-    LEAD,
+    LANE_TIMER,
+    LEAD_SPEED,
     NEXT,
-    PACE,
-    PAST,
     PERMIT,
+    SECOND_NEXT,
     SHIFT,
     SIN,
     SPEED,
+    SPEED_FACTOR,
     X,
     Y,
     choose_lane,
@@ -133,7 +133,7 @@ def _ahead(network, car, other):
         return along - car[ALONG]
     if lane == car[NEXT]:
         return lane_length(network, _I(car[LANE])) - car[ALONG] + along
-    if lane == car[AFTER]:
+    if lane == car[SECOND_NEXT]:
         return lane_length(network, _I(car[LANE])) - car[ALONG] + lane_length(network, _I(car[NEXT])) + along
     return _F(1e9)
 
@@ -158,8 +158,8 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
             return _F(1e9)
         length = lane_length(network, lane)
         box = network.boxes[_N(lane)]
-        beside_x = abs(turned(box[0] - x, network.width)) - box[2]
-        beside_y = abs(turned(box[1] - y, network.height)) - box[3]
+        beside_x = abs(wrapped_any(box[0] - x, network.width)) - box[2]
+        beside_y = abs(wrapped_any(box[1] - y, network.height)) - box[3]
         if beside_x > reach_x or beside_y > reach_y:  # all of this lane is out of reach
             travelled += max(length - along, _ZERO)
             along = max(along, length)
@@ -172,8 +172,8 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
                 px, py = network.points[k, 0], network.points[k, 1]
                 aside_by = min(network.room[k], right + more * travelled)
                 if aside_by > _ZERO:
-                    px, py = moved_over(network, k, k + _N(1) if along + step <= length else k - _N(1), aside_by)
-                dx, dy = turned(px - x, network.width), turned(py - y, network.height)
+                    px, py = shifted_right(network, k, k + _N(1) if along + step <= length else k - _N(1), aside_by)
+                dx, dy = wrapped_any(px - x, network.width), wrapped_any(py - y, network.height)
                 forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < _ZERO:
@@ -185,12 +185,12 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
         if lane == _I(car[LANE]):
             lane = _I(car[NEXT])
         else:
-            lane = _I(car[AFTER])
+            lane = _I(car[SECOND_NEXT])
     return _F(1e9)
 
 
 @leaf
-def follow(network, drivers, car, other, is_ego):
+def update_gap(network, drivers, car, other, is_ego):
     """Take another car within a car's horizon into account: whether it is the nearest thing to keep behind."""
     along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
     at = _F(1e9)
@@ -204,30 +204,30 @@ def follow(network, drivers, car, other, is_ego):
         looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
     if not looked:
         near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
-        more = EGO_DODGE_SLOPE if is_ego and meets(network, car, other) else _ZERO
+        more = EGO_DODGE_SLOPE if is_ego and meets_ego(network, car, other) else _ZERO
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, more)
     if at < car[GAP]:
-        car[GAP], car[LEAD] = at, along
+        car[GAP], car[LEAD_SPEED] = at, along
     if is_ego and not looked and other[SPEED] > _ONE:
         if car[COS] * other[COS] + car[SIN] * other[SIN] <= _HALF:
-            at = runs_into(network, drivers, car, other)
+            at = way_to_ego_collision(network, drivers, car, other)
         elif forward > _ZERO:
             # Where the ego car will be in a second: it may be about to cut in.
             x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
             near = min(car[HORIZON], car[GAP])
             at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, _ZERO)
         if at < car[GAP]:
-            car[GAP], car[LEAD] = at, along
+            car[GAP], car[LEAD_SPEED] = at, along
 
 
 @leaf
-def _see(network, drivers, world, ego):
-    """Find for each car the nearest thing that it has to keep behind, within its horizon: GAP and LEAD."""
+def _find_gaps(network, drivers, world, ego):
+    """Find for each car the nearest thing that it has to keep behind, within its horizon: GAP and LEAD_SPEED."""
     cars = world.shape[0]
     for i in range(cars):
         speed = world[i, SPEED]
         world[i, HORIZON] = horizon(drivers, speed)
-        world[i, GAP], world[i, LEAD] = _F(1e9), _ZERO
+        world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
     ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
     for i in range(cars):
         if world[i, LANE] < _ZERO:
@@ -236,16 +236,16 @@ def _see(network, drivers, world, ego):
         for j in range(i):
             if world[j, LANE] < _ZERO:
                 continue
-            dx, dy = away(world[j, X] - x, network.width), away(world[j, Y] - y, network.height)
+            dx, dy = torus_distance(world[j, X] - x, network.width), torus_distance(world[j, Y] - y, network.height)
             squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _REACH
             if squared < far * far:
-                follow(network, drivers, world[i], world[j], False)
+                update_gap(network, drivers, world[i], world[j], False)
             if squared < other_far * other_far:
-                follow(network, drivers, world[j], world[i], False)
+                update_gap(network, drivers, world[j], world[i], False)
         if ego_is_there:
-            dx, dy = away(ego[X] - x, network.width), away(ego[Y] - y, network.height)
+            dx, dy = torus_distance(ego[X] - x, network.width), torus_distance(ego[Y] - y, network.height)
             if dx * dx + dy * dy < far * far:
-                follow(network, drivers, world[i], ego, True)
+                update_gap(network, drivers, world[i], ego, True)
 
 
 @leaf
@@ -253,17 +253,17 @@ def _desired(network, car):
     """Speed (m/s) that a car would like to go where it is."""
     lane = _N(_I(car[LANE]))
     at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-    return car[FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
+    return car[SPEED_FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
 
 
 @leaf
 def change_lanes(network, drivers, world, i, ego):
     """Move car i to a neighbouring lane if it is time to think of that, and if it is safe and the car gains by it."""
     car = world[i]
-    if car[CLOCK] > _ZERO:
-        car[CLOCK] -= _ONE
+    if car[LANE_TIMER] > _ZERO:
+        car[LANE_TIMER] -= _ONE
         return
-    car[CLOCK] = LANE_CHANGE_PERIOD - _ONE
+    car[LANE_TIMER] = LANE_CHANGE_PERIOD - _ONE
     lane = _I(car[LANE])
     if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
         _choose_neighbour(network, drivers, world, i, ego)
@@ -274,7 +274,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
     """MOBIL (Kesting et al. 2007). Not inlined: the call is rare, and dear for all the network's arguments."""
     car = world[i]
     lane = _I(car[LANE])
-    mine = car[PACE]
+    mine = car[ACCELERATION]
     best, gain = _I(-1), drivers.threshold
     for side in range(2):
         target = network.left[lane] if side == 0 else network.right[lane]
@@ -344,22 +344,22 @@ def _choose_neighbour(network, drivers, world, i, ego):
         k = _I(car[ALONG] / network.steps[best])
         dx = network.points[second + k, 0] - network.points[first + k, 0]
         dy = network.points[second + k, 1] - network.points[first + k, 1]
-        dx, dy = turned(dx, network.width), turned(dy, network.height)
+        dx, dy = wrapped_any(dx, network.width), wrapped_any(dy, network.height)
         car[SHIFT] = -toward * math.sqrt(dx * dx + dy * dy)
         car[LANE] = _F(best)
         car[NEXT] = _F(choose_lane(network, best, car))
-        car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
+        car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
 
 
 @leaf
-def _go(network, drivers, car, ego):
+def _move(network, drivers, car, ego):
     """Move one car by its acceleration for a control period, and to the right or back by how it meets the ego car."""
-    after = max(car[SPEED] + car[PACE] * drivers.dt, _ZERO)
+    after = max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
     car[ALONG] += _HALF * (car[SPEED] + after) * drivers.dt
     car[SPEED] = after
     sway, place = _ZERO, _ZERO
-    if meets(network, car, ego):
-        place = -room_beside(network, car)
+    if meets_ego(network, car, ego):
+        place = -room_to_right(network, car)
     if car[SHIFT] != place:
         slide = min(drivers.shift * drivers.dt, abs(car[SHIFT] - place)) * min(after, _ONE)
         if car[SHIFT] > place:
@@ -373,12 +373,12 @@ def _go(network, drivers, car, ego):
     if car[ALONG] >= length:
         lane = _I(car[LANE])
         car[ALONG] -= length
-        car[PAST] = car[LANE] if is_junction(network, lane) else -_ONE
-        car[LANE], car[NEXT] = car[NEXT], car[AFTER]
+        car[JUNCTION_BEHIND] = car[LANE] if is_junction(network, lane) else -_ONE
+        car[LANE], car[NEXT] = car[NEXT], car[SECOND_NEXT]
         car[PERMIT] = -_ONE
-        car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
-    elif car[PAST] >= _ZERO and car[ALONG] > drivers.half_length + _ONE:
-        car[PAST] = -_ONE
+        car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
+    elif car[JUNCTION_BEHIND] >= _ZERO and car[ALONG] > drivers.half_length + _ONE:
+        car[JUNCTION_BEHIND] = -_ONE
     set_pose(network, car, sway)
 
 
@@ -390,14 +390,14 @@ def flow(network, drivers, world, ego):
     it is not there).
     """
     cars = world.shape[0]
-    _see(network, drivers, world, ego)
+    _find_gaps(network, drivers, world, ego)
     for i in range(cars):
         car = world[i]
         if car[LANE] < _ZERO:
             continue
         lane, onward = _I(car[LANE]), _I(car[NEXT])
         desired = _desired(network, car)
-        pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD])
+        pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED])
         if is_junction(network, onward) and car[PERMIT] != car[NEXT]:
             # A junction comes: up to its line without a permit.
             line = lane_length(network, lane) - car[ALONG] - drivers.half_length
@@ -406,10 +406,10 @@ def flow(network, drivers, world, ego):
                     car[PERMIT] = car[NEXT]
                 else:
                     pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - STOP_LINE_GAP, _ZERO))
-        car[PACE] = pace
+        car[ACCELERATION] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
             change_lanes(network, drivers, world, i, ego)
     for i in range(cars):
         if world[i, LANE] >= _ZERO:
-            _go(network, drivers, world[i], ego)
+            _move(network, drivers, world[i], ego)

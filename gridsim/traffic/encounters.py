@@ -18,16 +18,16 @@ from gridsim.config import (
     SAME_WAY_COSINE,
 )
 from gridsim.jit import leaf, njit
-from gridsim.maps.network import lane_length, turned, wrapped
+from gridsim.maps.network import lane_length, wrapped, wrapped_any
 from gridsim.sensing.boxes import boxes_touch
-from gridsim.traffic.world import AFTER, ALONG, COS, LANE, NEXT, SHIFT, SIN, SPEED, X, Y
+from gridsim.traffic.world import ALONG, COS, LANE, NEXT, SECOND_NEXT, SHIFT, SIN, SPEED, X, Y
 
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 
 @leaf
-def meets(network, car, ego):
+def meets_ego(network, car, ego):
     """Whether the ego car, not far ahead, comes towards a car or crosses its way."""
     if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE:
         return False
@@ -36,7 +36,7 @@ def meets(network, car, ego):
 
 
 @leaf
-def room_beside(network, car):
+def room_to_right(network, car):
     """M to the right that a car can move over where it is."""
     lane = _N(_I(car[LANE]))
     at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
@@ -44,7 +44,7 @@ def room_beside(network, car):
 
 
 @leaf
-def moved_over(network, k, other, right):
+def shifted_right(network, k, other, right):
     """Point k of a lane (m), moved to the right; other is a neighbour of k, before or after it on the lane."""
     one, two = max(k, other), min(k, other)
     x, y = network.points[k, 0], network.points[k, 1]
@@ -54,7 +54,7 @@ def moved_over(network, k, other, right):
 
 
 @njit(_nrt=False)
-def runs_into(network, drivers, car, ego):
+def way_to_ego_collision(network, drivers, car, ego):
     """M from a car's middle along its path to where it must not get if it is not to run into the ego car.
 
     Both are taken to go on as they do: the car along its lanes at its speed, keeping to the right, the ego car at its
@@ -80,16 +80,16 @@ def runs_into(network, drivers, car, ego):
             if lane == _I(car[LANE]):
                 lane = _I(car[NEXT])
             elif lane == _I(car[NEXT]):
-                lane = _I(car[AFTER])
+                lane = _I(car[SECOND_NEXT])
             else:
                 return _F(1e9)
             length = lane_length(network, lane)
         k = _N(network.offsets[_N(lane)]) + _N(_I((way - begin) / network.steps[_N(lane)]))
         k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
         right = min(network.room[k], drivers.shift * t - car[SHIFT])
-        px, py = moved_over(network, k, k + _N(1), right)
+        px, py = shifted_right(network, k, k + _N(1), right)
         x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
-        dx, dy = turned(x - px, network.width), turned(y - py, network.height)
+        dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
         if dx * dx + dy * dy > CONTACT_DISTANCE * CONTACT_DISTANCE:
             continue
         ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]

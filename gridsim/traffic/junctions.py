@@ -11,33 +11,49 @@ import numpy as np
 
 from gridsim.config import CAUTION, CROSSING_TIME, EGO_CLEARANCE, EGO_SECTOR_COSINE
 from gridsim.jit import leaf
-from gridsim.maps.network import is_junction, lane_length, turned, wrapped
-from gridsim.traffic.world import AFTER, ALONG, COS, HORIZON, LANE, NEXT, PAST, PERMIT, SIN, SPEED, X, Y
+from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
+from gridsim.traffic.world import (
+    ALONG,
+    COS,
+    HORIZON,
+    JUNCTION_BEHIND,
+    LANE,
+    NEXT,
+    PERMIT,
+    SECOND_NEXT,
+    SIN,
+    SPEED,
+    X,
+    Y,
+)
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF = _F(0.0), _F(0.5)
 
 
 @leaf
-def _passes(network, drivers, lane, other):
+def _blocked_by_waiting_car(network, drivers, lane, other):
     """Whether a lane passes where a car's rear is that waits at the end of another lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
     reach = _F(2.0) * drivers.half_width + _F(2.0) * CAUTION
     for p in range(network.offsets[lane], network.offsets[lane + 1]):
-        dx = turned(network.points[p, 0] - network.points[q, 0], network.width)
-        dy = turned(network.points[p, 1] - network.points[q, 1], network.height)
+        dx = wrapped_any(network.points[p, 0] - network.points[q, 0], network.width)
+        dy = wrapped_any(network.points[p, 1] - network.points[q, 1], network.height)
         if dx * dx + dy * dy < reach * reach:
             return True
     return False
 
 
 @leaf
-def _reaches(network, lane, x, y, within):
+def _way_to_point(network, lane, x, y, within):
     """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
     first, k = network.offsets[lane], network.offsets[lane]
     while k < network.offsets[lane + 1]:
-        dx, dy = turned(network.points[k, 0] - x, network.width), turned(network.points[k, 1] - y, network.height)
+        dx, dy = (
+            wrapped_any(network.points[k, 0] - x, network.width),
+            wrapped_any(network.points[k, 1] - y, network.height),
+        )
         apart = math.sqrt(dx * dx + dy * dy)
         if apart < within:
             return _F(k - first) * network.steps[lane]
@@ -46,11 +62,11 @@ def _reaches(network, lane, x, y, within):
 
 
 @leaf
-def _awaits(network, lane, ego, way):
+def _in_ego_path(network, lane, ego, way):
     """Whether a lane comes within `way` m of the ego car in front of it, or right beside it."""
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
-        dx = turned(network.points[p, 0] - ego[X], network.width)
-        dy = turned(network.points[p, 1] - ego[Y], network.height)
+        dx = wrapped_any(network.points[p, 0] - ego[X], network.width)
+        dy = wrapped_any(network.points[p, 1] - ego[Y], network.height)
         squared = dx * dx + dy * dy
         if squared < way * way:
             forward = dx * ego[COS] + dy * ego[SIN]
@@ -65,7 +81,7 @@ def _awaits(network, lane, ego, way):
 def may_enter(network, drivers, world, i, ego):
     """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
     car = world[i]
-    here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[AFTER])
+    here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[SECOND_NEXT])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
     # Who enters must be able to leave, or junctions would block each other. Before another junction there is room for
     # one, else for as many as the lane beyond holds.
@@ -75,7 +91,7 @@ def may_enter(network, drivers, world, i, ego):
     for j in range(world.shape[0]):
         if j == i or world[j, LANE] < _ZERO:
             continue
-        there, past, permit = _I(world[j, LANE]), _I(world[j, PAST]), _I(world[j, PERMIT])
+        there, past, permit = _I(world[j, LANE]), _I(world[j, JUNCTION_BEHIND]), _I(world[j, PERMIT])
         onward = _I(world[j, NEXT])
         # Most are nowhere near a junction.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
@@ -92,13 +108,13 @@ def may_enter(network, drivers, world, i, ego):
         if there == here and world[j, ALONG] > car[ALONG]:
             if permit != onward:
                 return False  # who is in front of this one waits for others, who must not wait for this one
-            if is_junction(network, _I(world[j, AFTER])):
+            if is_junction(network, _I(world[j, SECOND_NEXT])):
                 waits = permit
         elif permit != onward and is_junction(network, there) and is_junction(network, onward):
             for k in range(network.successors.shape[1]):
                 if there == network.successors[here, k]:
                     waits = there
-        if waits >= 0 and waits != lane and _passes(network, drivers, lane, waits):
+        if waits >= 0 and waits != lane and _blocked_by_waiting_car(network, drivers, lane, waits):
             return False
         if chained:
             if there == lane or permit == lane:
@@ -110,7 +126,9 @@ def may_enter(network, drivers, world, i, ego):
         elif there == beyond:
             rear = world[j, ALONG] - drivers.half_length
             room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
-        elif (permit >= 0 and _I(world[j, AFTER]) == beyond) or (onward == beyond and is_junction(network, there)):
+        elif (permit >= 0 and _I(world[j, SECOND_NEXT]) == beyond) or (
+            onward == beyond and is_junction(network, there)
+        ):
             needed += place
     # The ego car goes first, unless it is behind this one. Which way it will turn nobody knows, so all the ground ahead
     # of it is left to it; but who is in a junction already, as in a roundabout, goes on.
@@ -122,8 +140,8 @@ def may_enter(network, drivers, world, i, ego):
         way = EGO_CLEARANCE + CROSSING_TIME * max(ego[SPEED], _ZERO)
         far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
         if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < _F(2.5))):
-            if not is_junction(network, here) and _awaits(network, lane, ego, way):
+            if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):
                 return False
-            rear = _reaches(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
+            rear = _way_to_point(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
             room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
     return room >= needed

@@ -25,18 +25,18 @@ COS, SIN = 2, 3  # heading
 SPEED = 4  # m/s
 LANE = 5  # index of its lane, -1 for a car that is not there
 ALONG = 6  # m along it
-NEXT, AFTER = 7, 8  # the two lanes that come then
-PAST = 9  # junction lane that its rear may still be on, or -1
+NEXT, SECOND_NEXT = 7, 8  # the two lanes that come then
+JUNCTION_BEHIND = 9  # junction lane that its rear may still be on, or -1
 PERMIT = 10  # junction lane that it may enter next, or -1
 SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
-FACTOR = 12  # desired speed over the lane's
+SPEED_FACTOR = 12  # desired speed over the lane's
 SEED = 13  # of its turns, below 2 ** 24
-TURNS = 14  # lanes it has chosen so far
-PACE = 15  # m/s2, its acceleration in this step
+DRAWS = 14  # lanes it has chosen so far
+ACCELERATION = 15  # m/s2, its acceleration in this step
 HORIZON = 16  # m ahead that it looks in this step
 GAP = 17  # m from its middle to where it must not get
-LEAD = 18  # m/s of what is there
-CLOCK = 19  # control steps until it thinks of another lane
+LEAD_SPEED = 18  # m/s of what is there
+LANE_TIMER = 19  # control steps until it thinks of another lane
 FIELDS = 20
 
 _MOST = 1 << 24  # float32 holds all whole numbers up to it
@@ -75,8 +75,8 @@ def set_pose(network, car, sway):
 @leaf
 def _draw(car):
     """A random number in [0, 1) of a car's own."""
-    car[TURNS] += _ONE
-    return uniform(mix(mix(_U(car[SEED])) + _U(car[TURNS]) * GOLDEN))
+    car[DRAWS] += _ONE
+    return uniform(mix(mix(_U(car[SEED])) + _U(car[DRAWS]) * GOLDEN))
 
 
 @leaf
@@ -107,8 +107,8 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
     for i in range(world.shape[0]):
         car = world[i]
         car[:] = _ZERO
-        car[LANE], car[PAST], car[PERMIT] = -_ONE, -_ONE, -_ONE
-        car[CLOCK] = _F(i) % LANE_CHANGE_PERIOD  # not all at once
+        car[LANE], car[JUNCTION_BEHIND], car[PERMIT] = -_ONE, -_ONE, -_ONE
+        car[LANE_TIMER] = _F(i) % LANE_CHANGE_PERIOD  # not all at once
         for _ in range(60):
             draws += 1
             bits = mix(key + _U(draws) * GOLDEN)
@@ -123,11 +123,11 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
                 car[SEED] = _F(mix(bits) >> _U(40))
-                car[FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
+                car[SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
                 car[NEXT] = _F(choose_lane(network, lane, car))
-                car[AFTER] = _F(choose_lane(network, _I(car[NEXT]), car))
+                car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
                 at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-                car[SPEED] = SPAWN_SPEED * car[FACTOR] * network.speeds[at]
+                car[SPEED] = SPAWN_SPEED * car[SPEED_FACTOR] * network.speeds[at]
                 break
             car[LANE] = -_ONE
 
@@ -165,10 +165,10 @@ def check_worlds(worlds: np.ndarray, network: Network | None = None) -> None:
         raise ValueError("there are no lanes for traffic on this map")
     lowest = np.array([0, 0, 0, -1, -1, 0, 0])
     highest = np.array([*[lanes - 1] * 5, _MOST, _MOST])
-    whole = cars[:, [LANE, NEXT, AFTER, PAST, PERMIT, SEED, TURNS]]
+    whole = cars[:, [LANE, NEXT, SECOND_NEXT, JUNCTION_BEHIND, PERMIT, SEED, DRAWS]]
     k, field = np.nonzero((whole < lowest) | (whole > highest) | (whole % 1.0 != 0.0))
     if len(k):
-        name = ("LANE", "NEXT", "AFTER", "PAST", "PERMIT", "SEED", "TURNS")[field[0]]
+        name = ("LANE", "NEXT", "SECOND_NEXT", "JUNCTION_BEHIND", "PERMIT", "SEED", "DRAWS")[field[0]]
         wanted = f"a whole number from {lowest[field[0]]} to {highest[field[0]]}"
         raise ValueError(f"traffic's {name} must be {wanted}, not {whole[k[0], field[0]]:g}")
     length = np.full(len(cars), np.inf)

@@ -24,7 +24,7 @@ from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import check_name
 from gridsim.traffic.world import LANE
-from gridsim.view.render import Renderer, Window, between
+from gridsim.view.render import Renderer, Window, interpolate
 
 COLUMNS = (
     "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "traffic",
@@ -71,20 +71,20 @@ class Drive:
         return len(self.actions)
 
 
-def unhurried(config: SimConfig | None = None) -> SimConfig:
+def without_idle_limit(config: SimConfig | None = None) -> SimConfig:
     """The configuration a person drives with: who stands still goes on standing."""
     config = config or SimConfig()
     return dataclasses.replace(config, episode=dataclasses.replace(config.episode, patience=_ENDLESS))
 
 
-def _simulator(scenario: Map, config: SimConfig | None, traffic: int) -> Simulator:
+def _simulator(road_map: Map, config: SimConfig | None, traffic: int) -> Simulator:
     """One car among so many others, whose episode ends with a collision and with nothing else."""
-    return Simulator([scenario], 1, unhurried(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
+    return Simulator([road_map], 1, without_idle_limit(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
-def _key(scenario: Map, episode: int) -> int:
+def _key(road_map: Map, episode: int) -> int:
     """What the traffic of an episode is spawned from."""
-    return int(np.random.SeedSequence([scenario.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
+    return int(np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
 
 
 def pose(car: np.ndarray) -> np.ndarray:
@@ -113,9 +113,9 @@ def action_for(keys: set[str], speed: float) -> Action:
 class Recorder:
     """Writes a drive to a new file, row by row, so that whatever ends it, what was driven is there."""
 
-    def __init__(self, path: str | os.PathLike[str], scenario: Map, period: float, traffic: int = 0):
+    def __init__(self, path: str | os.PathLike[str], road_map: Map, period: float, traffic: int = 0):
         """Make the file. Raises: DriveError with one line if it is there already or cannot be made."""
-        self._map = (traffic, scenario.name, scenario.seed)
+        self._map = (traffic, road_map.name, road_map.seed)
         self._period = period
         self.path, self.rows = Path(path), 0
         try:
@@ -215,21 +215,21 @@ def _whole(row: Sequence[str], column: int, most: int) -> int:
     return int(text)
 
 
-def replay(drive: Drive, scenario: Map, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
+def replay(drive: Drive, road_map: Map, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
     """Drive a recorded drive again, by its actions alone.
 
     Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
     traffic float32 [n, others, world.FIELDS]).
     Raises: DriveError with one line if an episode has a collision before its end: map and drive do not belong together.
     """
-    simulator = _simulator(scenario, config, drive.traffic)
+    simulator = _simulator(road_map, config, drive.traffic)
     n, rays = len(drive), simulator.config.sensors.rays
     poses, cars = np.empty((n, 5), np.float32), np.empty((n, FIELDS), np.float32)
     views = np.empty((n, rays), np.float32)
     worlds = np.empty((n, *simulator.state.worlds.shape[1:]), np.float32)
     for k in range(n):
         if k == 0 or drive.episodes[k] != drive.episodes[k - 1]:
-            ranges, _ = simulator.reset(drive.poses[k : k + 1], keys=_key(scenario, int(drive.episodes[k])))
+            ranges, _ = simulator.reset(drive.poses[k : k + 1], keys=_key(road_map, int(drive.episodes[k])))
             poses[k] = drive.poses[k]
         else:
             ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
@@ -244,7 +244,7 @@ def replay(drive: Drive, scenario: Map, config: SimConfig | None = None) -> tupl
 
 
 def drive(
-    scenario: Map,
+    road_map: Map,
     start: np.ndarray,
     window: Window,
     renderer: Renderer,
@@ -259,13 +259,13 @@ def drive(
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
     Raises: DriveError with one line if the recording cannot be written.
     """
-    simulator = _simulator(scenario, config, traffic)
+    simulator = _simulator(road_map, config, traffic)
     period = simulator.config.episode.control_period
     pictures = max(1, round(period * FPS))
     start = np.asarray(start, dtype=np.float32)
-    title = f"{scenario.name}, map {scenario.seed:,}    {HELP}"
+    title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
-    ranges, _ = simulator.reset(start[None], keys=_key(scenario, 0))
+    ranges, _ = simulator.reset(start[None], keys=_key(road_map, 0))
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
@@ -274,7 +274,7 @@ def drive(
         if "r" in pressed:
             if simulator.state.cars[0, STEPS] > 0:
                 episode += 1
-            ranges, _ = simulator.reset(start[None], keys=_key(scenario, episode))
+            ranges, _ = simulator.reset(start[None], keys=_key(road_map, episode))
             path = [start[:2].copy()]
         before, view = simulator.state.cars[0].copy(), ranges[0]
         there = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
@@ -291,13 +291,13 @@ def drive(
         best = max(best, float(after[DISTANCE]))
         for k in range(1, pictures + 1):
             part = k / pictures
-            car = between(before, after, part, scenario)
+            car = interpolate(before, after, part, road_map)
             text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {car[STEPS] * period:.1f} s"
             if ended:
                 text += "    collision: R restarts"
             trace = np.array([*path, car[[X, Y]]])
             image = renderer.draw(
-                car, boxes=between(there, then, part, scenario) if len(then) else None,
+                car, boxes=interpolate(there, then, part, road_map) if len(then) else None,
                 ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title),
             )  # fmt: skip
             window.show(image, pictures / period)

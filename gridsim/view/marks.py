@@ -21,9 +21,9 @@ CLAIM = 0.5  # m, side of the cells by which a line is known to be marked alread
 SHORTEST = 5  # points of a line worth marking
 
 
-def _samples(scenario: Map) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _samples(road_map: Map) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points [n, 2] on all lanes every STEP m, on the torus, their directions [n, 2], and lane numbers [n]."""
-    lanes, mileage = scenario.lanes, scenario.mileage
+    lanes, mileage = road_map.lanes, road_map.mileage
     at = np.arange(STEP / 2, mileage[-1], STEP)
     segment = np.clip(np.searchsorted(mileage, at, side="right") - 1, 0, len(mileage) - 2)
     points = lanes.points.astype(np.float64)
@@ -35,17 +35,17 @@ def _samples(scenario: Map) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return found, direction, lane
 
 
-def lane_marks(scenario: Map) -> np.ndarray:
+def lane_marks(road_map: Map) -> np.ndarray:
     """Dashes float32 [n, 6]: centre x, y (m), direction (cosine, sine), half length (m), 1 between opposite lanes."""
-    if not len(scenario.lanes) or scenario.mileage[-1] < STEP:
+    if not len(road_map.lanes) or road_map.mileage[-1] < STEP:
         return freeze(np.zeros((0, 6), dtype=np.float32))
-    size = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
-    points, direction, lane = _samples(scenario)
+    size = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
+    points, direction, lane = _samples(road_map)
     wrapped = np.mod(points, size)
     # Lanes often lie on one another (the ways into a junction): each place and direction once is enough to search.
     key = np.concatenate([np.round(wrapped), np.round(direction * 8)], axis=1)
     _, one = np.unique(key, axis=0, return_index=True)
-    tree = cKDTree(wrapped[one], boxsize=size if scenario.torus else None)
+    tree = cKDTree(wrapped[one], boxsize=size if road_map.torus else None)
     left = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
 
     middle, reach = (NEAREST + FARTHEST) / 2, (FARTHEST - NEAREST) / 2 + STEP / 2
@@ -53,7 +53,7 @@ def lane_marks(scenario: Map) -> np.ndarray:
     there = near < len(one)
     other = one[np.minimum(near, len(one) - 1)]  # [n, k]
     offset = wrapped[other] - wrapped[:, None]
-    if scenario.torus:
+    if road_map.torus:
         offset -= np.round(offset / size) * size
     across = (offset * left[:, None]).sum(axis=2)
     ahead = np.abs((offset * direction[:, None]).sum(axis=2))

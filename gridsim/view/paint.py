@@ -103,12 +103,12 @@ def draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels
                         image[j, i, c] = np.uint8(value + half)
 
 
-def smoothed(scenario: Map) -> np.ndarray:
+def smoothed(road_map: Map) -> np.ndarray:
     """The map's clearance field without the dips where strips meet, away from any edge: packed as in `Road`.
 
     Such a dip, down to a point of clearance 0 in the middle of a junction, would be drawn as an edge.
     """
-    road = scenario.road
+    road = road_map.road
     nodes = (road.field & np.uint32(255)).astype(np.uint8).reshape(int(road.rows), int(road.columns))
     least = minimum_filter(nodes, 2 * round(DIP * CELLS_PER_M) + 1, mode="wrap")
     inside = least > round((-FIELD_FLOOR - 0.1) * FIELD_UNITS)

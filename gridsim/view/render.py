@@ -46,7 +46,7 @@ class Renderer:
 
     def __init__(
         self,
-        scenario: Map,
+        road_map: Map,
         size: tuple[int, int] = (640, 480),
         metres: float = 52.0,
         follow: bool = True,
@@ -62,18 +62,18 @@ class Renderer:
             raise ValueError(f"a picture is 16 to 8192 pixels wide and high, not {width} x {height}")
         if not 1.0 <= metres <= 10_000.0:
             raise ValueError(f"a picture shows 1 to 10,000 metres, not {metres}")
-        self.scenario, self.size, self.follow = scenario, (int(width), int(height)), follow
+        self.road_map, self.size, self.follow = road_map, (int(width), int(height)), follow
         self.config = config or SimConfig()
         self._constants = constants(self.config)
-        road = scenario.road
-        self._field = paint.smoothed(scenario)
+        road = road_map.road
+        self._field = paint.smoothed(road_map)
         self._world = np.array([road.width, road.height], dtype=np.float64)
         self.pixels_per_m = height / metres if follow else min(width / self._world[0], height / self._world[1])
         self._anchor = np.array([width / 2, height * (CAR_AT if follow else 0.5)])
         self._centre, self._up = self._world / 2, np.array([0.0, 1.0])
-        self._marks = lane_marks(scenario)
+        self._marks = lane_marks(road_map)
         # Parked cars: boxes that are part of the map, where it has any.
-        blocks = getattr(scenario.strips, "blocks", None)
+        blocks = getattr(road_map.strips, "blocks", None)
         self._blocks = np.zeros((0, 5)) if blocks is None else np.asarray(blocks, dtype=np.float64)
         self._colours = freeze(
             np.array([paint.GROUND, paint.GROUND_OTHER, paint.VERGE, paint.ASPHALT, paint.EDGE_LINE], dtype=np.float32)
@@ -90,7 +90,7 @@ class Renderer:
         Of a point of a torus, the one of its places that is nearest to the view's centre.
         """
         offset = np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre
-        if self.scenario.torus and self.follow:
+        if self.road_map.torus and self.follow:
             offset -= np.round(offset / self._world) * self._world
         return self._anchor + self._turn(offset) * self.pixels_per_m
 
@@ -133,11 +133,11 @@ class Renderer:
         right = np.array([self._up[1], -self._up[0]])
         metre = 1.0 / self.pixels_per_m
         origin = self._centre - (self._anchor[0] - 0.5) * metre * right + (self._anchor[1] - 0.5) * metre * self._up
-        road = self.scenario.road
+        road = self.road_map.road
         # Float32 positions stay exact to a millimetre or two: tiles enough to be above 0, and no more.
         turn = 1 + math.ceil(math.hypot(width, height) * metre / self._world.min())
         paint.draw_ground(
-            self._field, road.columns, road.rows, self.scenario.torus and self.follow, turn,
+            self._field, road.columns, road.rows, self.road_map.torus and self.follow, turn,
             (origin + turn * self._world) * CELLS_PER_M, right * metre * CELLS_PER_M, -self._up * metre * CELLS_PER_M,
             self.pixels_per_m, self._colours, image,
         )  # fmt: skip
@@ -315,17 +315,17 @@ def _glyphs(text: str, pixels: int) -> np.ndarray:
     return rgba.reshape(surface.get_height(), surface.get_width(), 4)[:, :, 3]
 
 
-def between(before: np.ndarray, after: np.ndarray, part: float, scenario: Map) -> np.ndarray:
+def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Map) -> np.ndarray:
     """A state float32 [FIELDS] between two, or boxes [n, 4 or more] (x, y, cosine, sine): for pictures, not physics.
 
     Args: part in [0, 1] of the way from the first to the second, over the torus's edge where that is shorter.
     """
-    size = np.array([scenario.road.width, scenario.road.height], dtype=np.float64)
+    size = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     gap = np.asarray(after, dtype=np.float64) - before
-    if scenario.torus:
+    if road_map.torus:
         gap[..., :2] -= np.round(gap[..., :2] / size) * size
     state = before + part * gap
-    if scenario.torus:
+    if road_map.torus:
         state[..., :2] = np.mod(state[..., :2], size)
     state[..., COS : SIN + 1] /= np.maximum(np.hypot(state[..., COS], state[..., SIN]), 1e-9)[..., None]
     return state.astype(np.float32)

@@ -23,7 +23,7 @@ from evolution.search.breeding import RECIPE, Kind, breed
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 from gridsim.config import SimConfig
-from gridsim.traffic.world import ALONG, FIELDS, LANE, NEXT, PAST, SPEED
+from gridsim.traffic.world import ALONG, FIELDS, JUNCTION_BEHIND, LANE, NEXT, SPEED
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
@@ -236,7 +236,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert row["fitness/mean"] == score.mean()
     if after == 2:
         assert len(recipes) == 53
-        validation = curriculum.validation().within(curriculum.goal_limits())
+        validation = curriculum.validation().with_limits(curriculum.goal_limits())
         alone = evolution.drive("alone", first_two(task, recipes), validation, curriculum.goal_limits())
         tried = outcome.results[51:, -config.validation :]
         assert tried[0, :4].tobytes() == alone.results[0, :4].tobytes()
@@ -363,7 +363,7 @@ def test_crashes_on_no_road_are_refused(maps, halfway, name, field, number):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("field", "number"), [(LANE, 1e6), (NEXT, 1e6), (PAST, 1e6), (ALONG, 1e4)])
+@pytest.mark.parametrize(("field", "number"), [(LANE, 1e6), (NEXT, 1e6), (JUNCTION_BEHIND, 1e6), (ALONG, 1e4)])
 def test_a_crash_that_does_not_fit_its_map_is_refused_when_it_is_to_be_driven(maps, halfway, field, number):
     arrays, meta = load(halfway)
     arrays["crash_worlds"] = arrays["crash_worlds"].copy()

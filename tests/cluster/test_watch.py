@@ -27,7 +27,7 @@ from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import Recorder, pose, unhurried
+from gridsim.view.drive import Recorder, pose, without_idle_limit
 from gridsim.view.render import Renderer
 
 ROOT = Path(__file__).parents[2]
@@ -271,7 +271,7 @@ def test_watch_writes_films(run_folder, tmp_path):
 @pytest.mark.e2e
 def test_watch_shows_a_recorded_drive(tmp_path):
     scenario = build("seamless", 3)
-    simulator = Simulator([scenario], 1, unhurried())
+    simulator = Simulator([scenario], 1, without_idle_limit())
     start = sample_starts(scenario, 1, np.random.default_rng(1))[0]
     with Recorder(tmp_path / "drive.csv", scenario, 0.1) as recorder:
         for episode, steps in enumerate((16, 11)):

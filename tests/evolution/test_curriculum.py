@@ -28,7 +28,7 @@ def led(curriculum, generation, ends, distance=0.0, steps=50):
     results = np.zeros(len(episodes.rows), dtype=RESULT)
     results["end"], results["distance"], results["steps"] = ends, distance, steps
     rewound = np.repeat(np.arange(len(results), dtype=np.float32)[:, None], 5, axis=1) + 100.0 * generation
-    curriculum.followed(episodes, results, rewound, episodes.worlds)
+    curriculum.learn_from_leader(episodes, results, rewound, episodes.worlds)
     return episodes, rewound
 
 

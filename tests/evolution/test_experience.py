@@ -13,11 +13,11 @@ from evolution.dqn.experience import (
     Experience,
     ages,
     empty,
-    fixed,
     join,
-    keep_grid,
-    keep_rays,
     observation_dtype_and_width,
+    store_grid,
+    store_rays,
+    to_fixed_point,
     unpack,
 )
 from evolution.networks import convnet
@@ -32,17 +32,17 @@ SPECS = [MlpSpec((5,)), MlpSpec((5,), motion=True), MlpSpec((5,), steering=True)
 
 @njit
 def _keep_rays(inputs, row):
-    keep_rays(inputs, row)
+    store_rays(inputs, row)
 
 
 @njit
 def _keep_grid(grid, speed, row):
-    keep_grid(grid, speed, row)
+    store_grid(grid, speed, row)
 
 
 @njit
 def _fixed(value):
-    return fixed(value)
+    return to_fixed_point(value)
 
 
 def made(spec: PolicySpec, lengths: list[int], seed: int = 0) -> Experience:

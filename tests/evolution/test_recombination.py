@@ -22,7 +22,7 @@ CNN = PolicySpec.parse("cnn:8,8,8@1")
 def begun(config, seed=1, spec=SPEC, genome=None):
     """A search about a genome, by default a random one."""
     search = Recombination(spec, config, seed)
-    search.begin_with(np.random.default_rng(seed).normal(size=spec.size).astype(F) if genome is None else genome)
+    search.start_from(np.random.default_rng(seed).normal(size=spec.size).astype(F) if genome is None else genome)
     return search
 
 
@@ -57,7 +57,7 @@ def test_the_champion_is_the_second_member_bit_for_bit():
     search = begun(SearchConfig(population=16, groups=2))
     champion = np.random.default_rng(3).normal(size=GENES).astype(F)
     champion[:2] = -0.0, 1e-42
-    search.carry(champion)
+    search.keep_champion(champion)
     asked = search.ask()
     members = search.genomes(np.arange(16))
     assert members[0].tobytes() == leader(search).tobytes()
@@ -76,7 +76,7 @@ def test_mirrored_pairs_meet_the_same_episodes(data):
     search = begun(SearchConfig(population=population, groups=groups))
     elites = 2
     if data.draw(st.booleans()):
-        search.carry(np.zeros(GENES, dtype=F))
+        search.keep_champion(np.zeros(GENES, dtype=F))
     asked = search.ask()
     kinds, seeds = asked.recipes["kind"], asked.recipes["seed"]
     assert (kinds[:elites] == Kind.COPY).all()
@@ -238,7 +238,7 @@ def test_it_is_about_as_fast_as_separable_cma_es(condition, tournament):
 def test_a_run_may_begin_with_a_genome():
     genome = np.random.default_rng(1).normal(size=GENES).astype(F)
     search = Recombination(SPEC, SearchConfig(population=20, groups=1, sigma=0.25), seed=12)
-    search.begin_with(genome)
+    search.start_from(genome)
     genome[0] += 1.0  # it is a copy
     assert leader(search)[1:].tobytes() == genome[1:].tobytes()
     assert leader(search)[0] != genome[0]

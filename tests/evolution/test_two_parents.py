@@ -140,7 +140,7 @@ def test_random_search_learns_nothing_but_keeps_its_best():
 def test_a_run_may_begin_with_a_genome():
     genome = np.random.default_rng(1).normal(size=SPEC.size).astype(F)
     search = TwoParents(SPEC, CONFIG, seed=12)
-    search.begin_with(genome)
+    search.start_from(genome)
     assert leader(search).tobytes() == genome.tobytes()
     search.ask()
     members = search.genomes(EVERYONE)

@@ -19,7 +19,7 @@ from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, freeze, make_road
 from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, nearest_box, stands_ahead
 from gridsim.sensing.rays import fan
-from gridsim.traffic.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT, SIN, SPEED, X, Y
+from gridsim.traffic.world import ALONG, COS, FIELDS, JUNCTION_BEHIND, LANE, PERMIT, SIN, SPEED, SPEED_FACTOR, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
@@ -226,7 +226,7 @@ def cross():
 def on_lane(lane, along, speed, pose):
     """A world with one car, `along` m along a lane of `cross`, at a pose."""
     world = parked(pose)
-    world[0, [LANE, ALONG, PAST, PERMIT, FACTOR, SPEED]] = lane, along, -1.0, -1.0, 1.0, speed
+    world[0, [LANE, ALONG, JUNCTION_BEHIND, PERMIT, SPEED_FACTOR, SPEED]] = lane, along, -1.0, -1.0, 1.0, speed
     world[0, 7:9] = lane  # the lane leads into itself
     return world
 

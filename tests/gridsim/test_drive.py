@@ -19,7 +19,7 @@ from gridsim.car.vehicle import Action
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, unhurried
+from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, without_idle_limit
 
 KEYS = ("up", "down", "left", "right", "space")
 COMMAND = [sys.executable, "-c", "from cluster.commands.entry import drive_main; drive_main()"]
@@ -36,7 +36,7 @@ def recorded(scenario, tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "drive.csv"
     rng = np.random.default_rng(0)
     start = sample_starts(scenario, 1, rng)[0]
-    simulator = Simulator([scenario], 1, unhurried())
+    simulator = Simulator([scenario], 1, without_idle_limit())
     poses = []
     with Recorder(path, scenario, 0.1) as recorder:
         for episode in range(2):

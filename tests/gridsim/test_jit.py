@@ -22,7 +22,7 @@ from gridsim.config import SimConfig, constants
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
-from gridsim.sensing.rays import LANES, fan
+from gridsim.sensing.rays import SIMD_RAYS, fan
 
 F = np.float32
 
@@ -151,7 +151,7 @@ def drive_a_while(scenario, start, actions):
     k = constants(CONFIG)
     rays = fan(31, k.ray_first, k.ray_step)
     car, visits = np.zeros(FIELDS, dtype=F), np.zeros(64 * 64, dtype=F)
-    beams, ranges = np.empty((3, LANES), dtype=F), np.empty(31, dtype=F)
+    beams, ranges = np.empty((3, SIMD_RAYS), dtype=F), np.empty(31, dtype=F)
     place(scenario.road, start, car, visits)
     states, seen, ends = [], [], []
     for action in actions:

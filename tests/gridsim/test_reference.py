@@ -18,7 +18,7 @@ from gridsim.maps.roads import Lanes, clearance_nodes, freeze, make_road
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.reference.driver import ReferenceDriver
 from gridsim.reference.routes import ReferenceConfig, locate, plan, profile, top_speed, unwrapped
-from gridsim.traffic.world import ALONG, COS, FACTOR, FIELDS, LANE, PAST, PERMIT
+from gridsim.traffic.world import ALONG, COS, FIELDS, JUNCTION_BEHIND, LANE, PERMIT, SPEED_FACTOR
 from gridsim.traffic.world import X as TRAFFIC_X
 from gridsim.traffic.world import Y as TRAFFIC_Y
 
@@ -233,8 +233,8 @@ def test_batch_in_the_simulator_drives_as_alone(seamless):
 
 def test_it_stops_behind_a_standing_car(straight):
     world = np.zeros((1, 1, FIELDS), dtype=np.float32)
-    world[0, 0, [LANE, PAST, PERMIT]] = 0, -1, -1
-    world[0, 0, [ALONG, TRAFFIC_X, TRAFFIC_Y, COS, FACTOR]] = 90, 90, 32, 1, 0
+    world[0, 0, [LANE, JUNCTION_BEHIND, PERMIT]] = 0, -1, -1
+    world[0, 0, [ALONG, TRAFFIC_X, TRAFFIC_Y, COS, SPEED_FACTOR]] = 90, 90, 32, 1, 0
     sim = Simulator([straight], 1, traffic=1)
     driver = ReferenceDriver([straight])
     sim.reset(START[None], worlds=world)

@@ -14,7 +14,7 @@ from gridsim.maps.map import sample_starts
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
 from gridsim.view import paint, render
-from gridsim.view.render import Renderer, between
+from gridsim.view.render import Renderer, interpolate
 
 BARE = {**os.environ}
 for _name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR"):
@@ -205,12 +205,12 @@ def test_between_goes_over_the_seam_and_keeps_the_heading_a_unit(scenario):
     width = float(scenario.road.width)
     a, b = car_at(width - 1.0, 5.0, 0.0), car_at(1.0, 5.0, 1.0)
     b[SPEED], b[STEERING] = 4.0, 0.2
-    half = between(a, b, 0.5, scenario)
+    half = interpolate(a, b, 0.5, scenario)
     assert half[X] % width == pytest.approx(0.0, abs=1e-3)
     assert np.arctan2(half[SIN], half[COS]) == pytest.approx(0.5, abs=1e-3)
     assert np.hypot(half[SIN], half[COS]) == pytest.approx(1.0, abs=1e-6)
     assert half[SPEED] == pytest.approx(2.0)
-    assert between(a, b, 0.0, scenario) == pytest.approx(a)
+    assert interpolate(a, b, 0.0, scenario) == pytest.approx(a)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.roads import HEADING_BINS, Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
 from gridsim.sensing.rays import AMONG_THIN_WALLS, PLAIN, fan, fast_march, fast_march_thin, march, sense
-from gridsim.sensing.simd import LANES
+from gridsim.sensing.simd import SIMD_RAYS
 
 F = np.float32
 K = constants(SimConfig())
@@ -35,7 +35,7 @@ def vector_march_thin(field, columns, rows, px, py, reach, beams):
 def look(road, points, headings, k=K, count=31):
     """Kernel ranges [n, rays] from points [n, 2] with headings [n]."""
     table = fan(count, k.ray_first, k.ray_step)
-    beams = np.empty((3, LANES), dtype=F)
+    beams = np.empty((3, SIMD_RAYS), dtype=F)
     ranges = np.full((len(points), count), np.nan, dtype=F)
     for (x, y), heading, row in zip(points, headings, ranges, strict=True):
         sense(road, table, k.ray_first, k.ray_range, F(x), F(y), F(np.cos(heading)), F(np.sin(heading)), beams, row)
@@ -240,11 +240,11 @@ def test_the_sensor_knows_no_border(scenario, views):
 
 
 def march_both(road, point, angles, start=0.0, thin=False):
-    """Ranges [2, LANES] by the plain kernel and by the vector code, of rays from one point."""
+    """Ranges [2, SIMD_RAYS] by the plain kernel and by the vector code, of rays from one point."""
     results = []
     how, vector = (AMONG_THIN_WALLS, vector_march_thin) if thin else (PLAIN, vector_march)
     for kernel, more in ((march, (how,)), (vector, ())):
-        beams = np.stack([np.cos(angles), np.sin(angles), np.full(LANES, start)]).astype(F)
+        beams = np.stack([np.cos(angles), np.sin(angles), np.full(SIMD_RAYS, start)]).astype(F)
         kernel(road.field, road.columns, road.rows, F(2 * point[0]), F(2 * point[1]), F(REACH), beams, *more)
         results.append(beams[2])
     return np.array(results)
@@ -257,7 +257,7 @@ def test_vector_code_is_the_plain_kernel(scenario, views, thin):
     inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:400]
     both = []
     for point in views[0].points[inner]:
-        plain, vector = march_both(scenario.road, point, np.full(LANES, rng.uniform(-math.pi, math.pi)), thin=thin)
+        plain, vector = march_both(scenario.road, point, np.full(SIMD_RAYS, rng.uniform(-math.pi, math.pi)), thin=thin)
         assert (vector == vector[0]).all()
         assert (plain == plain[0]).all()
         both.append((plain[0], vector[0]))
@@ -272,7 +272,7 @@ def test_vector_code_is_the_plain_kernel_lane_by_lane(scenario, views, thin):
     rng = np.random.default_rng(5)
     inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:600]
     points = views[0].points[inner]
-    angles = rng.uniform(-math.pi, math.pi, (len(points), 1)) + np.radians(np.linspace(-60, 60, LANES))
+    angles = rng.uniform(-math.pi, math.pi, (len(points), 1)) + np.radians(np.linspace(-60, 60, SIMD_RAYS))
     plain, vector = np.stack(
         [march_both(scenario.road, p, a, thin=thin) for p, a in zip(points, angles, strict=True)], axis=1
     )
@@ -287,7 +287,7 @@ def test_vector_code_is_the_plain_kernel_lane_by_lane(scenario, views, thin):
 
 @pytest.mark.parametrize("start", [0.0, 30.0, REACH, 60.0])
 def test_both_marches_take_a_start_and_stay_within_reach(scenario, start):
-    plain, vector = march_both(scenario.road, (5.0, 5.0), np.linspace(0, 6, LANES), start)
+    plain, vector = march_both(scenario.road, (5.0, 5.0), np.linspace(0, 6, SIMD_RAYS), start)
     for ranges in (plain, vector):
         assert ranges.min() >= 0.0
         assert ranges.max() <= REACH

@@ -20,18 +20,18 @@ from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.sensing.boxes import boxes_touch
 from gridsim.traffic.behaviour import drivers, flow, idm
 from gridsim.traffic.world import (
-    AFTER,
     ALONG,
     COS,
-    FACTOR,
     FIELDS,
+    JUNCTION_BEHIND,
     LANE,
     NEXT,
-    PAST,
     PERMIT,
+    SECOND_NEXT,
     SHIFT,
     SIN,
     SPEED,
+    SPEED_FACTOR,
     X,
     Y,
     spawn,
@@ -95,9 +95,9 @@ def cars_on(network, *rows):
     """A world of cars (lane, m along it, m/s, factor), placed by one look at where they are."""
     world = np.zeros((len(rows), FIELDS), dtype=F)
     for car, (lane, along, speed, factor) in zip(world, rows, strict=True):
-        car[[LANE, ALONG, SPEED, FACTOR, PAST, PERMIT]] = lane, along, speed, factor, -1.0, -1.0
+        car[[LANE, ALONG, SPEED, SPEED_FACTOR, JUNCTION_BEHIND, PERMIT]] = lane, along, speed, factor, -1.0, -1.0
         car[NEXT] = network.successors[lane, 0]
-        car[AFTER] = network.successors[int(car[NEXT]), 0]
+        car[SECOND_NEXT] = network.successors[int(car[NEXT]), 0]
         at = along / float(network.steps[lane])
         first = network.offsets[lane] + int(at)
         a, b = network.points[first], network.points[first + 1]
@@ -394,7 +394,7 @@ def test_the_second_of_a_queue_has_no_permit_before_the_first():
     is in the first car's way, while the second wants to turn right, where the road is free."""
     network = network_of([*crossing_paths(), *right_turn()], 256.0, 256.0)
     world = cars_on(network, (0, 116.0, 0.0, 1.0), (0, 110.0, 0.0, 1.0))
-    world[1, [NEXT, AFTER]] = 6, 7
+    world[1, [NEXT, SECOND_NEXT]] = 6, 7
     assert {6} < set(network.successors[0])
     stuck = watch(network, world, 20, ego(134.0, 128.0))
     assert (stuck[:, :, PERMIT] == -1.0).all()
@@ -458,7 +458,7 @@ def test_nobody_cuts_in_on_another(seed):
             gap, j = min(near)
             rear, lead = (mine, before[j]) if leads else (before[j], mine)
             at = network.offsets[int(rear[LANE])] + int(rear[ALONG] / network.steps[int(rear[LANE])])
-            desired = rear[FACTOR] * network.speeds[at]
+            desired = rear[SPEED_FACTOR] * network.speeds[at]
             # Along bends of 150 m lanes differ in length by a few percent.
             pace = oracle.idm(CONFIG, rear[SPEED], desired, gap * 1.03 + 0.3 - LENGTH, lead[SPEED])
             assert pace > -CONFIG.traffic.safe_braking
@@ -484,7 +484,7 @@ def test_cars_spawn_uniformly_over_the_lanes_outside_junctions(scenario):
     expected = np.where(free, lengths, 0.0) / lengths[free].sum() * len(cars)
     assert stats.chisquare(counts[free], expected[free]).pvalue > 1e-3
     assert stats.kstest(cars[:, ALONG] / lengths[lane], "uniform").pvalue > 1e-3
-    assert stats.kstest(cars[:, FACTOR], "uniform", args=(0.9, 0.3)).pvalue > 1e-3
+    assert stats.kstest(cars[:, SPEED_FACTOR], "uniform", args=(0.9, 0.3)).pvalue > 1e-3
 
 
 @pytest.mark.parametrize("scenario", REGISTRY)

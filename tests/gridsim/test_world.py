@@ -15,17 +15,17 @@ from gridsim.maps.network import lane_length
 from gridsim.maps.scenarios import REGISTRY, build
 from gridsim.traffic.behaviour import drivers, flow
 from gridsim.traffic.world import (
-    AFTER,
     ALONG,
-    FACTOR,
+    DRAWS,
     FIELDS,
+    JUNCTION_BEHIND,
     LANE,
     NEXT,
-    PAST,
     PERMIT,
+    SECOND_NEXT,
     SEED,
     SPEED,
-    TURNS,
+    SPEED_FACTOR,
     check_worlds,
     spawn,
 )
@@ -47,7 +47,7 @@ def test_what_traffic_comes_to_is_taken(name):
         check_worlds(world, network)
         check_worlds(world)
         flow(network, drivers(CONFIG), world, NOBODY)
-    assert (world[:, TURNS] > 4).any()
+    assert (world[:, DRAWS] > 4).any()
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +71,10 @@ WRONG = [
     (LANE, 1e30, "LANE must be a whole number from 0"),
     (NEXT, -1.0, "NEXT must be a whole number from 0"),
     (NEXT, LANES, "NEXT must be a whole number from 0"),
-    (AFTER, -1.0, "AFTER must be a whole number from 0"),
-    (AFTER, LANES, "AFTER must be a whole number from 0"),
-    (PAST, -2.0, "PAST must be a whole number from -1"),
-    (PAST, LANES, "PAST must be a whole number from -1"),
+    (SECOND_NEXT, -1.0, "SECOND_NEXT must be a whole number from 0"),
+    (SECOND_NEXT, LANES, "SECOND_NEXT must be a whole number from 0"),
+    (JUNCTION_BEHIND, -2.0, "JUNCTION_BEHIND must be a whole number from -1"),
+    (JUNCTION_BEHIND, LANES, "JUNCTION_BEHIND must be a whole number from -1"),
     (PERMIT, -2.0, "PERMIT must be a whole number from -1"),
     (PERMIT, LANES, "PERMIT must be a whole number from -1"),
     (ALONG, -0.01, "ALONG"),
@@ -82,8 +82,8 @@ WRONG = [
     (SPEED, -0.1, "SPEED"),
     (SPEED, 1e9, "SPEED"),
     (SEED, -1.0, "SEED"),
-    (TURNS, 2.5, "TURNS"),
-    (FACTOR, math.nan, "finite"),
+    (DRAWS, 2.5, "DRAWS"),
+    (SPEED_FACTOR, math.nan, "finite"),
     (LANE, math.inf, "finite"),
 ]
 

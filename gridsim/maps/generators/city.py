@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gridsim.maps.generators.seamless import DIRECTIONS, square_strips, turned
+from gridsim.maps.generators.seamless import DIRECTIONS, rotated, square_strips
 from gridsim.maps.lanes import Path, lay_lanes, through_square
 from gridsim.maps.roads import Lanes, Strips
 
@@ -123,7 +123,7 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
             lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in here_lines]
             arcs += [[a + x, b + y, *rest] for a, b, *rest in here_arcs]
             for entry in arms:
-                edge_x, edge_y = turned(np.array([half, LANE_WIDTH / 2]), entry)
+                edge_x, edge_y = rotated(np.array([half, LANE_WIDTH / 2]), entry)
                 for exit in arms:
                     if exit != entry:
                         pieces = through_square((exit - entry) % 4, half, LANE_WIDTH / 2)

@@ -103,7 +103,7 @@ def _flare() -> tuple[float, float, float]:
     return x, y, math.atan2(y, x)
 
 
-def turned(points: np.ndarray, quarters: int) -> np.ndarray:
+def rotated(points: np.ndarray, quarters: int) -> np.ndarray:
     """Points [n, 2] turned counter-clockwise by so many quarters."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
@@ -129,7 +129,7 @@ def _ring_strips(arms: list[int]) -> tuple[list[list[float]], list[list[float]]]
         inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
         lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
         for side in (1.0, -1.0):  # way in, way out
-            (cx, cy), first = turned(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
+            (cx, cy), first = rotated(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
             arcs.append([cx, cy, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
     return lines, arcs
 
@@ -181,7 +181,7 @@ def _layout(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[
         lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in tile_lines]
         arcs += [[a + x, b + y, *rest] for a, b, *rest in tile_arcs]
         for entry in arms:
-            edge_x, edge_y = turned(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
+            edge_x, edge_y = rotated(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
             for exit in arms:
                 if exit != entry:
                     turn = (exit - entry) % 4
