@@ -1,7 +1,7 @@
-"""GridSim's simulator: arrays in, arrays out. Knows nothing of learning, Ray, MLflow or files of a run.
+"""GridSim's simulator: arrays in, arrays out. It does not depend on learning, Ray, MLflow or run folders.
 
-Importing it registers Gymnasium's environments, which takes milliseconds: Numba and the roads are loaded when one is
-made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it by itself.
+Importing it registers the Gymnasium environments. That takes milliseconds, because Numba and the maps are loaded only
+when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
 """
 
 from gymnasium.envs.registration import register as _register
@@ -13,7 +13,7 @@ ENVIRONMENTS = {
     "GridSim/Roundabout-v0": "roundabout",
     "GridSim/City-v0": "city",
 }
-"""Scenarios by their environments' ids."""
+"""The scenario of each environment id."""
 
 for _id, _scenario in ENVIRONMENTS.items():
     _register(

@@ -1,4 +1,4 @@
-"""Every constant of the simulated world, once, with its unit and its source. Change a number here, nowhere else."""
+"""The constants of the simulated world, each with its unit and its source."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ CRASH_REWARD = -1.0
 BEND_COMFORT = 2.0  # m/s2, lateral acceleration that `Lanes.limits` allows
 CROSSING_GAP = 2.9  # m between two lanes' centre lines below which cars on them, 2 m wide, may touch
 
-# Traffic, beside `TrafficConfig`. These are float32 because kernels read them as globals. Own choices, tuned so that
-# traffic neither collides nor blocks junctions, unless a source is named.
+# Traffic, beside `TrafficConfig`. These are float32 because kernels read them as globals. Own choices, unless a source
+# is named.
 TRAFFIC_PACE = 0.5  # share of the sum of the speed interval's ends that is traffic's speed on a straight: the middle
 SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of the lane's: least, and range above it
 SPAWN_SPEED = _F(0.5)  # of the desired speed, at the start of an episode
@@ -60,7 +60,7 @@ EGO_SECTOR_COSINE = _F(0.6)  # of the angle from its heading within which the eg
 
 @dataclass(frozen=True)
 class VehicleConfig:
-    """The car and what its engine, brakes and tyres can do."""
+    """The car: its size, and the limits of engine, brakes, steering and tyres."""
 
     length: float = 4.0  # m
     width: float = 2.0  # m
@@ -70,7 +70,7 @@ class VehicleConfig:
     steering_rate: float = 60.0  # degrees/s, towards the commanded angle and back to the centre
     speed_limit: float = 30.0  # m/s forward
     reverse_limit: float = 3.0  # m/s backward
-    acceleration: float = 3.0  # m/s2 forward, and of the reverse action
+    acceleration: float = 3.0  # m/s2, forward and in reverse
     braking: float = 8.0  # m/s2
     lateral_grip: float = 4.9  # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model
 
@@ -86,14 +86,14 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class EpisodeConfig:
-    """When an episode ends and what counts as distance."""
+    """When an episode ends, and what counts as distance."""
 
     control_period: float = 0.1  # s
     target: float = 2000.0  # m of new ground: success
     time_limit: float = 400.0  # s
-    patience: int = 15  # control steps without progress (the paper's sanity check)
-    progress: float = 0.05  # m of new ground a step below which a step is without progress
-    revisit: float = 200.0  # m of driving within which a stretch driven again counts nothing
+    patience: int = 15  # control steps without progress that end an episode (the paper's sanity check)
+    progress: float = 0.05  # m of new ground; a step with less is without progress
+    revisit: float = 200.0  # m of driving within which the same ground does not count again
 
 
 @dataclass(frozen=True)
@@ -107,21 +107,21 @@ class TrafficConfig:
     jam: float = 2.0  # m, bumper to bumper at standstill, s0 of IDM
     lateral: float = 3.0  # m/s2, lateral acceleration in bends
     politeness: float = 0.2  # p of MOBIL
-    threshold: float = 0.2  # m/s2 to be gained by a change of lanes
-    safe_braking: float = 3.0  # m/s2 that a change of lanes may ask of who is behind
+    threshold: float = 0.2  # m/s2 that a change of lanes must gain
+    safe_braking: float = 3.0  # m/s2 of braking that a change of lanes may force on the car behind
     lane_change_speed: float = 1.25  # m/s sideways: three seconds for a lane
-    kerb: float = 1.3  # m that the middle of a car which moves over keeps from the road's edge
-    give_way: float = 0.9  # m to the right that it moves over for who comes the other way, at most
-    taper: float = 0.15  # m a m of way that it moves over
-    apart: float = 2.35  # m between the middles of two lanes below which cars on them may touch
+    kerb: float = 1.3  # m from the middle of a car that moves to the right to the road's edge, at least
+    give_way: float = 0.9  # m that a car moves to the right for oncoming cars, at most
+    taper: float = 0.15  # m to the right for each m of way, while it does
+    apart: float = 2.35  # m between the middles of two lanes, below which cars on them may touch
     spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
-    spawn_gap_ego: float = 22.0  # m between a car and the ego car then
-    courtesy: float = 10.0  # m: standing with a standing car so near ahead is not idleness
+    spawn_gap_ego: float = 22.0  # m between a car and the ego car at the start, at least
+    courtesy: float = 10.0  # m; waiting behind a standing car within this distance is not idleness
 
 
 @dataclass(frozen=True)
 class SimConfig:
-    """All that the simulator needs to know beside the scenario."""
+    """The simulator's parameters that do not depend on the scenario."""
 
     vehicle: VehicleConfig = field(default_factory=VehicleConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)
@@ -155,9 +155,9 @@ class Constants(NamedTuple):
 
 
 def constants(config: SimConfig) -> Constants:
-    """Convert and check a configuration.
+    """Check a configuration and convert it for the kernels.
 
-    Raises: ValueError with one line if a number makes no sense.
+    Raises: ValueError with one line if a value is invalid.
     """
     vehicle, sensors, episode = config.vehicle, config.sensors, config.episode
     for name, value in (

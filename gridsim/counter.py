@@ -1,6 +1,6 @@
-"""Random numbers from counters, for kernels: a draw depends on its key and its place alone, not on earlier draws.
+"""Counter-based random numbers for kernels: a draw depends only on its key and its index, not on earlier draws.
 
-SplitMix64 (Steele et al. 2014): `mix(key + place * GOLDEN)` is the place-th draw of a key.
+SplitMix64 (Steele et al. 2014): `mix(key + index * GOLDEN)` is draw number `index` of a key.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Numba, configured once: where compiled kernels are cached and how they are compiled.
+"""Numba's options, and the cache of compiled kernels.
 
-Numba's own on-disk cache does not notice that a function in *another* file changed. So the cache lives in a folder
-whose name is a digest of every kernel source, of the constants and of the versions: an edit anywhere, a new folder.
-`NUMBA_DISABLE_JIT=1` runs every kernel as plain Python.
+Numba's own on-disk cache does not notice when a function in *another* file changes. So the cache folder is named after
+a digest of all sources and library versions: any edit leads to a new folder. `NUMBA_DISABLE_JIT=1` runs every kernel as
+plain Python.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import Any
 import numba
 from numba.core.caching import UserProvidedCacheLocator
 
-# Packages whose files may hold kernels; all their sources count, so that nobody has to keep a list in step.
+# Packages that may contain kernels. All their files enter the digest, so that no list of files has to be maintained.
 KERNEL_PACKAGES = ("gridsim", "evolution")
 
 
 def kernel_digest() -> str:
-    """Digest (16 hex digits) of all that decides what the kernels compile to: sources, constants, versions."""
+    """Digest (16 hex digits) of everything that compiled kernels depend on: sources and versions."""
     digest = hashlib.sha256()
     for name in ("numba", "llvmlite", "numpy"):
         digest.update(f"{name}=={version(name)}\n".encode())
@@ -39,7 +39,7 @@ def kernel_digest() -> str:
 
 
 def cache_folder() -> Path:
-    """Folder of the compiled kernels; the user's cache folder, or a temporary one where that cannot be written."""
+    """Folder of the compiled kernels: in the user's cache folder, or a temporary one if that is not writable."""
     base = os.environ.get("GRIDSIM_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "gridsim" / f"kernels-{kernel_digest()}"
     try:
@@ -53,16 +53,16 @@ def cache_folder() -> Path:
     return folder
 
 
-CONFIG: Any = numba.config  # its attributes are made when it is imported
+CONFIG: Any = numba.config  # Any, because its attributes are set at import time, unknown to type checkers
 CACHE_FOLDER = cache_folder()
 FAST_MATH = {"contract", "arcp", "nsz", "reassoc"}
 
 
 class CacheLocator(UserProvidedCacheLocator):
-    """Finds kernels by the name of their package and not, as Numba does, by the path that it lies at.
+    """Finds cached kernels by their path within the package; Numba uses the absolute path.
 
-    `CACHE_FOLDER` is that of these very sources, so that a copy of them has the same kernels: Ray unpacks what is
-    shipped to a cluster's node into a folder that is new with each start of the cluster.
+    So a copy of the same sources elsewhere finds the same kernels. Ray unpacks shipped code into a new folder at each
+    start of a cluster.
     """
 
     @classmethod
@@ -75,8 +75,8 @@ class CacheLocator(UserProvidedCacheLocator):
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable[..., Any]:
     """`numba.njit` with this project's options: cached in `CACHE_FOLDER`, divisions without a zero check.
 
-    `fastmath` allows contraction and reordering; results are still the same in every process of one machine type,
-    because all of them run the same compiled code.
+    `fastmath` allows contraction and reordering. Results are still the same in all processes on one type of machine,
+    because they run the same compiled code.
     """
     if function is None:
         return lambda f: njit(f, **options)
@@ -89,9 +89,9 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
 
 
 def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`njit` for small kernels that return numbers only: inlined into their callers, without reference counting.
+    """`njit` for small kernels that return only numbers: inlined into their callers, without reference counting.
 
-    Passing a road and its constants costs some 60 arguments and the counting of its arrays: a third of a step's time.
-    Not for a kernel that returns or stores an array.
+    Otherwise, passing a road and its constants (some 60 arguments, with reference counts of the arrays) would take a
+    third of a step's time. Do not use it for a kernel that returns or stores an array.
     """
     return njit(function, forceinline=True, _nrt=False)

@@ -1,1 +1,1 @@
-"""What drives: the kinematic bicycle, the control period and its ends, the reward."""
+"""The ego car: bicycle model, control step, end of an episode, reward."""

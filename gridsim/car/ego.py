@@ -1,7 +1,8 @@
-"""The ego car: its state, and the one order of events in its control period.
+"""The ego car: its state, and its control step.
 
-`drive` is one control period of one car: act, advance in sub-steps with collision checks, count new ground, end. The
-batched `simulator` and the fused rollout of `evolution` are loops over it. State is float32 [FIELDS]; fields below.
+`drive` is one control step of one car: apply the action, advance in sub-steps with collision checks, count new ground,
+check for the end. The batched `envs.simulator` and `evolution.episodes.rollout` both call it. The state is float32
+[FIELDS], with the fields below.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ STEERING = 5  # rad, left positive
 DISTANCE = 6  # m of new ground
 PACED = 7  # m of new ground at a speed within the scenario's interval
 ODOMETER = 8  # m driven, either way
-DEBT = 9  # m reversed and not yet made good
+DEBT = 9  # m reversed that must be driven forward again before distance counts
 IDLE = 10  # control steps in a row without progress
 STEPS = 11  # control steps
 CELL = 12  # index of the visit cell the car is in
-FRESH = 13  # 1 where this cell's ground is new
+FRESH = 13  # 1 if this cell's ground is new
 FIELDS = 14
 
 _VISIT_SCALE = _F(1.0 / VISIT_CELL)
@@ -61,7 +62,7 @@ _OUTLINE.setflags(write=False)
 def collides(road, constants, x, y, cosine, sine):
     """Whether any part of the car's outline is off the road."""
     length, width = constants.half_length, constants.half_width
-    # Two circles cover each half of the car: free if both are clear of the edge, without a look at the outline.
+    # Two circles cover the car, one each half. If both are clear of the edge, the outline need not be checked.
     half = _HALF * length
     radius = math.sqrt(half * half + width * width)
     front = clearance(road, x + half * cosine, y + half * sine)
@@ -79,7 +80,7 @@ def collides(road, constants, x, y, cosine, sine):
 
 @leaf
 def visit_cell(road, x, y):
-    """Index of the visit cell that holds a point of the torus."""
+    """Index of the visit cell that contains a point of the torus."""
     columns = _I(road.width * _VISIT_SCALE)
     rows = _I(road.height * _VISIT_SCALE)
     column = min(max(_I(x * _VISIT_SCALE), _I(0)), columns - _I(1))
@@ -105,8 +106,8 @@ def place(road, start, car, visits):
 def look(road, constants, fan, car, world, beams, ranges, closing):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
-    Here and below a world of None is no traffic, and what traffic needs is not even compiled. closing as in
-    `boxes.cast_boxes`; without traffic it is left as it is.
+    Here and below, a world of None means no traffic: Numba then leaves the traffic code out. closing is as in
+    `boxes.cast_boxes`; without traffic it is not changed.
     """
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
@@ -118,9 +119,9 @@ def look(road, constants, fan, car, world, beams, ranges, closing):
 
 @leaf
 def drive(road, constants, car, visits, world, action):
-    """One control period of one car under one of the eight actions. Returns RUNNING, COLLISION or IDLE.
+    """One control step of one car with one of the eight actions. Returns RUNNING, COLLISION or IDLE.
 
-    Its world's traffic has moved already.
+    The traffic in `world` must already have moved.
     """
     acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
     car[STEERING] = steering
@@ -129,7 +130,7 @@ def drive(road, constants, car, visits, world, action):
 
 @leaf
 def move(road, constants, car, visits, world, acceleration):
-    """One control period with the car's present steering and an acceleration in m/s2."""
+    """One control step with the car's current steering and an acceleration in m/s2."""
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
     curvature = path_curvature(constants, speed, car[STEERING])
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
@@ -184,7 +185,7 @@ def move(road, constants, car, visits, world, acceleration):
     if road.speed_low <= speed and speed <= road.speed_high:
         car[PACED] += gained
     if gained < constants.progress:
-        # Who stands behind a standing car waits as it has to.
+        # Waiting behind a standing car is not idleness.
         waits = False
         if world is not None and near:
             waits = stands_ahead(constants, world, road.width, road.height, car[X], car[Y], cosine, sine)
@@ -201,7 +202,7 @@ def move(road, constants, car, visits, world, acceleration):
 
 @leaf
 def control(road, constants, car, visits, world, acceleration, target, max_steps):
-    """`move`, and then the episode's limits: m of new ground, and control steps. Returns an End as a number."""
+    """`move`, then check the episode's limits: m of new ground, and control steps. Returns an End as a number."""
     end = move(road, constants, car, visits, world, acceleration)
     if end == 0:
         if car[DISTANCE] >= target:

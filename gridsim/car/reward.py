@@ -1,8 +1,8 @@
-"""The paper's reward, once: of a control step of the environment, and of the experience that a learner collects.
+"""The paper's reward of a control step, for the environment and for the DQN's experience.
 
-0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a collision. f(distance) is the step's new ground
-and f(speed) the forward speed after it, as shares of what the scenario's upper speed gives and no more than 1; min(S)
-is the shortest of the rays then, as a share of their full range.
+0.15 f(distance) + 0.15 f(speed) + 0.7 min(S), each in [0, 1]; -1 for a collision. f(distance) is the new ground of the
+step, and f(speed) the forward speed after it, both relative to driving at the scenario's upper speed and at most 1;
+min(S) is the shortest ray after the step, relative to the full range.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from gridsim.jit import njit
 _F = np.float32
 
 
-# A leaf whose sums are not reordered, nor divisions replaced: it rounds the same in all kernels that it is part of.
+# Compiled without reordering sums or replacing divisions, so that it rounds the same in every kernel that inlines it.
 @njit(forceinline=True, _nrt=False, fastmath={"contract"})
 def reward(ranges, reach, speed, progress, end, fastest, dt):
     """Reward of one control step.
 
-    Args: ranges float32 [rays] and their full range (m), speed (m/s), new ground (m), and End, all after the step; the
-    upper speed of the scenario (m/s); the control period (s).
+    Args: after the step, ranges float32 [rays] and their full range (m), speed (m/s), new ground (m) and End; then the
+    scenario's upper speed (m/s) and the control period (s).
     """
     if end == 1:
         return _F(CRASH_REWARD)

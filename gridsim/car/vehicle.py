@@ -3,7 +3,7 @@
 Equations, with l_r the distance from the centre of mass to the rear axle and L the wheelbase:
     beta = atan(l_r / L * tan(steering))        slip angle
     x' = v cos(psi + beta),  y' = v sin(psi + beta),  psi' = v / l_r * sin(beta),  v' = a
-The path's curvature is sin(beta) / l_r. It is bounded to grip / v^2: faster than the tyres allow, the car runs wide.
+The path's curvature is sin(beta) / l_r, but at most grip / v^2: a car that is too fast for its tyres runs wide.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Action(IntEnum):
 
 @leaf
 def act(constants, action, speed, steering):
-    """What an action asks of the car in one control period.
+    """Acceleration and steering of an action in one control period.
 
     Returns: (acceleration m/s2, steering angle rad after the period). Without left or right the wheels return to the
-    centre. Braking stops at standstill; reverse goes on backwards.
+    centre. Braking ends at standstill; reverse continues backwards.
     """
     target = _ZERO
     if action == 1 or action == 5:
@@ -50,7 +50,7 @@ def act(constants, action, speed, steering):
     if action == 0 or action == 5 or action == 6:
         acceleration = constants.acceleration
     elif action == 3:
-        # Brakes only slow down: no more than what stops the car within the period.
+        # Brake at most so hard that the car stops within the period: brakes do not drive it backwards.
         acceleration = -min(max(speed / constants.dt, -constants.braking), constants.braking)
     elif action == 7:
         acceleration = -constants.acceleration
@@ -59,11 +59,12 @@ def act(constants, action, speed, steering):
 
 @leaf
 def act_continuous(constants, pedal, wheel, steering):
-    """What a continuous action asks of the car in one control period, `pedal` and `wheel` each in [-1, 1].
+    """Acceleration and steering of a continuous action in one control period, `pedal` and `wheel` each in [-1, 1].
 
-    pedal is a share of the greatest acceleration above 0 and of the greatest braking below; wheel is a share of the
-    greatest steering angle, left positive, towards which the wheels turn at their rate.
-    Returns: (acceleration m/s2, steering angle rad after the period). Braking goes on backwards, up to the limit there.
+    Above 0, pedal is a share of the maximum acceleration; below 0, of the maximum braking. wheel is a share of the
+    steering limit, left positive; the wheels turn towards it at the steering rate.
+    Returns: (acceleration m/s2, steering angle rad after the period). Braking continues backwards, up to the reverse
+    limit.
     """
     step = constants.steering_step
     target = min(max(wheel, -_ONE), _ONE) * constants.steering_limit
@@ -74,7 +75,7 @@ def act_continuous(constants, pedal, wheel, steering):
 
 @leaf
 def path_curvature(constants, speed, steering):
-    """Curvature (1/m, left positive) of the centre of mass's path: the bicycle's, bounded by lateral grip."""
+    """Curvature (1/m, left positive) of the centre of mass's path: the bicycle model's, limited by lateral grip."""
     tangent = constants.rear_share * math.tan(steering)  # of the slip angle
     curvature = tangent / (math.sqrt(_ONE + tangent * tangent) * constants.rear_axle)
     bound = constants.grip / max(speed * speed, _F(1e-6))
@@ -90,7 +91,7 @@ def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
     """
     after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
     length = _HALF * (speed + after) * dt
-    # Heading turns by `turn`; the chord points along heading + slip + turn / 2.
+    # The heading changes by `length * curvature`, called turn here; the chord points along heading + slip + turn / 2.
     half = _HALF * length * curvature
     square = half * half
     sine_half = half * (_ONE - square * (_F(1.0 / 6.0) - square * _F(1.0 / 120.0)))
@@ -98,10 +99,10 @@ def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
     chord = length * (_ONE - square * (_F(1.0 / 6.0) - square * _F(1.0 / 120.0)))
     sine_slip = curvature * constants.rear_axle
     cosine_slip = math.sqrt(max(_ONE - sine_slip * sine_slip, _ZERO))
-    # Unit vector along heading + turn / 2, then turned on by the slip angle.
+    # Unit vector along heading + turn / 2, then rotated by the slip angle.
     ch, sh = cosine * cosine_half - sine * sine_half, sine * cosine_half + cosine * sine_half
     x += chord * (ch * cosine_slip - sh * sine_slip)
     y += chord * (sh * cosine_slip + ch * sine_slip)
     c, s = ch * cosine_half - sh * sine_half, sh * cosine_half + ch * sine_half
-    norm = _F(1.5) - _HALF * (c * c + s * s)  # one Newton step of 1 / sqrt: keeps the vector a unit
+    norm = _F(1.5) - _HALF * (c * c + s * s)  # one Newton step of 1 / sqrt keeps the vector's length 1
     return x, y, c * norm, s * norm, after, length
