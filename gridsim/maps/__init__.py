@@ -1,1 +1,1 @@
-"""What is driven on: roads, lanes and their network, clearance fields, and maps from files."""
+"""Maps: roads, lanes, clearance fields, the scenarios that generate them, and maps from files."""

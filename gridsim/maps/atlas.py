@@ -1,4 +1,4 @@
-"""Several maps as one set of arrays, so that cars on different maps are one call of a kernel."""
+"""Several maps in one set of arrays, so that one kernel call can step cars on different maps."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ LANE_ARRAYS = (
 
 
 class Atlas(NamedTuple):
-    """Roads one after another; all arrays read-only and C-contiguous."""
+    """Concatenated maps; all arrays read-only and C-contiguous."""
 
-    field: np.ndarray  # as `Road.field`, of all maps
-    start_row: np.ndarray  # as `Road.start_row`
-    start: np.ndarray  # as `Road.start`
-    bounds: np.ndarray  # int64 [maps + 1, 3], where each map's part of these three begins
+    field: np.ndarray  # `Road.field` of all maps
+    start_row: np.ndarray  # `Road.start_row` of all maps
+    start: np.ndarray  # `Road.start` of all maps
+    bounds: np.ndarray  # int64 [maps + 1, 3], where each map begins in these three arrays
     sides: np.ndarray  # uint32 [maps, 3], columns, rows and `Road.thin`
     sizes: np.ndarray  # float32 [maps, 4], width and height (m), lower and upper speed (m/s)
-    lanes: Network  # arrays of all maps' networks
+    lanes: Network  # the arrays of all maps' networks
     lane_bounds: np.ndarray  # int64 [maps + 1, 3], where each map's points, lanes and crossings begin
 
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
-    """Lay maps one after another: a copy, unless there is one alone."""
+    """Concatenate maps. A single map is not copied."""
     lanes = networks[0]
     if len(networks) > 1:
         most = max(network.successors.shape[1] for network in networks)

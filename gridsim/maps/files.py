@@ -1,12 +1,12 @@
 """Maps from files: a picture in which bright is road, or the YAML form of ROS's map_server with a picture.
 
-A picture is thresholded at its own resolution; its signed distance to the edge between road and wall, sampled at the
-nodes of the clearance field, is what cars and rays meet. Unknown is wall, and so is all that lies outside of the
-picture, unless it is a torus. The world's point (0, 0) is the picture's lower left corner; a file's own coordinates
-are that plus its `origin`.
+A picture is thresholded at its own resolution. The signed distance to the edge between road and wall is sampled at the
+nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture, unless the map is a
+torus. World coordinates have their origin at the picture's lower left corner; a file's own coordinates are shifted by
+its `origin`.
 
-A file is one map, whatever the seed. It has no lanes: episodes begin at `Map.starts`, poses on the ridge of the
-free space, headed along it either way, or those that the file names.
+A file gives the same map for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
+in the file, or poses on the ridge of the free space, heading along it in both directions.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from gridsim.maps.roads import (
     power_of_two,
 )
 
-PIXELS_PER_M = 16.0  # of a picture without a scale of its own
+PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
 KEYS = (
@@ -64,17 +64,17 @@ SHORTEST_SIDE = 16  # m
 
 @dataclass(frozen=True)
 class MapFile:
-    """What a map's file says.
+    """The contents of a map file.
 
     Attributes:
         image: the picture's path.
         resolution: m a pixel.
         origin: x, y (m) of the picture's lower left corner in the file's own coordinates.
-        negate: whether dark is road.
+        negate: whether dark pixels are road.
         free_thresh: darkness, 0 to 1, below which a pixel is road.
-        starts: rows of x, y (m, the file's coordinates), heading (rad, NaN: along the road); empty: to be found.
+        starts: rows of x, y (m, the file's coordinates), heading (rad, NaN: along the road); empty: chosen by us.
         torus: whether leaving on one side means entering on the other.
-        speed: m/s, the interval within which speed counts.
+        speed: m/s, the speed interval.
     """
 
     image: Path
@@ -88,20 +88,20 @@ class MapFile:
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Map:
-    """The map of a file; the same object as long as the file stays as it is.
+    """The map of a file; the same object as long as the file does not change.
 
-    Raises: ValueError with one line that says what is wrong with the file.
+    Raises: ValueError with one line that names the problem.
     """
     path = Path(os.path.abspath(name))
     return _load(str(path), *(_stamp(file) for file in _files(path)), config=config or SimConfig())
 
 
 def short_lap(name: str, config: SimConfig) -> str:
-    """A line to warn with where a file's road is too short for a lap that counts twice, else ""."""
+    """A warning (one line) if a file's road is so short that a second lap counts no distance, else ""."""
     road, revisit = load_map(name, config).road, config.episode.revisit
     nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
     length = road_length(nodes)
-    if length > 1.05 * revisit:  # it is an estimate
+    if length > 1.05 * revisit:  # 5 % for the error of the estimate
         return ""
     return (
         f"{Path(name).stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
@@ -110,7 +110,7 @@ def short_lap(name: str, config: SimConfig) -> str:
 
 
 def map_digest(name: str) -> str:
-    """SHA-256 of the bytes that a map is made of. Raises: ValueError with one line if they cannot be read."""
+    """SHA-256 of a map's files. Raises: ValueError with one line if they cannot be read."""
     path = Path(os.path.abspath(name))
     limits = (MAX_YAML, MAX_IMAGE) if path.suffix.lower() in YAMLS else (MAX_IMAGE,)
     digests = [hashlib.sha256(_bytes(f, limit)).digest() for f, limit in zip(_files(path), limits, strict=True)]
@@ -118,7 +118,7 @@ def map_digest(name: str) -> str:
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read and check a map's YAML, or take a picture as it is. The picture is not opened.
+    """Read and check a map's YAML; for a picture alone, use defaults. The picture itself is not opened.
 
     Raises: ValueError with one line.
     """
@@ -130,7 +130,7 @@ def read_map_file(path: Path) -> MapFile:
     text = _bytes(path, MAX_YAML)
     try:
         values = yaml.safe_load(text)
-    except Exception as error:  # PyYAML raises a dozen kinds of them on input that is no YAML
+    except Exception as error:  # PyYAML raises many types of error on invalid input
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
         raise ValueError(f"{path}: no plain YAML{where}: {getattr(error, 'problem', None) or _shown(error)}") from None
@@ -144,7 +144,7 @@ def read_map_file(path: Path) -> MapFile:
 
 
 def _shown(value: object) -> str:
-    """A value in a few characters of one line, however large or nested it is."""
+    """A value's repr, shortened to one line of at most 80 characters."""
     try:
         text = " ".join(reprlib.repr(value).split())
     except ValueError:  # a number of more digits than Python prints
@@ -153,7 +153,7 @@ def _shown(value: object) -> str:
 
 
 def _stamp(path: Path) -> tuple[str, int, int]:
-    """What changes when a file does. Raises: ValueError unless it is a file that can be read."""
+    """Path, time and size: they change with the file. Raises: ValueError if it is not a file."""
     try:
         status = path.stat()
     except OSError as error:
@@ -177,13 +177,13 @@ def _bytes(path: Path, limit: int) -> bytes:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files that a map is made of."""
+    """The files of a map: the YAML, if any, and the picture."""
     image = read_map_file(path).image
     return [image] if image == path else [path, image]
 
 
 def _number(value: Any, what: str, low: float, high: float) -> float:
-    """A number within limits. (YAML 1.1 takes 5e-2 for a word; ROS does not.)"""
+    """A number within limits, also from text: YAML 1.1 reads 5e-2 as a string, ROS as a number."""
     number = value
     if isinstance(value, str):
         try:
@@ -209,7 +209,7 @@ def _list(value: Any, what: str, lengths: tuple[int, ...]) -> list[Any]:
 
 
 def _checked(path: Path, values: Any) -> MapFile:
-    """What a YAML's values mean. Raises: ValueError with one line, without the file's name."""
+    """The MapFile of a YAML's values. Raises: ValueError with one line, without the file's name."""
     if not isinstance(values, dict):
         raise ValueError(f"a map's YAML is a mapping with image and resolution, not {_shown(values)}")
     unknown = [key for key in values if key not in KEYS]
@@ -267,7 +267,7 @@ def _given_starts(values: Any) -> tuple[tuple[float, float, float], ...]:
 
 
 def _image_path(path: Path, image: Any) -> Path:
-    """The path of a YAML's picture, which lies in the YAML's folder or below."""
+    """The path of a YAML's picture, which must be in the YAML's folder or below."""
     if not isinstance(image, str) or Path(image).suffix.lower() not in PICTURES:
         raise ValueError(f"image must name a picture ({', '.join(PICTURES)}), not {_shown(image)}")
     folder = path.parent
@@ -286,12 +286,12 @@ def _image_path(path: Path, image: Any) -> Path:
 def read_free(file: MapFile) -> np.ndarray:
     """Which pixels are road: bool [rows, columns], the lowest row first.
 
-    Raises: ValueError with one line for what is no picture, too large a one, or all road or all wall.
+    Raises: ValueError with one line if the picture is unreadable, too large, all road or all wall.
     """
     data = _bytes(file.image, MAX_IMAGE)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our limit is lower
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is stricter
             picture = Image.open(io.BytesIO(data), formats=tuple(dict.fromkeys(PICTURES.values())))
         width, height = picture.size
     except Image.DecompressionBombError:
@@ -302,7 +302,7 @@ def read_free(file: MapFile) -> np.ndarray:
         raise ValueError(f"{file.image}: {width:,} x {height:,} pixels are more than {MAX_PIXELS:,}; make it smaller")
     try:
         free = _free(picture, file)
-    except Exception as error:  # decoders raise a dozen kinds of them
+    except Exception as error:  # decoders raise many types of error
         raise ValueError(f"{file.image}: truncated or damaged: {_shown(str(error))}") from None
     if not free.any():
         raise ValueError(f"{file.image}: all wall; road is what is {'darker' if file.negate else 'brighter'}")
@@ -312,7 +312,7 @@ def read_free(file: MapFile) -> np.ndarray:
 
 
 def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
-    """Road bool [rows, columns] of a picture, decoded here: its darkness is below the threshold, and it is opaque."""
+    """Decode a picture: bool [rows, columns], True for road, which is opaque and below the threshold of darkness."""
     if picture.mode == "F":
         raise ValueError("its pixels are real numbers; save it with 8 or 16 bits")
     if picture.mode.startswith("I"):
@@ -324,7 +324,7 @@ def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
             picture = picture.convert("RGBA")
             opaque = np.asarray(picture.getchannel("A")) >= 128
         if picture.mode != "L":
-            # The mean of the channels, as in map_server, not how bright the eye finds them.
+            # The mean of the channels, as in map_server, not the luminance.
             picture = picture.convert("RGB").convert("L", (1 / 3, 1 / 3, 1 / 3, 0))
         light, full = np.asarray(picture), 255
     values = np.arange(full + 1) / full
@@ -362,7 +362,7 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
 
 @lru_cache(maxsize=4)
 def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Map:
-    """Build a map. `stamps` tell a file that has changed."""
+    """Build a map. `stamps` are part of the cache's key, so that a changed file is read again."""
     path = Path(name)
     file = read_map_file(path)
     free = read_free(file)

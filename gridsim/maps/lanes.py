@@ -1,8 +1,8 @@
-"""Lanes from paths: straight and curved pieces in, equally spaced points, successors and crossings out.
+"""Lanes from paths: equally spaced points, successors and crossings.
 
 A path is a start pose and pieces of constant curvature, so that its points, its length and its sharpest bend are exact.
-What follows from the geometry is found from the geometry: a lane is succeeded by those that begin where it ends, and
-crosses those that come too close.
+Successors and crossings are found from the geometry: a lane's successors begin where it ends, and its crossings are
+the lanes that come too close to it.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from gridsim.jit import njit
 from gridsim.maps.roads import Lanes, Strips
 
 LANE_STEP = 1.0  # m between points of a lane, at most
-FORKS = 3  # successors of a lane at most: straight on, left and right
-_SAME = 0.01  # m and rad within which an end and a beginning are one
+FORKS = 3  # most successors of a lane: straight on, left and right
+_SAME = 0.01  # m and rad within which one lane's end is another's beginning
 
 
 class Path(NamedTuple):
-    """A directed curve: a pose, and pieces of constant curvature from there on."""
+    """A directed curve: a start pose, and pieces of constant curvature."""
 
     x: float  # m
     y: float  # m
@@ -40,7 +40,7 @@ def end_of(path: Path) -> tuple[float, float, float]:
 
 
 def beside(path: Path, offset: float) -> list[Path]:
-    """The pieces of a path, each a path of its own, `offset` m to the left of it."""
+    """The pieces of a path as separate paths, shifted `offset` m to the left."""
     pose, result = path[:3], []
     for length, curvature in path.pieces:
         x, y, heading = pose
@@ -52,13 +52,13 @@ def beside(path: Path, offset: float) -> list[Path]:
 
 
 def backwards(path: Path) -> Path:
-    """The same curve, driven the other way."""
+    """The same curve in the opposite direction."""
     x, y, heading = end_of(path)
     return Path(x, y, heading + math.pi, tuple((length, -curvature) for length, curvature in reversed(path.pieces)))
 
 
 def sample(path: Path, step: float) -> tuple[np.ndarray, float]:
-    """Points float32 [n, 2] along a path, and the spacing of them in m: `step` at most."""
+    """Points float32 [n, 2] along a path, and their spacing in m, `step` at most."""
     length = sum(length for length, _ in path.pieces)
     intervals = math.ceil(length / step)
     offsets = np.array([0, intervals + 1])
@@ -88,9 +88,9 @@ def strips_along(path: Path, half_width: float) -> Strips:
 
 
 def through_square(turn: int, half: float, offset: float) -> tuple[tuple[float, float], ...]:
-    """Pieces of a lane through a square of side 2 * half, driving on the right, `offset` m from the road's middle.
+    """Pieces of a lane through a square of side 2 * half, `offset` m to the right of the road's middle.
 
-    It leaves by the side `turn` quarters on, counter-clockwise, from the one it enters by: 1 right, 2 straight, 3 left.
+    turn: sides from the one it enters by to the one it leaves by, counter-clockwise: 1 right, 2 straight, 3 left.
     """
     if turn == 2:
         return ((2.0 * half, 0.0),)
@@ -100,7 +100,7 @@ def through_square(turn: int, half: float, offset: float) -> tuple[tuple[float, 
 
 @njit
 def _pose_after(x, y, heading, length, curvature):
-    """Pose after so many metres of constant curvature."""
+    """Pose after an arc of this length (m) and curvature (1/m)."""
     half = 0.5 * length * curvature
     chord = length * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
     return x + chord * math.cos(heading + half), y + chord * math.sin(heading + half), heading + 2.0 * half
@@ -108,7 +108,7 @@ def _pose_after(x, y, heading, length, curvature):
 
 @njit
 def _sample(starts, pieces, piece_offsets, steps, offsets):
-    """Points float32 [n, 2] at equal spacing along each path, and the poses float64 [lanes, 3] where paths end."""
+    """Points float32 [n, 2] equally spaced along each path, and the end poses float64 [lanes, 3]."""
     points = np.empty((offsets[-1], 2), dtype=np.float32)
     ends = np.empty((len(starts), 3))
     for lane in range(len(starts)):
@@ -120,7 +120,7 @@ def _sample(starts, pieces, piece_offsets, steps, offsets):
                 x, y, heading = _pose_after(x, y, heading, pieces[piece, 0], pieces[piece, 1])
                 passed += pieces[piece, 0]
                 piece += 1
-            # One by one: an assignment of slices takes two seconds to compile.
+            # Element by element, because a slice assignment takes two seconds to compile.
             end_x, end_y, end_heading = _pose_after(x, y, heading, s - passed, pieces[piece, 1])
             ends[lane, 0], ends[lane, 1], ends[lane, 2] = end_x, end_y, end_heading
             points[offsets[lane] + i, 0], points[offsets[lane] + i, 1] = end_x, end_y
@@ -129,7 +129,7 @@ def _sample(starts, pieces, piece_offsets, steps, offsets):
 
 @njit
 def _successors(starts, ends, width, height, successors):
-    """Fill successors [lanes, k] with the lanes that begin where each one ends; returns the least number of them."""
+    """Fill successors [lanes, k] with the lanes that begin where each lane ends; returns the smallest count of them."""
     least = len(starts)
     for i in range(len(starts)):
         count = 0
@@ -160,7 +160,7 @@ def _near(one, other, width, height):
 
 @njit
 def _crossings(points, offsets, successors, abreast, width, height):
-    """Whether two lanes may collide in a junction: bool [lanes, lanes], symmetric."""
+    """Whether cars on two lanes may collide in a junction: bool [lanes, lanes], symmetric."""
     n = len(offsets) - 1
     cross = np.zeros((n, n), dtype=np.bool_)
     middle, radius = np.empty((n, 2)), np.zeros(n)
@@ -188,12 +188,12 @@ def _crossings(points, offsets, successors, abreast, width, height):
 
 
 def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int = 1) -> Lanes:
-    """Lanes along paths on a torus of these sides (m).
+    """Lanes along paths, on a torus with these sides (m).
 
-    Of `abreast` paths in a row, beginning with the first, all run side by side, from left to right: they get the same
-    number of points and are each other's neighbours.
+    Each group of `abreast` consecutive paths runs side by side, from left to right. Lanes of a group have the same
+    number of points and are neighbours.
 
-    Raises: ValueError if a lane leads nowhere.
+    Raises: ValueError if a lane has no successor.
     """
     n = len(paths)
     lengths = np.array([sum(length for length, _ in path.pieces) for path in paths])

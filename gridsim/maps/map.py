@@ -1,4 +1,4 @@
-"""A map: road, lanes and traffic's network as arrays, ready to drive on, and where episodes begin on it."""
+"""A map as arrays: its road, its lanes, the lane network for traffic, and start poses."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", 
 
 @dataclass(frozen=True)
 class Map:
-    """One map, ready to drive on.
+    """One map.
 
     Attributes:
-        name: the scenario's name in the registry.
+        name: its scenario's name, or a file's path.
         seed: the seed it was built from.
-        road: what the kernels read.
+        road: the drivable area as kernels read it.
         lanes: directed polylines, for starts, traffic and drivers.
-        strips: exact geometry of the drivable area, for pictures and tests.
-        network: the lanes as traffic reads them.
+        strips: the exact drivable area, for pictures and tests.
+        network: the lanes as traffic's kernels read them.
         torus: whether leaving on one side means entering on the other.
-        starts: float32 [n, 5], poses to start from where there are no lanes: a map from a file.
+        starts: float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     """
 
     name: str
@@ -52,14 +52,14 @@ class Map:
 
     @cached_property
     def mileage(self) -> np.ndarray:
-        """Metres of lane before each point of `lanes`, all lanes one after another: float64 [points]."""
+        """Cumulated length (m) at each point of `lanes`, with all lanes laid end to end: float64 [points]."""
         step = np.diff(self.lanes.points.astype(np.float64), axis=0)
         length = np.hypot(step[:, 0], step[:, 1])
-        length[self.lanes.offsets[1:-1] - 1] = 0.0  # from one lane's end to the next lane's beginning is no road
+        length[self.lanes.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
         return freeze(np.concatenate([[0.0], np.cumsum(length)]))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """All of it as plain arrays, to be shared between processes without a copy."""
+        """The map as plain arrays, which processes can share without copying."""
         scalars = np.array([float(getattr(self.road, name)) for name in ROAD_FIELDS] + [self.seed, self.torus])
         return {
             "name": np.frombuffer(self.name.encode(), dtype=np.uint8),
@@ -77,7 +77,7 @@ class Map:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Map:
-        """The inverse of `arrays`; arrays are used as they are, read-only."""
+        """The inverse of `arrays`. The arrays are not copied, and become read-only."""
         frozen = {key: freeze(value) for key, value in arrays.items()}
         columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
         f = np.float32
@@ -105,7 +105,7 @@ class Map:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copies are read-only, too: kernels would be compiled anew for arrays that can be written to."""
+        """Unpickle with read-only arrays: for writable ones, Numba would compile the kernels again."""
         return Map.from_arrays, (self.arrays(),)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Map:
@@ -114,7 +114,7 @@ class Map:
 
 
 def blank(config: SimConfig) -> Map:
-    """A map of 8 m x 8 m without any road: to compile kernels with, before there are maps."""
+    """A map of 8 m x 8 m without any road, used to compile kernels before the first map is built."""
     side = 8
     lanes, f = Lanes.none(), np.float32
     return Map(
@@ -151,10 +151,10 @@ def _starts_at(points, mileage, shares, speed, starts):
 
 
 def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
-    """Starts float32 [n, 5] at these shares float64 [n], in [0, 1), of the length of all lanes, at rest.
+    """Starts float32 [n, 5], at rest, at these shares float64 [n] in [0, 1) of the total length of the lanes.
 
-    A start is x, y (m), heading (rad), speed (m/s), steering (rad): on the lane's centre line, along it. Of a map
-    without lanes, the starts at these shares of `Map.starts`.
+    A start is x, y (m), heading (rad), speed (m/s), steering (rad), on the lane's centre line and along it. On a map
+    without lanes, shares index `Map.starts`.
     """
     if not len(road_map.lanes):
         return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]
@@ -164,5 +164,5 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
 
 
 def sample_starts(road_map: Map, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts float32 [count, 5] uniformly over the lanes, as `starts_at` gives them."""
+    """Starts float32 [count, 5] uniformly over the lanes; see `starts_at`."""
     return starts_at(road_map, rng.random(count))

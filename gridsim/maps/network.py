@@ -1,4 +1,4 @@
-"""The lane network of a map as the kernels read it: tables made once a map, and where places on the torus lie."""
+"""The lane network of a map as kernels read it, and distances on the torus."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from gridsim.maps.roads import Lanes, freeze
 
 _F, _N = np.float32, np.uint64
 _HALF, _NEXT = _F(0.5), _N(1)
-_ROUNDED = 1e-3  # m, which is more than float32 rounds a box's sides by
+_ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 
 
 class Network(NamedTuple):
-    """Lanes as the kernels read them; arrays flat, read-only and C-contiguous. The rest is in `roads.Lanes`."""
+    """Lanes as kernels read them; arrays flat, read-only and C-contiguous. More about each is in `roads.Lanes`."""
 
     points: np.ndarray  # float32 [n, 2], m
-    speeds: np.ndarray  # float32 [n], m/s: greatest speed there, so that bends ahead are met in comfort
+    speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
     offsets: np.ndarray  # int32 [lanes + 1]
     steps: np.ndarray  # float32 [lanes], m between a lane's points
     successors: np.ndarray  # int32 [lanes, k]
-    left: np.ndarray  # int32 [lanes], neighbour for a change of lanes, or -1
+    left: np.ndarray  # int32 [lanes], neighbouring lane in the same direction, or -1
     right: np.ndarray
     crossing_offsets: np.ndarray  # int32 [lanes + 1]
-    crossings: np.ndarray  # int32 [c], junction lanes that cross each lane
-    clear: np.ndarray  # float32 [c], m along those from which on a car's middle is out of the way
-    room: np.ndarray  # float32 [n], m that a car there can move over to the right for who comes the other way
-    boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y of the box around each lane's points and half its sides
+    crossings: np.ndarray  # int32 [c], the junction lanes that cross each lane, lane by lane
+    clear: np.ndarray  # float32 [c], m along each of those beyond which a car no longer blocks this lane
+    room: np.ndarray  # float32 [n], m that a car can move to the right for oncoming cars
+    boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
     width: np.float32  # m, of the torus
     height: np.float32
 
 
 @njit
 def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, speeds):
-    """Greatest speed at each point: by lateral acceleration, and so that braking for what comes is comfortable."""
+    """Top speed at each point: limited by lateral acceleration, and by comfortable braking for slower points ahead."""
     lanes = offsets.shape[0] - 1
     for lane in range(lanes):
         first, last = offsets[lane], offsets[lane + 1] - 1
@@ -51,7 +51,7 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
             turn = abs(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy)) if a < b else 0.0
             length = 0.5 * (math.hypot(ux, uy) + math.hypot(vx, vy))
             speeds[p] = min(top, math.sqrt(lateral * length / max(turn, 1e-6))) if length > 1e-6 else top
-    for _ in range(4):  # a bend is felt through the lanes before it
+    for _ in range(4):  # repeated, so that a bend also limits the lanes before it
         for lane in range(lanes):
             first, last = offsets[lane], offsets[lane + 1] - 1
             onward = speeds[last]
@@ -65,7 +65,7 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
 
 @njit
 def _ease(offsets, steps, successors, slope, room):
-    """Let the room on the right end and begin gently, so many m a m of way, over lanes' ends as well."""
+    """Limit the slope of the room on the right (m for each m of way), also from lane to lane."""
     lanes = offsets.shape[0] - 1
     for _ in range(4):
         for lane in range(lanes):
@@ -86,7 +86,7 @@ def _ease(offsets, steps, successors, slope, room):
 
 @njit
 def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, height, apart, clear):
-    """For each crossing, the last point of the other lane within `apart` m of this one, as m along it."""
+    """For each crossing, how far along the other lane (m) its last point within `apart` m of this lane is."""
     for lane in range(offsets.shape[0] - 1):
         for c in range(crossing_offsets[lane], crossing_offsets[lane + 1]):
             other = crossings[c]
@@ -105,7 +105,7 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
 
 
 def _boxes(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """The boxes around lanes: float32 [lanes, 4]."""
+    """`Network.boxes` of lanes."""
     if len(offsets) < 2:
         return freeze(np.zeros((0, 4), dtype=np.float32))
     low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
@@ -120,9 +120,9 @@ def make_network(
     config: TrafficConfig,
     clearances: np.ndarray | None = None,
 ) -> Network:
-    """Tables of a map's lanes; `speed_limit` (m/s) is the scenario's own.
+    """The network of a map's lanes; `speed_limit` (m/s) is the scenario's.
 
-    Args: clearances float32 [points], m from each point of the lanes to the road's edge; without, nobody keeps right.
+    Args: clearances float32 [points], m from the lanes' points to the road's edge. Without them, `room` is 0.
     """
     f = np.float32
     speeds = np.empty(len(lanes.points), dtype=np.float32)
@@ -137,7 +137,7 @@ def make_network(
         )  # fmt: skip
     room = np.zeros(len(lanes.points), dtype=np.float32)
     if clearances is not None and len(lanes):
-        beside = np.maximum(lanes.left, lanes.right) >= 0  # where a lane is beside, that is where one moves over to
+        beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
         room = np.clip(clearances - f(config.kerb), 0.0, config.give_way).astype(np.float32)
         room[np.repeat(beside, np.diff(lanes.offsets))] = 0.0
         _ease(offsets, steps, successors, f(config.taper), room)
@@ -147,7 +147,7 @@ def make_network(
 def network_of_lanes(
     lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, room: np.ndarray, width: float, height: float
 ) -> Network:
-    """Tables from what `make_network` computed before; all arrays read-only already."""
+    """The network from arrays that `make_network` computed; they must be read-only."""
     return Network(
         points=lanes.points,
         speeds=speeds,
@@ -168,7 +168,7 @@ def network_of_lanes(
 
 @leaf
 def wrapped(difference, side):
-    """The shortest way round a torus of a side (m) for a difference of two coordinates on it."""
+    """Wrap the difference of two coordinates in [0, side) (m) to [-side / 2, side / 2]."""
     half = _HALF * side
     if difference > half:
         return difference - side
@@ -179,27 +179,27 @@ def wrapped(difference, side):
 
 @leaf
 def torus_distance(difference, side):
-    """How far that is, either way."""
+    """Shortest distance (m) on the torus, for the difference of two coordinates in [0, side)."""
     size = abs(difference)
     return min(size, side - size)
 
 
 @leaf
 def wrapped_any(difference, side):
-    """The same for any difference: lanes' points are not wrapped."""
-    # NumPy's floor is a float32; that of `math` is an int64, whose product with a float32 is a float64.
+    """As `wrapped`, for any difference; needed for points of lanes, which may lie outside [0, side)."""
+    # NumPy's floor, because that of `math` returns int64, whose product with float32 is float64.
     return difference - np.floor(difference / side + _HALF) * side
 
 
 @leaf
 def lane_length(network, lane):
     """Length (m) of a lane."""
-    lane = _N(lane)  # unsigned, here and elsewhere: a signed index might count from the end, which would be looked up
+    lane = _N(lane)  # unsigned, here and elsewhere: Numba checks whether signed indices are negative
     return _F(network.offsets[lane + _NEXT] - network.offsets[lane] - 1) * network.steps[lane]
 
 
 @leaf
 def is_junction(network, lane):
-    """Whether a lane is a junction's: others cross it."""
+    """Whether a lane is inside a junction, that is, whether other lanes cross it."""
     lane = _N(lane)
     return network.crossing_offsets[lane + _NEXT] > network.crossing_offsets[lane]

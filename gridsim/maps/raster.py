@@ -1,4 +1,4 @@
-"""From pixels to a map: the signed clearance of what is road in a picture, and where on it a car can start."""
+"""Maps from pictures: the signed clearance of the road, and poses where a car can start."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from scipy.sparse.csgraph import connected_components
 from gridsim.config import VehicleConfig
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
 
-OUTSIDE = -FIELD_FLOOR  # m of wall around what is road, at least: it must not show through the sides of the field
-_FINE = 0.25  # m, largest pixels that distances are measured on; larger ones are cut up
-_WALL = 0.4  # m, half of what walls are thickened to: above 0.36 m, no speck lies unseen between four nodes
-_TIP = 0.25  # m that a corner may stick out of where a disc of that radius fits, and is no thin wall
-_DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m of clearance, beyond which all is the same
-_HALO = _DEEPEST + 2.0  # m around a tile that may matter to it
+OUTSIDE = -FIELD_FLOOR  # m of wall around the road, at least, so that it does not wrap round the field's sides
+_FINE = 0.25  # m, largest pixels on which distances are measured; larger ones are subdivided
+_WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
+_TIP = 0.25  # m that a corner may extend beyond a disc of that radius without being a thin wall
+_DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m, the largest clearance that the field holds
+_HALO = _DEEPEST + 2.0  # m around a tile that can influence it
 _TILE = 128  # nodes
 
-_MARGIN = 0.3  # m around a car at a start that was found
-_TOUCH = 0.05  # m around a car at a start that was given
-_AHEAD = 6.0  # m that a car at a start can go straight on
-_EXTENT = 30.0  # m that a road extends, at least, for a car to be put on it
-_SMOOTH = 3.0  # m, standard deviation of the window in which a road's direction is taken
-_COHERENCE = 0.5  # of directions in there, from 0 (a plaza, a crossing) to 1 (a straight road)
+_MARGIN = 0.3  # m free around a car at a start that we choose
+_TOUCH = 0.05  # m free around a car at a start given in the file
+_AHEAD = 6.0  # m free straight ahead of a car at a start
+_EXTENT = 30.0  # m, least extent of a road with starts
+_SMOOTH = 3.0  # m, standard deviation of the window over which a road's direction is averaged
+_COHERENCE = 0.5  # least agreement of directions there, from 0 (a plaza, a crossing) to 1 (a straight road)
 _STARTS = 512
 _NODE = 1.0 / CELLS_PER_M  # m
 _BACK = np.array([0.0, 0.0, math.pi])
 
 
 def _thickened(free: np.ndarray, depth: np.ndarray, pixel: float) -> np.ndarray | None:
-    """Road without what thin walls are thickened by, so that the nodes of the field cannot miss them.
+    """The road after thin walls are thickened, so that the nodes of the field do not miss them.
 
-    A wall is thin where no disc of _WALL fits into it; every point of its middle line becomes such a disc. `depth` is
-    the distance (m) of a wall's pixels to the road. None if there is no thin wall.
+    A wall is thin where no disc of radius _WALL fits into it; such a disc is put on each point of its middle line.
+    `depth` is the distance (m) of a wall's pixels to the road. None if there is no thin wall.
     """
     middle = ~free & (depth < _WALL) & (depth >= ndimage.maximum_filter(depth, size=3))
     if not middle.any():
@@ -59,21 +59,20 @@ def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
     thickened = _thickened(free, depth, pixel)
     if thickened is not None:
         free, depth = thickened, outside(thickened)
-    # From a pixel's centre to the nearest one of the other kind, less half a pixel: the edge runs between the two.
+    # The distance to the nearest pixel of the other kind, less half a pixel, as the edge lies between the two centres.
     inside = np.maximum(ndimage.distance_transform_edt(free) - 0.5, 0.0) * pixel
     return np.where(free, inside, -depth).astype(np.float32)
 
 
 def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: int, torus: bool) -> np.ndarray:
-    """Signed clearance float32 [rows, columns] at the nodes of the field, in m, of road bool [pixels y, pixels x].
+    """Signed clearance (m) float32 [rows, columns] at the nodes of the field, of road bool [pixels y, pixels x].
 
-    Exact to a fifth of a pixel up to the deepest clearance that the field holds. Tile by tile, so that the memory it
-    takes does not grow with the picture.
+    Exact to a fifth of a pixel, up to the largest clearance of the field. It works tile by tile, to bound the memory.
     """
     halo = math.ceil(_HALO / resolution) + 1
     cut = max(math.ceil(resolution / _FINE - 1e-9), 1)
     padded = np.pad(free, halo, mode="wrap") if torus else np.pad(free, halo)
-    # Road that begins at the picture's edge has its wall behind the far end: the last nodes are those before 0.
+    # Road that begins at the picture's edge needs wall before it: nodes with negative indices wrap to the far end.
     used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
     first = [0 if torus else min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
     per_node = [n / side if torus else _NODE / resolution for n, side in zip(free.shape, (rows, columns), strict=True)]
@@ -106,13 +105,13 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
 
 
 def _clearance_at(nodes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Clearance (m) at points, as kernels read it."""
+    """Clearance (m) at points, bilinearly, as in kernels."""
     grid = [np.asarray(y) * CELLS_PER_M, np.asarray(x) * CELLS_PER_M]
     return ndimage.map_coordinates(nodes, grid, order=1, mode="grid-wrap")
 
 
 def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: float) -> np.ndarray:
-    """Whether a car with a margin (m) around it is all on the road, at poses [n, 3]: bool [n]."""
+    """Whether a car with a margin (m) around it is entirely on the road at poses [n, 3]: bool [n]."""
     half = np.array([vehicle.length, vehicle.width]) / 2 + margin
     along, across = (np.linspace(-h, h, math.ceil(2 * h / _NODE) + 1) for h in half)
     u, v = (points.ravel() for points in np.meshgrid(along, across))
@@ -122,7 +121,7 @@ def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: 
 
 
 def _way_ahead(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, reach: float) -> np.ndarray:
-    """How far (m, `reach` at most) a car could go straight on from poses [n, 3]: float64 [n]."""
+    """How far (m, `reach` at most) a car can drive straight ahead from poses [n, 3]: float64 [n]."""
     steps = np.arange(1, round(reach / _NODE) + 1) * _NODE
     x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
     free = _clearance_at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading)) >= vehicle.width / 2
@@ -130,10 +129,9 @@ def _way_ahead(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, rea
 
 
 def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Along which axis the road runs at each node: angle (rad) float [rows, columns], and the coherence, 0 to 1.
+    """The road's axis at each node: angle (rad) float [rows, columns], and its coherence, 0 to 1.
 
-    The structure tensor of the clearance (Bigun and Granlund 1987): near a road's middle gradients point across it
-    from both sides.
+    By the structure tensor of the clearance (Bigun and Granlund 1987): near a road's middle, gradients point across it.
     """
     gx = np.roll(nodes, -1, axis=1) - np.roll(nodes, 1, axis=1)
     gy = np.roll(nodes, -1, axis=0) - np.roll(nodes, 1, axis=0)
@@ -147,7 +145,7 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Where no direction stands out, at points [n, 2]: the axis (rad) with the longest way to both its ends."""
+    """For points [n, 2] without a clear direction, the axis (rad) with the longest free way both ways."""
     angles = np.arange(36) * math.pi / 36
     ways = np.empty((len(points), len(angles)))
     for k, angle in enumerate(angles):
@@ -157,7 +155,7 @@ def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig
 
 
 def _widest_heading(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
-    """The heading (rad) with the longest way straight on from a pose's point, amid those that are like it."""
+    """The middle (rad) of the sector of headings with the longest free way from a pose."""
     headings = np.arange(72) * math.pi / 36
     ways = _way_ahead(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
     best = int(np.argmax(ways))
@@ -166,7 +164,7 @@ def _widest_heading(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig)
 
 
 def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Connected parts: labels of nodes, 0 is none, and the part of each label; over the sides of the field as well."""
+    """Connected components, also across the field's sides: labels of nodes (0 is none), and each label's component."""
     labels, count = ndimage.label(wide)
     seams = np.concatenate([np.stack([labels[0], labels[-1]]), np.stack([labels[:, 0], labels[:, -1]])], axis=1)
     seams = seams[:, (seams > 0).all(axis=0)]
@@ -175,7 +173,7 @@ def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def road_length(nodes: np.ndarray) -> float:
-    """About how many m of road hang together: the largest part's area over its width. Within 10 % for a ring."""
+    """Estimated length (m) of the largest connected road: area over width. Within 10 % for a ring."""
     road = nodes > 0.0
     labels, group = _components(road)
     middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
@@ -186,7 +184,7 @@ def road_length(nodes: np.ndarray) -> float:
 
 
 def _large(wide: np.ndarray) -> np.ndarray:
-    """Which nodes belong to a connected part that extends some tens of metres; over the sides of the field as well."""
+    """Which nodes belong to a connected component of _EXTENT m or more."""
     labels, group = _components(wide)
     boxes = ndimage.find_objects(labels)
     size = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
@@ -195,14 +193,14 @@ def _large(wide: np.ndarray) -> np.ndarray:
 
 
 def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
-    """So many of the items at most, evenly over their order."""
+    """At most `count` of the items, evenly spread over their order."""
     return items[np.linspace(0, len(items) - 1, count).round().astype(int)] if len(items) > count else items
 
 
 def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Poses float64 [n, 3] (x, y, heading) on free space: along the road, both ways, a margin around the car.
+    """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
 
-    Raises: ValueError with one line if there is no room for a car.
+    Raises: ValueError with one line if a car fits nowhere.
     """
     wide = nodes >= vehicle.width / 2 + _MARGIN
     large = _large(wide)
@@ -234,9 +232,9 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
 
 
 def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Poses [n, 3] (x, y, heading) float64, their headings set along the road where they are NaN.
+    """Poses [n, 3] (x, y, heading) float64, in which a heading of NaN is replaced by the road's direction.
 
-    Raises: ValueError with one line where a car would be off the road.
+    Raises: ValueError with one line if a car would be off the road.
     """
     complete = np.array(poses, dtype=np.float64)
     size = np.array(nodes.shape[::-1]) * _NODE

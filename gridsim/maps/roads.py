@@ -1,10 +1,10 @@
 """Roads: strips with exact geometry, lanes with successors, and the fields that kernels read.
 
-The drivable area is the union of strips, straight pieces and arcs of a centre line, each with a half width, without the
-blocks: oriented rectangles such as parked cars. The signed clearance of a point is the greatest (half width - distance
-to the centre line) over the strips, and no more than the distance to the nearest block, negative inside: positive on
-the road, zero on its edge, exact near the edges, and never too large inside. Kernels read it from a byte field,
-bilinearly; tests hold it against the strips themselves.
+The drivable area is the union of strips (lines and arcs with a half width) without the blocks (oriented rectangles,
+such as parked cars). The signed clearance of a point is the maximum over the strips of (half width - distance to the
+centre line), but at most the signed distance to the nearest block. It is positive on the road and zero on its edge,
+exact near the edges, and elsewhere on the road a lower bound. Kernels interpolate it from a field of bytes; tests
+compare it with the strips.
 """
 
 from __future__ import annotations
@@ -18,43 +18,43 @@ import numpy as np
 from gridsim.jit import leaf, njit
 
 CELLS_PER_M = 2  # nodes of the clearance field per metre
-FIELD_FLOOR = -2.0  # m, clearance of byte 0: deeper inside a wall is all the same
+FIELD_FLOOR = -2.0  # m, clearance of byte 0, and of all that is deeper inside a wall
 FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
-HEADING_BINS = 90  # of the ray start table: 4 degrees each
-HEADING_WRAP = 64  # bins repeated behind the last, so that a fan of rays never wraps
+HEADING_BINS = 90  # bins of heading in the ray start table, 4 degrees each
+HEADING_WRAP = 64  # bins repeated after the last, so that a fan of rays needs no wrapping
 START_UNITS = 4.0  # steps of a start range byte per metre
 START_CELLS_PER_M = 1  # cells of the ray start table per metre
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
-THIN_WALL = 3.0  # m: a plain ray may pass what is thinner
+THIN_WALL = 3.0  # m; a plain ray may miss walls that are thinner
 MEMORY_LIMIT_CELLS = 1 << 24  # nodes of a field; above this a map is refused
 
 _F, _I, _U = np.float32, np.int32, np.uint32
-_SIMD_CONES = 16  # cones of the ray start table that are marched side by side
+_SIMD_CONES = 16  # cones of the ray start table that are marched in lockstep
 
 
 class Road(NamedTuple):
-    """What the kernels read of a map; all arrays flat, read-only and C-contiguous. Sides are powers of two."""
+    """A map as kernels read it; all arrays flat, read-only and C-contiguous. Sides are powers of two."""
 
     field: np.ndarray  # uint32 [rows * columns], bytes of the four corners: (0,0), (1,0), (0,1), (1,1) in (x, y)
-    start_row: np.ndarray  # int32 [cells of 1 m], row of `start` or -1 where no car can be
-    start: np.ndarray  # uint8 [rows * (HEADING_BINS + HEADING_WRAP)], range no ray from here falls short of
+    start_row: np.ndarray  # int32 [cells of 1 m], row of `start`, or -1 off the road
+    start: np.ndarray  # uint8 [rows * (HEADING_BINS + HEADING_WRAP)], lower bound of the range of rays from here
     columns: np.uint32  # nodes along x
     rows: np.uint32  # nodes along y
     width: np.float32  # m along x
     height: np.float32  # m along y
-    speed_low: np.float32  # m/s, the scenario's interval
+    speed_low: np.float32  # m/s, the speed interval
     speed_high: np.float32  # m/s
-    thin: np.uint32 = _U(1)  # 1 where walls may be under THIN_WALL, so that rays look out for them
+    thin: np.uint32 = _U(1)  # 1 if walls may be thinner than THIN_WALL, so that rays march with care
 
 
 @dataclass(frozen=True)
 class Strips:
-    """Centre lines with half widths, in metres; the exact description of the drivable area.
+    """Centre lines with half widths, in metres: the exact drivable area.
 
     Attributes:
         lines: float64 [n, 5]: x0, y0, x1, y1, half width.
         arcs: float64 [m, 6]: centre x, centre y, radius, start angle, sweep (rad, counter-clockwise), half width.
-        blocks: float64 [k, 5]: centre x, centre y, heading (rad), half length, half width: not drivable.
+        blocks: float64 [k, 5]: centre x, centre y, heading (rad), half length, half width; not drivable.
     """
 
     lines: np.ndarray
@@ -69,17 +69,17 @@ class Lanes:
     Attributes:
         points: float32 [n, 2], m; a lane's points lie together, in driving direction, not wrapped over the torus.
         offsets: int32 [lanes + 1], where each lane's points begin.
-        successors: int32 [lanes, k], -1 where there is none further; every lane has at least one. Where a successor
-            begins, the lane has ended, save for whole turns of the torus.
+        successors: int32 [lanes, k], filled up with -1; every lane has at least one. A successor begins where the lane
+            ends, up to whole turns of the torus.
         steps: float32 [lanes], m along the lane between its points; 1 m at most.
         lengths: float32 [lanes], m: steps * (points - 1).
-        left: int32 [lanes], the lane beside it to which a car may change, point i beside point i; -1 where none is.
+        left: int32 [lanes], the lane to the left to which a car may change, or -1. Its point i is beside point i.
         right: int32 [lanes], as `left`.
         crossing_offsets: int32 [lanes + 1], where each lane's part of `crossings` begins.
-        crossings: int32, the other lanes that a car on this lane may collide with inside a junction: they cross it or
-            merge into its end. Not those that begin where it begins, precede or succeed it, or lie beside it.
-        junction: uint8 [lanes], 1 where a lane has crossings.
-        limits: float32 [lanes], m/s that keep lateral acceleration in the lane's sharpest bend within comfort.
+        crossings: int32, for each lane the lanes with which it conflicts in a junction: they cross it or merge into its
+            end. Lanes with the same beginning, predecessors, successors and neighbours are not among them.
+        junction: uint8 [lanes], 1 if a lane has crossings.
+        limits: float32 [lanes], m/s at which lateral acceleration in the sharpest bend is BEND_COMFORT.
     """
 
     points: np.ndarray
@@ -96,7 +96,7 @@ class Lanes:
 
     @classmethod
     def none(cls) -> Lanes:
-        """No lanes: a map from a file has none."""
+        """No lanes, as on a map from a file."""
         empty = freeze(np.zeros(0, dtype=np.int32))
         none = freeze(np.zeros(0, dtype=np.float32))
         return cls(
@@ -121,13 +121,13 @@ class Lanes:
         return self.points[self.offsets[i] : self.offsets[i + 1]]
 
     def crossing(self, i: int) -> np.ndarray:
-        """Lanes [k] that cross lane i."""
+        """Lanes [k] that conflict with lane i."""
         return self.crossings[self.crossing_offsets[i] : self.crossing_offsets[i + 1]]
 
 
 @njit(nogil=True)
 def _cut_blocks(field, blocks, widest, wrap, node):
-    """Lower the clearance at the nodes around each block, as far as a road of half width `widest` may reach."""
+    """Lower the clearance at nodes around each block; `widest` is the largest half width of a road."""
     rows, columns = field.shape
     for k in range(blocks.shape[0]):
         x, y, heading, half_length, half_width = blocks[k]
@@ -152,7 +152,7 @@ def _cut_blocks(field, blocks, widest, wrap, node):
 
 @njit(nogil=True)
 def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
-    """Greatest (half width - distance) at each node, FIELD_FLOOR at least; each strip touches its band only."""
+    """Maximum of (half width - distance) at each node, at least FIELD_FLOOR; visits only the nodes near each strip."""
     field = np.full((rows, columns), _F(FIELD_FLOOR), dtype=np.float32)
     reach = -FIELD_FLOOR
     for k in range(lines.shape[0] + arcs.shape[0]):
@@ -175,7 +175,7 @@ def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
                 x_low, x_high = min(e0x, e1x, px), max(e0x, e1x, px)
                 y_low, y_high = min(e0y, e1y, py), max(e0y, e1y, py)
         band = w + reach
-        # Below a quarter turn the end points and the middle bound the arc up to its bulge; one node more covers that.
+        # Below a quarter turn, the ends and the middle bound the arc but for its bulge, which the slack covers.
         slack = 0.0 if is_line else 0.09 * radius
         i0, i1 = int(math.floor((x_low - band - slack) / node)), int(math.ceil((x_high + band + slack) / node))
         j0, j1 = int(math.floor((y_low - band - slack) / node)), int(math.ceil((y_high + band + slack) / node))
@@ -204,7 +204,7 @@ def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
 
 @njit
 def _pack(nodes):
-    """Clearance [rows, columns] in m to the four-corner words that `clearance` reads."""
+    """Pack clearance (m) [rows, columns] into the four-corner words that `clearance` reads."""
     rows, columns = nodes.shape
     quantised = np.empty((rows, columns), dtype=np.uint32)
     for j in range(rows):
@@ -227,11 +227,11 @@ def _pack(nodes):
 
 @njit(nogil=True, fastmath=False)
 def _ray_starts(nodes, columns, rows, ray_range):
-    """Start ranges: for each 1 m cell where a car can be and each bin of 4 degrees, how far every ray surely gets.
+    """The ray start table: for each 1 m cell on the road and each bin of 4 degrees, a lower bound of all rays' ranges.
 
-    A cone that holds every ray of the cell and bin is marched through the field; where it first may touch an edge
-    is the start. Without fast math, so that every machine has the same table.
-    Returns (row of each cell or -1, ranges as bytes [rows, bins + wrap]).
+    A cone that contains every ray of the cell and bin is marched through the field until it may touch an edge. Compiled
+    without fast math, so that every machine computes the same table.
+    Returns: (row of each cell or -1, ranges as bytes [rows, bins + wrap]).
     """
     k = CELLS_PER_M // START_CELLS_PER_M
     cells_x, cells_y = columns // k, rows // k
@@ -250,12 +250,12 @@ def _ray_starts(nodes, columns, rows, ray_range):
     ranges = np.zeros(count * stride, dtype=np.uint8)
     radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
     spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
-    margin = _F(0.2)  # m: not worth another step
+    margin = _F(0.2)  # m; the march ends below it
     mask_x, mask_y, flat = _I(columns - 1), _I(rows - 1), nodes.reshape(-1)
-    # Positions are kept above 0, where truncation is rounding down, by whole turns of the torus.
+    # Whole turns of the torus are added, so that positions are positive and truncation rounds down.
     turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
     turn_y = _F(rows * math.ceil(ray_range * CELLS_PER_M / rows) + 0.5)
-    # Cones are marched side by side, so that the inner loop becomes vector code; finished ones do not move.
+    # Cones are marched in lockstep, so that the inner loop is vectorised; finished ones do not move.
     cones = (HEADING_BINS + _SIMD_CONES - 1) // _SIMD_CONES * _SIMD_CONES
     c, s = np.empty(cones, dtype=np.float32), np.empty(cones, dtype=np.float32)
     for b in range(cones):
@@ -291,9 +291,9 @@ def _ray_starts(nodes, columns, rows, ray_range):
 
 @leaf
 def clearance(road, x, y):
-    """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, any tile of the torus."""
+    """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, also outside the torus."""
     px, py = x * _F(CELLS_PER_M), y * _F(CELLS_PER_M)
-    fx, fy = np.floor(px), np.floor(py)  # float32, unlike those of `math`
+    fx, fy = np.floor(px), np.floor(py)  # NumPy's floor returns float32 here, that of `math` int64
     ux, uy = px - fx, py - fy
     i = np.uint32(np.int32(fx)) & np.uint32(road.columns - np.uint32(1))
     j = np.uint32(np.int32(fy)) & np.uint32(road.rows - np.uint32(1))
@@ -309,7 +309,7 @@ def clearance(road, x, y):
 
 @njit
 def clearances(road, points):
-    """Signed distances (m), float32 [n], from points [n, 2] to the road's edge, as `clearance` gives them."""
+    """`clearance` (m) of points [n, 2]: float32 [n]."""
     found = np.empty(points.shape[0], dtype=np.float32)
     for k in range(points.shape[0]):
         found[k] = clearance(road, points[k, 0], points[k, 1])
@@ -317,21 +317,21 @@ def clearances(road, points):
 
 
 def freeze(array: np.ndarray) -> np.ndarray:
-    """The array, C-contiguous and read-only: the one form in which kernels are given their inputs."""
+    """The array as C-contiguous and read-only, the one form for which kernels are compiled."""
     array = np.ascontiguousarray(array)
     array.setflags(write=False)
     return array
 
 
 def power_of_two(n: float) -> int:
-    """Smallest power of two that is n or more."""
+    """The smallest power of two that is at least n."""
     return 1 << max(int(math.ceil(n)) - 1, 0).bit_length()
 
 
 def clearance_nodes(strips: Strips, width: float, height: float, torus: bool = True) -> np.ndarray:
     """Clearance float32 [rows, columns] at the nodes of the field, in m.
 
-    Raises: ValueError if the sides are no powers of two, or the field would be too large.
+    Raises: ValueError if a side is not a power of two, or the field would be too large.
     """
     columns, rows = round(width * CELLS_PER_M), round(height * CELLS_PER_M)
     if power_of_two(columns) != columns or power_of_two(rows) != rows:
@@ -345,7 +345,7 @@ def clearance_nodes(strips: Strips, width: float, height: float, torus: bool = T
 
 
 def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float, thin: bool = True) -> Road:
-    """The kernels' view of a clearance field [rows, columns] in m; thin: whether walls under THIN_WALL may occur."""
+    """The Road of a clearance field (m) [rows, columns]; thin: whether walls may be thinner than THIN_WALL."""
     rows, columns = nodes.shape
     start_row, start = _ray_starts(nodes, columns, rows, _F(ray_range))
     return Road(

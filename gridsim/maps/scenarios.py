@@ -1,4 +1,4 @@
-"""Scenarios: builders of maps from a seed, in one registry. Another one is one function and one line."""
+"""The scenarios: builders of maps from a seed. To add one, write a layout function and register it here."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from gridsim.maps.roads import (
     make_road,
 )
 
-TRAINING_SEED = 0  # first seed of the maps that are trained on
-VALIDATION_SEED = 1_000_000  # ... that choose the champion
-HELD_OUT_SEED = 2_000_000  # ... that are reported and never chosen on
+TRAINING_SEED = 0  # first seed of the training maps
+VALIDATION_SEED = 1_000_000  # ... of the maps on which the champion is chosen
+HELD_OUT_SEED = 2_000_000  # ... of the maps on which it is reported, used for nothing else
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scenario's builder and its driving limitations (the paper's term)."""
+    """A kind of road: its layout and its driving limitations (the paper's term)."""
 
     summary: str
     speed_interval: tuple[float, float]  # m/s, within which speed counts
-    traffic: int  # cars beside the ego car, unless told otherwise
+    traffic: int  # default number of cars beside the ego car
     thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
@@ -51,47 +51,47 @@ REGISTRY: dict[str, Scenario] = {
 
 
 def is_map_file(name: str) -> bool:
-    """Whether a scenario is named by a map's file, `gridsim.maps.files`, and not by the registry."""
+    """Whether a scenario's name is the path of a map file (`gridsim.maps.files`)."""
     return "." in name or os.sep in name
 
 
 def check_name(name: str) -> None:
-    """Raises: ValueError with one line for what is neither in the registry nor a map's file."""
+    """Raises: ValueError with one line if the name is neither in the registry nor a map file's."""
     if name not in REGISTRY and not is_map_file(name):
         names = ", ".join(sorted(REGISTRY))
         raise ValueError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
 
 
 def label(name: str) -> str:
-    """A scenario in one word: a map's file is called by its stem."""
+    """A short name of a scenario: for a map file, its stem."""
     return Path(name).stem if is_map_file(name) else name
 
 
 def default_traffic(name: str) -> int:
-    """Other cars on a scenario's road unless told otherwise; none on a map from a file, which has no lanes."""
+    """A scenario's default number of other cars; 0 on a map from a file, which has no lanes."""
     return REGISTRY[name].traffic if name in REGISTRY else 0
 
 
 def speed_interval(name: str) -> tuple[float, float]:
-    """m/s, a scenario's own; of a map from a file, the one that files have unless they say otherwise."""
+    """A scenario's speed interval, m/s; for a map file, the default of files."""
     return REGISTRY[name].speed_interval if name in REGISTRY else FILE_SPEEDS
 
 
 def seed_of_map(name: str, seed: int) -> int:
-    """The seed that stands for the map of a seed: a file has one map."""
+    """The seed of the map that `build` returns: always 0 for a map file, which has only one map."""
     return 0 if is_map_file(name) else seed
 
 
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    Raises: ValueError with one line for an unknown scenario, a seed below 0, or a map's file that is none.
+    Raises: ValueError with one line for an unknown scenario, a negative seed, or an invalid map file.
     """
     check_name(name)
     if seed < 0:
         raise ValueError(f"a seed must be 0 or more, not {seed}")
     if is_map_file(name):
-        from gridsim.maps.files import load_map  # here: workers never read files
+        from gridsim.maps.files import load_map  # imported here, because workers never read files
 
         return load_map(name, config)
     config = config or SimConfig()

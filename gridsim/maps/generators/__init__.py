@@ -1,1 +1,1 @@
-"""A builder a scenario: each makes a map from a seed."""
+"""The scenarios' generators: each lays out a map from a random generator."""

@@ -1,7 +1,7 @@
 """The city: narrow irregular blocks on a torus, plain crossings with tight corners, parked cars in bays at the kerb.
 
-Streets run along the axes at irregular distances; some pieces of them are missing, so that there are Ts and bends
-beside crossings. A bay widens the road on one side of a street; the cars in it are blocks that stay off the lanes.
+Streets run along the axes at irregular distances. Some pieces are missing, which makes T junctions and bends. A bay
+widens the road on one side of a street; the cars parked in it are blocks that do not reach into the lanes.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ SIDE = 256.0  # m, of the torus
 LANE_WIDTH = 3.0  # m
 HALF_ROAD = (3.4, 3.6)  # m, centre line to the kerb, drawn for each map
 CORNER = (8.0, 10.0)  # m, radius of the roads' centre lines round a corner, drawn for each crossing
-# Streets along one axis and the other, each with the least distance between those along that axis (m). The lane round
-# the smallest block, corners cut, is longer than the 200 m within which ground driven again counts nothing.
+# For each axis, the number of streets and the least distance between them (m). The way round the smallest block,
+# corners cut, is longer than the 200 m within which the same ground does not count again.
 GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
-MISSING = 0.2  # of the pieces of streets between crossings, at most
-BAY_SHARE = 0.6  # of the sides of streets
+MISSING = 0.2  # share of the pieces of streets between crossings, at most
+BAY_SHARE = 0.6  # of the sides of streets have a bay
 BAY_DEPTH = 2.0  # m
-BAY_LENGTH = 12.0  # m, at least, without its slanting ends
+BAY_LENGTH = 12.0  # m, at least, without its ends
 BAY_AWAY = 5.5  # m from the crossing, at least
 CAR = (2.0, 0.9)  # m, half length and half width of a parked car
 CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
-CAR_SHARE = 0.7  # of the places
-CAR_SKEW = 0.05  # rad either way
+CAR_SHARE = 0.7  # of the parking places are taken
+CAR_SKEW = 0.05  # rad, at most, either way
 CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
 
 
 def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray:
-    """Where on the torus the streets across one axis are, in m: `least` apart."""
+    """Positions (m) of the streets across one axis of the torus, `least` or more apart."""
     gaps = least + (SIDE - count * least) * rng.dirichlet(np.full(count, 2.0))
     return rng.uniform(0.0, SIDE) + np.concatenate([[0.0], np.cumsum(gaps[:-1])])
 
 
 def street_graph(rng: np.random.Generator, columns: int, rows: int) -> np.ndarray:
-    """Open edges bool [rows, columns, 4] (east, north, west, south): connected, two or more at every crossing."""
+    """Open edges bool [rows, columns, 4] (east, north, west, south): connected, and two or more at each node."""
     edges = np.ones((rows, columns, 4), dtype=bool)
     pairs = [(j, i, d) for j in range(rows) for i in range(columns) for d in (0, 1)]
     left = int(MISSING * len(pairs))
@@ -72,7 +72,7 @@ def _connected(edges: np.ndarray) -> bool:
 
 
 def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tuple[float, float, float]]:
-    """Parked cars of a bay: m along the street, m from the middle of the bay towards the lane, rad askew."""
+    """Parked cars of a bay: (m along the street, m from the bay's middle towards the lane, rad of skew)."""
     along = first + CAR[0] + rng.uniform(0.0, 1.0)
     while along + CAR[0] <= last:
         if rng.random() < CAR_SHARE:
@@ -81,7 +81,7 @@ def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tup
 
 
 def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """Lay a city: (strips, lanes, width m, height m)."""
+    """A city: (strips, lanes, width m, height m)."""
     (columns, apart_x), (rows, apart_y) = GRIDS[rng.integers(len(GRIDS))]
     xs, ys = _positions(rng, columns, apart_x), _positions(rng, rows, apart_y)
     edges = street_graph(rng, columns, rows)

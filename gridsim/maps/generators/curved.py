@@ -1,7 +1,7 @@
 """The curved road: one winding two-lane loop without a junction.
 
-Random corners, joined by a short round tour, rounded with arcs; a loop that does not bend both ways, comes too close to
-itself or has a bend that is too tight is drawn again.
+Random corners are joined by a short closed tour and rounded with arcs. A loop that does not bend both ways, comes too
+close to itself or has too tight a bend is drawn again.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MARGIN = 20.0  # m, corners from the torus's sides, so that the road does not cr
 LANE_WIDTH = 3.5  # m
 HALF_ROAD = 4.0  # m, centre line to the road's edge
 RADIUS = (16.0, 60.0)  # m, of the bends
-CORNERS = (8, 15)  # of a loop, from and below
+CORNERS = (8, 15)  # of a loop, from 8 to 14
 SPACING = 42.0  # m between corners, at least
 DRAWS = 60  # points from which corners are taken
 STRAIGHT = 5.0  # m between bends, at least
@@ -27,12 +27,12 @@ SHORTEST_BEND = 5.0  # m
 SHORTEST_LOOP = 450.0  # m
 BENDS_EACH_WAY = 2
 GAP = 3.0  # m between two parts of the road, edge to edge, at least
-NEIGHBOURS = 24.0  # m along the road within which two points are one part of it
+NEIGHBOURS = 24.0  # m along the road within which two points may be close to each other
 
 
 @njit
 def _tour(corners):
-    """Put corners [n, 2] in the order of a closed tour that no exchange of two edges shortens: it crosses nowhere."""
+    """Order corners [n, 2] as a closed tour by 2-opt, which leaves no crossing edges."""
     n = len(corners)
     better = True
     while better:
@@ -49,7 +49,7 @@ def _tour(corners):
 
 @njit
 def _meets_itself(points, step):
-    """Whether two points [n, 2] of a closed line, spaced `step`, are closer than two roads may be, save neighbours."""
+    """Whether a closed line of points [n, 2], `step` m apart, comes closer to itself than two roads may."""
     n, near = len(points), int(NEIGHBOURS / step)
     for i in range(n):
         for j in range(i + near, min(n, n + i - near + 1)):
@@ -60,7 +60,7 @@ def _meets_itself(points, step):
 
 
 def _corners(rng: np.random.Generator) -> np.ndarray:
-    """Corners [n, 2], SPACING apart, in the order of a tour."""
+    """Corners [n, 2], SPACING or more apart, in the order of a tour."""
     count = rng.integers(*CORNERS)
     corners: list[np.ndarray] = []
     for point in rng.uniform(MARGIN, SIDE - MARGIN, (DRAWS, 2)):
@@ -72,7 +72,7 @@ def _corners(rng: np.random.Generator) -> np.ndarray:
 
 
 def _rounded(corners: np.ndarray, rng: np.random.Generator) -> Path | None:
-    """The closed path round corners [n, 2], beginning with a straight; None where a bend does not fit."""
+    """The closed path round corners [n, 2], beginning with a straight; None if a bend does not fit."""
     edges = np.roll(corners, -1, axis=0) - corners
     lengths, headings = np.hypot(*edges.T), np.arctan2(edges[:, 1], edges[:, 0])
     turns = (headings - np.roll(headings, 1) + math.pi) % (2 * math.pi) - math.pi  # at each corner
@@ -94,7 +94,7 @@ def _rounded(corners: np.ndarray, rng: np.random.Generator) -> Path | None:
 
 
 def curved_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """Lay a loop: (strips, lanes, width m, height m)."""
+    """A loop: (strips, lanes, width m, height m)."""
     while True:
         middle = _rounded(_corners(rng), rng)
         if middle is None or sum(length for length, _ in middle.pieces) < SHORTEST_LOOP:

@@ -1,8 +1,7 @@
 """The highway: four lanes one way, straights and S-bends, round the torus in x.
 
-Each S-bend is a pair of arcs that leaves the road's heading as it was and shifts it sideways; the shifts add up to
-nothing and the straights fill the length, so that the road closes exactly. It is a function of x: a torus so wide that
-it does not meet itself is enough.
+Each S-bend is a pair of arcs that shifts the road sideways and keeps its heading. The shifts add up to 0 and the
+straights fill the length, so that the road closes exactly. The road's y is a function of x, so it never meets itself.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ STRAIGHT = 20.0  # m between S-bends, at least
 
 
 def highway_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """Lay a highway: (strips, lanes, width m, height m)."""
+    """A highway: (strips, lanes, width m, height m)."""
     while True:
         radii = rng.uniform(*RADIUS, (BENDS, 2))
         shifts = rng.uniform(*SHIFT, BENDS) * rng.choice([-1.0, 1.0], BENDS)

@@ -1,9 +1,9 @@
 """The seamless road network: square tiles on a torus, laid from a random graph, so that the road never ends.
 
-Every tile is read off the edges its node has in the graph: two opposite ones make a straight, two others a curve, three
-a T, four a crossing; now and then a T or crossing is built as a roundabout. No node has one edge alone, so every open
-edge meets an open edge and every lane has a successor. No block of the network has fewer than ten tiles around it:
-round one it is more than the 200 m within which a stretch that is driven again counts nothing, corners cut and all.
+The edges of a node decide its tile: two opposite edges make a straight, two others a curve, three a T, four a crossing;
+some Ts and crossings are built as roundabouts. No node has a single edge, so every lane has a successor. Each block of
+the network is surrounded by ten tiles or more: the way round it, corners cut, is longer than the 200 m within which the
+same ground does not count again.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ LANE_WIDTH = 3.5  # m
 SHOULDER = 0.5  # m of paved road outside the outer lane
 HALF_ROAD = LANE_WIDTH + SHOULDER  # m, centre line to the road's edge
 ROUNDABOUT_RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
-ROUNDABOUT_HALF = 4.5  # m, half width of the ring, which is wide enough for a lorry to turn
+ROUNDABOUT_HALF = 4.5  # m, half width of the ring, wide enough for a lorry to turn
 ROUNDABOUT_FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
-FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those: their outer edge runs on into the arm's
+FLARE_HALF = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those arcs, whose outer edge continues the arm's
 ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles of the seamless road
-FEWEST_ROUNDABOUTS = 6  # of a map of the roundabout scenario
-EDGE_SHARE = 0.9  # of the graph's edges that are kept, if the shortest block allows
+FEWEST_ROUNDABOUTS = 6  # on a map of the roundabout scenario
+EDGE_SHARE = 0.9  # share of the graph's edges that are kept where SHORTEST_BLOCK allows
 SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
 
 # Edges of a tile in counter-clockwise order: east, north, west, south.
@@ -34,9 +34,9 @@ DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 def _closes_short_block(edges: np.ndarray, tile: int, direction: int) -> bool:
-    """Whether an edge [n, 4] from a tile would close a block of fewer than SHORTEST_BLOCK tiles.
+    """Whether opening this edge of a tile would close a block of fewer than SHORTEST_BLOCK tiles.
 
-    Searched on the plane that the torus is rolled from: a way round the whole torus is no block.
+    The search is on the unrolled plane, since a way round the whole torus encloses no block.
     """
     x0, y0 = tile % TILES, tile // TILES
     goal = DIRECTIONS[direction]
@@ -96,7 +96,7 @@ def _largest_component(edges: np.ndarray) -> np.ndarray:
 def _flare() -> tuple[float, float, float]:
     """The arc by which an arm's lane joins the ring: (x, y of its centre for the eastern arm, ring angle in rad).
 
-    It touches the lane's centre line from the right and the ring's from outside.
+    It is tangent to the lane's centre line and, from outside, to the ring's.
     """
     y = LANE_WIDTH / 2 + ROUNDABOUT_FLARE
     x = math.sqrt((ROUNDABOUT_RADIUS + ROUNDABOUT_FLARE) ** 2 - y**2)
@@ -104,13 +104,13 @@ def _flare() -> tuple[float, float, float]:
 
 
 def rotated(points: np.ndarray, quarters: int) -> np.ndarray:
-    """Points [n, 2] turned counter-clockwise by so many quarters."""
+    """Points [n, 2] rotated counter-clockwise by quarter turns."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
 
 
 def _around(turn: int) -> tuple[tuple[float, float], ...]:
-    """Pieces of the lane through a roundabout: in on the right, counter-clockwise round the ring, out on the right."""
+    """Pieces of the lane through a roundabout, counter-clockwise; `turn` as in `through_square`."""
     x, _, angle = _flare()
     straight = (TILE / 2 - x, 0.0)
     flare = ((math.pi / 2 - angle) * ROUNDABOUT_FLARE, -1.0 / ROUNDABOUT_FLARE)
@@ -126,7 +126,7 @@ def _ring_strips(arms: list[int]) -> tuple[list[list[float]], list[list[float]]]
     arcs = [[0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF]]
     for arm in arms:
         dx, dy = DIRECTIONS[arm]
-        inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end stays off the island
+        inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end must not cover the island
         lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
         for side in (1.0, -1.0):  # way in, way out
             (cx, cy), first = rotated(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
@@ -135,11 +135,11 @@ def _ring_strips(arms: list[int]) -> tuple[list[list[float]], list[list[float]]]
 
 
 def square_strips(arms: list[int], half: float, half_road: float) -> tuple[list[list[float]], list[list[float]]]:
-    """Lines and arcs that join the middles of those sides of a square (of side 2 * half, centred on the origin)."""
+    """Lines and arcs that join the middles of some sides of a square (side 2 * half, centred on the origin)."""
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
     if len(arms) == 3:
-        # Paved already; but where the edges of the other three strips meet, none of them knows how wide the road is.
+        # This area is already covered, but near the seams of the other three strips their clearance is too small.
         dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
         lines.append([dx * half, dy * half, 0.0, 0.0, half_road])
     for k, a in enumerate(arms):
@@ -156,12 +156,12 @@ def square_strips(arms: list[int], half: float, half_road: float) -> tuple[list[
 
 
 def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """Lay a network: (strips, lanes, width m, height m)."""
+    """A network: (strips, lanes, width m, height m)."""
     return _layout(rng, tile_graph(rng), ROUNDABOUT_SHARE)
 
 
 def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """Lay a network in which every T and crossing is a roundabout: (strips, lanes, width m, height m)."""
+    """A network in which each T and crossing is a roundabout: (strips, lanes, width m, height m)."""
     while True:
         edges = tile_graph(rng)
         if (edges.sum(axis=1) > 2).sum() >= FEWEST_ROUNDABOUTS:
@@ -169,7 +169,7 @@ def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, f
 
 
 def _layout(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[Strips, Lanes, float, float]:
-    """Tiles and lanes along a graph's edges; this share of the T and crossing tiles are roundabouts."""
+    """The map of a graph; `share` of the T and crossing tiles are roundabouts."""
     lines: list[list[float]] = []
     arcs: list[list[float]] = []
     paths: list[Path] = []
