@@ -1,1 +1,1 @@
-"""What the car sees: range rays, other cars as boxes, the occupancy grid."""
+"""Sensors: range rays, other cars as boxes, the occupancy grid."""

@@ -1,4 +1,4 @@
-"""Other cars as oriented boxes: what rays hit of them, and whether they are run into."""
+"""Other cars as oriented boxes: ray casting and collisions."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 @leaf
 def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, ranges, closing):
-    """Shorten ranges (m) to the first box of a world that each ray meets: slab test (Kay and Kajiya 1986).
+    """Shorten ranges (m) to the first box of a world that each ray hits: slab test (Kay and Kajiya 1986).
 
     Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading and speed (m/s) along it;
     world of `world`.
-    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the relative speed (m/s) at which a car that
-    a ray has met and the sensor come closer along it, as a radar tells; 0 where that is the road's edge.
+    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the closing speed (m/s) along the ray of the
+    sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
     """
     if closing is not None:
         closing[:] = _ZERO
     length, breadth = constants.half_length, constants.half_width
     radius = math.sqrt(length * length + breadth * breadth)
     last_ray = _I(ranges.shape[0] - 1)
-    # Up to half a turn the field of view is where two half planes meet, by the first and the last ray: no angle is
-    # needed for what lies outside of one.
+    # A field of view below 180 degrees is the intersection of two half planes, along the first and the last ray. Boxes
+    # outside of it are skipped without computing an angle.
     narrow = fan[0, 0] > _ZERO
     margin, reach = _F(-1.01) * radius, constants.ray_range + radius
     for j in range(world.shape[0]):
@@ -48,7 +48,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, 
             continue
         first, last = _I(0), last_ray
         if squared > _F(4.0) * radius * radius:
-            # Only rays within the angle that the box's circle fills; its arc sine is at most 1.05 times its sine here.
+            # Only the rays that may hit the box's circle; here the arc sine is at most 1.05 times its argument.
             half = _F(1.06) * radius / math.sqrt(squared)
             angle = math.atan2(aside, forward)
             low, high = (angle - half - constants.ray_first), (angle + half - constants.ray_first)
@@ -57,7 +57,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, 
             first = max(_I(low / constants.ray_step), _I(0))
             last = min(_I(high / constants.ray_step) + _I(1), last_ray)
         bc, bs = world[j, COS], world[j, SIN]
-        ox, oy = -(dx * bc + dy * bs), -(dy * bc - dx * bs)  # the sensor as the box sees it
+        ox, oy = -(dx * bc + dy * bs), -(dy * bc - dx * bs)  # the sensor's position in the box's frame
         rc, rs = cosine * bc + sine * bs, sine * bc - cosine * bs
         for r in range(first, last + 1):
             ux, uy = rc * fan[0, r] - rs * fan[1, r], rs * fan[0, r] + rc * fan[1, r]
@@ -69,7 +69,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, 
             if enter <= leave and leave > _ZERO and enter < ranges[r]:
                 ranges[r] = max(enter, _ZERO)
                 if closing is not None:
-                    closing[r] = speed * fan[0, r] - world[j, SPEED] * ux  # the box moves along its own heading
+                    closing[r] = speed * fan[0, r] - world[j, SPEED] * ux  # the box moves along its heading, its x axis
 
 
 @leaf
@@ -90,7 +90,7 @@ def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
 
 @leaf
 def nearest_box(world, width, height, x, y):
-    """Distance (m) from a point to the nearest box of a world, and the greatest speed (m/s) of any within 20 m."""
+    """Distance (m) from a point to the middle of the nearest box, and the top speed (m/s) of boxes within 20 m."""
     nearest, fastest = _F(1e18), _ZERO
     for j in range(world.shape[0]):
         if world[j, LANE] >= _ZERO:
@@ -104,7 +104,7 @@ def nearest_box(world, width, height, x, y):
 
 @leaf
 def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
-    """Whether a car overlaps a box of a world as it was `back` of a control period (share) ago."""
+    """Whether a car overlaps a box of a world, moved back by `back` (a share) of a control period."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= _ZERO:
             behind = back * dt * world[j, SPEED]
@@ -119,7 +119,7 @@ def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
 
 @leaf
 def stands_ahead(constants, world, width, height, x, y, cosine, sine):
-    """Whether a standing box is close ahead of the front of a car, in its way."""
+    """Whether a standing box blocks the way close ahead of a car's front."""
     for j in range(world.shape[0]):
         if world[j, LANE] >= _ZERO and world[j, SPEED] < _HALF:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)

@@ -1,15 +1,15 @@
-"""The occupancy grid: what the range sensor's rays say about the ground ahead, cell by cell.
+"""The occupancy grid: the ground ahead, cell by cell, computed from the range sensor's rays.
 
 80 x 80 cells of 0.5 m, from the front axle to 40 m ahead of it and 20 m to either side. Row 0 is the farthest ahead and
-column 0 the leftmost, so that a picture of a grid has ahead upwards and left on the left. Each cell within the field of
-view belongs to the ray whose direction is nearest to its centre's. With r the centre's distance from the front axle, R
-the ray's range and h half the diagonal of a cell, it is
+column 0 the leftmost, as in a picture that looks ahead. Each cell within the field of view belongs to the ray whose
+direction is nearest to its centre's. With r the centre's distance from the front axle, R the ray's range and h half the
+diagonal of a cell, the cell is
 
-* free where r < R - h: it lies before what the ray hit;
-* occupied where R - h <= r <= R + h: the ray was stopped there;
-* unknown where r > R + h, hidden; and everywhere outside the field of view.
+* free if r < R - h, before the ray's hit;
+* occupied if R - h <= r <= R + h, at the hit;
+* unknown if r > R + h, behind the hit, or if it is outside the field of view.
 
-A ray that reached its full range hit nothing: its cells are free up to there, and unknown beyond.
+A ray with its full range hit nothing: its cells are free up to there, and unknown beyond.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _F, _I, _N = np.float32, np.int32, np.uint64
 CELLS = 80  # along each side
 CELL = 0.5  # m
 MAX_FRAMES = 8  # that an observation is made of
-#: Codes of a cell, dark to bright in a picture; divided by 255 they are what a network sees.
+#: Codes of a cell, as grey levels of a picture; networks see them divided by 255.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
 HALF_DIAGONAL = _F(CELL * math.sqrt(0.5))  # m
 
 
 class GridTable(NamedTuple):
-    """Cells sorted by ray, and by distance within a ray; made once for a configuration of the sensor."""
+    """Cells sorted by ray, then by distance; computed once for a configuration of the sensor."""
 
     first: np.ndarray  # int32 [rays + 1]: where each ray's cells begin
     cells: np.ndarray  # uint16 [cells in view]: index into a grid, row by row
@@ -69,10 +69,10 @@ def grid_table(config: SimConfig) -> GridTable:
 
 @leaf
 def fill_grid(table, ranges, grid):
-    """What one car's rays say of the cells: ranges float32 [rays] in m; writes grid uint8 [6400], row by row."""
+    """One car's grid from its ranges float32 [rays] in m; writes grid uint8 [6400], row by row."""
     for i in range(grid.shape[0]):
         grid[i] = UNKNOWN
-    # Unsigned indices: a signed one might count from the end.
+    # Unsigned indices, because Numba checks whether signed ones are negative.
     for ray in range(ranges.shape[0]):
         hit = ranges[ray]
         near, far = hit - HALF_DIAGONAL, hit + HALF_DIAGONAL
@@ -98,7 +98,7 @@ def _fill_grids(table, ranges, grids):
 def grids(table: GridTable, ranges: np.ndarray) -> np.ndarray:
     """Grids uint8 [n, 80, 80] of ranges float32 [n, rays] in m.
 
-    Raises: ValueError with one line for ranges of another shape.
+    Raises: ValueError with one line if ranges have another shape.
     """
     rays = len(table.first) - 1
     if ranges.ndim != 2 or ranges.shape[1] != rays:
@@ -122,11 +122,11 @@ def _push_frames(stacked, grids, begun):
 
 
 def push_frames(stacked: np.ndarray, grids: np.ndarray, begun: np.ndarray) -> None:
-    """Append each car's new grid to its stack, whose oldest drops out; the newest is last.
+    """Append each car's new grid to its stack and drop the oldest; the newest is last.
 
     Args: stacked uint8 [n, frames, 80, 80], C-contiguous, changed in place; grids uint8 [n, 80, 80]; begun bool [n],
-    where an episode has just begun: there all frames are the first grid.
-    Raises: ValueError with one line where shapes do not fit.
+    whether an episode has just begun; then all frames become the first grid.
+    Raises: ValueError with one line if shapes do not fit.
     """
     n = len(grids)
     if grids.shape != (n, CELLS, CELLS) or stacked.ndim != 4 or begun.shape != (n,):

@@ -1,11 +1,12 @@
 """The range sensor: rays over the forward field of view, marched through the signed clearance field.
 
-A ray is the root of the clearance along it. It starts where the table of `roads` says no ray can have ended yet, takes
-long steps while the road is wide and Newton steps near the edge; slopes are those of the bilinear field.
+A ray ends at the root of the clearance along it. It starts at the lower bound given by the ray start table of `roads`,
+takes long steps while the road is wide, and Newton steps near the edge, with slopes of the bilinear field.
 
-A step is longer than the clearance it starts from, so that a wall may lie within it. Where a map has walls thinner than
-such a step, steps are shorter and each is looked back at: what is neither within the clearance before it nor behind it
-is blind, and if that is more than _GAP, the ray goes back. So no ray passes a wall of 1 m or more.
+A step is longer than the clearance at its beginning, so it may skip a wall. On maps with walls thinner than such a
+step, steps are shorter and checked afterwards: the part of a step that neither the clearance at its beginning nor that
+at its end covers is blind. If the blind part is longer than _GAP, the ray goes back. So no ray passes a wall of 1 m or
+more.
 """
 
 from __future__ import annotations
@@ -35,16 +36,16 @@ _SLOPE = _F(CELLS_PER_M / FIELD_UNITS)
 _BINS_PER_RADIAN = _F(HEADING_BINS / (2.0 * math.pi))
 _PER_START = _U(CELLS_PER_M // START_CELLS_PER_M)
 _STRIDE = _I(HEADING_BINS + HEADING_WRAP)
-# Chosen for the least error at the least steps of the slowest ray, over 4,000 poses: 99th percentile 0.06 m.
-_NEAR = _F(2.0)  # m of clearance below which steps are Newton's
-_STRETCH = _F(1.5)  # of the steps above it
+# Chosen for a small error with few steps of the slowest ray, over 4,000 poses: 99th percentile 0.06 m.
+_NEAR = _F(2.0)  # m of clearance below which Newton steps are taken
+_STRETCH = _F(1.5)  # length of a step above it, in clearances
 _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
 _SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance ...
-_LEAP = _F(2.0)  # ... and at most this many m longer than a stretched one, so as not to jump over an island
+_LEAP = _F(2.0)  # ... and at most so many m longer than a stretched step, not to jump over an island
 _STEPS = 16  # at most
-_GAP = _F(0.95)  # m of a step that may be blind, among thin walls
-# How to march, plain and among thin walls: steps at most, leap in m, whether steps are looked back at. Plain, 3 m of
-# wall may be passed.
+_GAP = _F(0.95)  # m of a step that may be blind, on maps with thin walls
+# How to march without and with thin walls: most steps, leap in m, whether steps are checked for blind parts. PLAIN may
+# pass walls of less than 3 m.
 PLAIN = (_STEPS, _LEAP, False)
 AMONG_THIN_WALLS = (24, _F(0.9), True)
 
@@ -52,7 +53,7 @@ AMONG_THIN_WALLS = (24, _F(0.9), True)
 def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:
     """Directions of the rays from the heading: float32 [3, lanes] of cosine, sine, and bins from the first ray's.
 
-    `lanes` is count rounded up to whole blocks of SIMD_RAYS; a lane without a ray of its own repeats the last one.
+    `lanes` is count rounded up to a multiple of SIMD_RAYS; the extra ones repeat the last ray.
     """
     ray = np.minimum(np.arange(-(-count // SIMD_RAYS) * SIMD_RAYS), count - 1)
     angle = first + step * ray
@@ -66,14 +67,14 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
 def march(field, columns, rows, px0, py0, reach, beams, how):
     """Move each of SIMD_RAYS rays from its start range to the edge of the road.
 
-    Args: packed field with its sides; origin in cells; reach m; beams float32 [3, SIMD_RAYS]: direction x, direction
-    y and range, the start on entry and the result on return, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
+    Args: packed field with its sides; origin in cells; reach m; beams float32 [3, SIMD_RAYS]: direction x, direction y
+    and range: on entry the start, on return the result, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
     """
     steps, leap, look_back = how
     mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
     for r in range(SIMD_RAYS):
         dx, dy, t = beams[0, r], beams[1, r], beams[2, r]
-        safe = t  # m, up to which the way is known to be free, but for gaps
+        safe = t  # m that are known to be free, but for blind parts of _GAP or less
         for _ in range(steps):
             px, py = px0 + t * (dx * _SCALE), py0 + t * (dy * _SCALE)
             fx, fy = math.floor(px), math.floor(py)
@@ -107,7 +108,7 @@ def march(field, columns, rows, px0, py0, reach, beams, how):
 
 
 def _compiled(how: tuple[int, np.float32, bool]) -> Any:
-    """The vector code for `march`, all lanes until the last has arrived."""
+    """The vector code for `march`: it runs until the last ray has arrived."""
     steps, leap, look_back = how
     numbers = map(float, (_SCALE, _UNIT, _FLOOR, _SLOPE, _NEAR, _STRETCH, _CLOSE, _SLOPE_MIN, leap))
     arguments: list[Any] = [*numbers, float(_GAP) if look_back else None]
@@ -124,7 +125,7 @@ def _plain_march_thin(field, columns, rows, px0, py0, reach, beams):
     march(field, columns, rows, px0, py0, reach, beams, AMONG_THIN_WALLS)
 
 
-# With `NUMBA_DISABLE_JIT=1` the plain kernel is taken.
+# `NUMBA_DISABLE_JIT=1` selects the plain kernel.
 fast_march = _plain_march if CONFIG.DISABLE_JIT else _compiled(PLAIN)
 fast_march_thin = _plain_march_thin if CONFIG.DISABLE_JIT else _compiled(AMONG_THIN_WALLS)
 
@@ -149,7 +150,7 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
     base = max(row, _I(0)) * _STRIDE
     known = _F(1.0 / START_UNITS) if row >= 0 else _F(0.0)
     rays = ranges.shape[0]
-    # Unsigned indices: a signed one might count from the end, and that check would keep this from being vector code.
+    # Unsigned indices: Numba's check whether signed ones are negative would prevent vectorisation.
     zero, one, two, lanes = _N(0), _N(1), _N(2), _N(SIMD_RAYS)
     for block in range(0, fan.shape[1], SIMD_RAYS):
         at = _N(block)

@@ -1,8 +1,7 @@
 """Vector code for `rays.march`: 32 rays in lockstep, emitted as LLVM vectors.
 
-The arithmetic of the plain kernel in `sensors`; tests hold one against the other. The lanes go in lockstep: one that
-has arrived goes on refining while others march, which the plain kernel's do not. LLVM turns the vectors of 32
-into whatever the machine has.
+The arithmetic is that of the plain kernel `rays.march`; tests compare the two. Unlike there, a ray that has arrived is
+refined further while others march. LLVM maps the vectors of 32 to the machine's registers.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ def march_intrinsic(
     leap: float,
     gap: float | None,
 ) -> Any:
-    """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; numbers as in `sensors`.
+    """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; numbers as in `rays`.
 
-    Without a gap steps are not looked back at, and no code for that is emitted.
+    With a gap of None, steps are not checked for blind parts, and no code for that is emitted.
 
     beams float32 [3, SIMD_RAYS], C-contiguous: direction x, direction y, and the range, which is read and written.
     """

@@ -1,1 +1,1 @@
-"""Who else drives: state and spawning, car following and lane changes, junctions, meeting the ego car."""
+"""The other cars: state and spawning, car following and lane changes, junctions, meeting the ego car."""

@@ -1,9 +1,9 @@
 """Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change lanes on the highway.
 
-Longitudinal motion is the intelligent driver model (Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
-(Kesting, Treiber and Helbing 2007). The ego car is an obstacle like any other, and has the right of way at junctions
-(`junctions.py`); who meets it keeps to the right (`encounters.py`). What a car's state holds is in `world.py`, a map's
-lanes are in `network.py`.
+Car following is the intelligent driver model (IDM; Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
+(Kesting, Treiber and Helbing 2007). The ego car is an obstacle like the other cars, but has the right of way at
+junctions (`junctions.py`), and oncoming cars keep to the right for it (`encounters.py`). `world.py` defines a car's
+state, `maps/network.py` the lanes.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _REACH = _F(5.0)  # m beyond a car's horizon to search, since positions are of c
 
 
 class Drivers(NamedTuple):
-    """`TrafficConfig` as the kernels read it, with the cars' size and the control period."""
+    """`TrafficConfig` as kernels read it, with the cars' size and the control period."""
 
     acceleration: np.float32  # m/s2
     comfort: np.float32  # m/s2, deceleration
@@ -77,7 +77,7 @@ class Drivers(NamedTuple):
     half_length: np.float32  # m
     half_width: np.float32  # m
     dt: np.float32  # s
-    ego: Constants  # of the ego car, by which its way is foreseen
+    ego: Constants  # of the ego car, to predict its motion
 
 
 def drivers(sim: SimConfig) -> Drivers:
@@ -104,8 +104,8 @@ def drivers(sim: SimConfig) -> Drivers:
 def idm(drivers, speed, desired, gap, leader):
     """Acceleration (m/s2) of the intelligent driver model: Treiber et al. 2000, equations 2 and 3.
 
-    Args: own speed and the desired one, m/s; m to the leader's rear; the leader's speed, m/s. Without a leader the gap
-    is infinite.
+    Args: own speed and desired speed, m/s; gap to the leader's rear, m; the leader's speed, m/s. Without a leader, pass
+    a gap of 1e9.
     """
     ratio = speed / max(desired, _F(0.1))
     free = ratio * ratio
@@ -127,7 +127,7 @@ def horizon(drivers, speed):
 
 @leaf
 def _ahead(network, car, other):
-    """Way (m) from a car to one on its lane or on one of the two that come then; 1e9 if it is on none, or behind."""
+    """Way (m) from a car to another one ahead on its lane or on its next two lanes; else 1e9."""
     lane, along = other[LANE], other[ALONG]
     if lane == car[LANE] and along > car[ALONG]:
         return along - car[ALONG]
@@ -140,10 +140,10 @@ def _ahead(network, car, other):
 
 @leaf
 def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
-    """M from a car's middle along its path to where its way is blocked by a car at (x, y) with a heading; 1e9 if not.
+    """Way (m) along a car's path to where a car at (x, y) with a heading blocks it; 1e9 if it does not.
 
-    Looks at points of the path from the car's front on, up to `horizon` m. The path is as far to the right of the lane
-    as the car is now, and goes further there, `more` m a m of way, as far as there is room.
+    Tests points of the path from the car's front up to `horizon` m. The path lies as far to the right of the lane as
+    the car is now, and moves further right, by `more` m for each m of way, as far as there is room.
     """
     right = max(-car[SHIFT], _ZERO)
     half_length = drivers.half_length + drivers.half_width + CAUTION
@@ -160,7 +160,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
         box = network.boxes[_N(lane)]
         beside_x = abs(wrapped_any(box[0] - x, network.width)) - box[2]
         beside_y = abs(wrapped_any(box[1] - y, network.height)) - box[3]
-        if beside_x > reach_x or beside_y > reach_y:  # all of this lane is out of reach
+        if beside_x > reach_x or beside_y > reach_y:  # the lane's bounding box is out of reach
             travelled += max(length - along, _ZERO)
             along = max(along, length)
         else:
@@ -178,7 +178,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < _ZERO:
                     return travelled
-                hop = max(free, PATH_SAMPLE)  # nothing can be in the way any sooner
+                hop = max(free, PATH_SAMPLE)  # the path is free at least so far
                 along += hop
                 travelled += hop
         along -= length
@@ -191,28 +191,28 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
 
 @leaf
 def update_gap(network, drivers, car, other, is_ego):
-    """Take another car within a car's horizon into account: whether it is the nearest thing to keep behind."""
+    """Update a car's GAP and LEAD_SPEED if another car within its horizon is the nearest obstacle so far."""
     along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
     at = _F(1e9)
     dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
     forward = dx * car[COS] + dy * car[SIN]
-    looked = forward < _F(-6.0)  # who is behind is not in the way
+    done = forward < _F(-6.0)  # a car behind is no obstacle
     if not is_ego:
         lane = _N(_I(other[LANE]))
         at = _ahead(network, car, other) - drivers.half_length
-        # Neither is who keeps to a lane beside others.
-        looked = looked or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
-    if not looked:
-        near = min(car[HORIZON], car[GAP])  # nobody minds what is behind something else
+        # Nor is a car that keeps to its lane on a road with several lanes.
+        done = done or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
+    if not done:
+        near = min(car[HORIZON], car[GAP])  # only obstacles nearer than the nearest so far matter
         more = EGO_DODGE_SLOPE if is_ego and meets_ego(network, car, other) else _ZERO
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, more)
     if at < car[GAP]:
         car[GAP], car[LEAD_SPEED] = at, along
-    if is_ego and not looked and other[SPEED] > _ONE:
+    if is_ego and not done and other[SPEED] > _ONE:
         if car[COS] * other[COS] + car[SIN] * other[SIN] <= _HALF:
             at = way_to_ego_collision(network, drivers, car, other)
         elif forward > _ZERO:
-            # Where the ego car will be in a second: it may be about to cut in.
+            # The ego car's position in a second, as it may be about to cut in.
             x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
             near = min(car[HORIZON], car[GAP])
             at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, _ZERO)
@@ -222,7 +222,7 @@ def update_gap(network, drivers, car, other, is_ego):
 
 @leaf
 def _find_gaps(network, drivers, world, ego):
-    """Find for each car the nearest thing that it has to keep behind, within its horizon: GAP and LEAD_SPEED."""
+    """Find the nearest obstacle within each car's horizon: its GAP and LEAD_SPEED."""
     cars = world.shape[0]
     for i in range(cars):
         speed = world[i, SPEED]
@@ -250,7 +250,7 @@ def _find_gaps(network, drivers, world, ego):
 
 @leaf
 def _desired(network, car):
-    """Speed (m/s) that a car would like to go where it is."""
+    """A car's desired speed (m/s) at its place."""
     lane = _N(_I(car[LANE]))
     at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
     return car[SPEED_FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
@@ -258,7 +258,7 @@ def _desired(network, car):
 
 @leaf
 def change_lanes(network, drivers, world, i, ego):
-    """Move car i to a neighbouring lane if it is time to think of that, and if it is safe and the car gains by it."""
+    """At its turn, move car i to a neighbouring lane if that is safe and a gain."""
     car = world[i]
     if car[LANE_TIMER] > _ZERO:
         car[LANE_TIMER] -= _ONE
@@ -271,7 +271,7 @@ def change_lanes(network, drivers, world, i, ego):
 
 @njit(_nrt=False)
 def _choose_neighbour(network, drivers, world, i, ego):
-    """MOBIL (Kesting et al. 2007). Not inlined: the call is rare, and dear for all the network's arguments."""
+    """MOBIL (Kesting et al. 2007). Not inlined: calls are expensive but rare."""
     car = world[i]
     lane = _I(car[LANE])
     mine = car[ACCELERATION]
@@ -306,11 +306,11 @@ def _choose_neighbour(network, drivers, world, i, ego):
                     ahead = along + lane_length(network, there) - place
                     ahead = -ahead
                 elif there != lane and other[SHIFT] != _ZERO and dx * dx + dy * dy < _F(400.0):
-                    free = False  # somebody else is moving over, from beyond the target lane or out of it
+                    free = False  # another car is changing lanes, to or from the target lane
                 if ahead > _F(1e8):
                     continue
             else:
-                ahead = dx * car[COS] + dy * car[SIN]  # of the ego car, which is on no lane
+                ahead = dx * car[COS] + dy * car[SIN]  # the ego car is on no lane
                 aside = dy * car[COS] - dx * car[SIN]
                 sideways = NEIGHBOUR_LANE if side == 0 else -NEIGHBOUR_LANE
                 if abs(aside - sideways) > NEIGHBOUR_HALF_WIDTH + NEIGHBOUR_WIDENING * ahead * ahead:
@@ -353,7 +353,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
 
 @leaf
 def _move(network, drivers, car, ego):
-    """Move one car by its acceleration for a control period, and to the right or back by how it meets the ego car."""
+    """Move one car for a control period along its lane, and sideways: to the right for the ego car, or back."""
     after = max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
     car[ALONG] += _HALF * (car[SPEED] + after) * drivers.dt
     car[SPEED] = after
@@ -384,10 +384,10 @@ def _move(network, drivers, car, ego):
 
 @leaf
 def flow(network, drivers, world, ego):
-    """One control period of a world's traffic around the ego car as it was before its own move.
+    """One control period of a world's traffic. The ego car must not have moved yet.
 
-    Args: world [cars, FIELDS], changed; ego, a car of which X to STEERING are read (without a heading, COS and SIN 0,
-    it is not there).
+    Args: world [cars, FIELDS], changed; ego, a car's state of which X to STEERING are read. COS and SIN of 0 mean that
+    there is no ego car.
     """
     cars = world.shape[0]
     _find_gaps(network, drivers, world, ego)
@@ -399,7 +399,7 @@ def flow(network, drivers, world, ego):
         desired = _desired(network, car)
         pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED])
         if is_junction(network, onward) and car[PERMIT] != car[NEXT]:
-            # A junction comes: up to its line without a permit.
+            # Without a permit, stop at the line of the junction ahead.
             line = lane_length(network, lane) - car[ALONG] - drivers.half_length
             if line < car[HORIZON]:
                 if may_enter(network, drivers, world, i, ego):

@@ -1,4 +1,4 @@
-"""How traffic meets the ego car: it keeps to the right of its lane, and sees coming where both would be."""
+"""How traffic reacts to an oncoming or crossing ego car: keep to the right, predict collisions and stop."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 @leaf
 def meets_ego(network, car, ego):
-    """Whether the ego car, not far ahead, comes towards a car or crosses its way."""
+    """Whether the ego car is near, ahead, and oncoming or crossing."""
     if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE:
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
@@ -37,7 +37,7 @@ def meets_ego(network, car, ego):
 
 @leaf
 def room_to_right(network, car):
-    """M to the right that a car can move over where it is."""
+    """`Network.room` (m) at a car's place."""
     lane = _N(_I(car[LANE]))
     at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
     return network.room[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
@@ -45,7 +45,7 @@ def room_to_right(network, car):
 
 @leaf
 def shifted_right(network, k, other, right):
-    """Point k of a lane (m), moved to the right; other is a neighbour of k, before or after it on the lane."""
+    """Point k of a lane, shifted `right` m to the right; other is the point before or after it."""
     one, two = max(k, other), min(k, other)
     x, y = network.points[k, 0], network.points[k, 1]
     ux, uy = network.points[one, 0] - network.points[two, 0], network.points[one, 1] - network.points[two, 1]
@@ -55,21 +55,21 @@ def shifted_right(network, k, other, right):
 
 @njit(_nrt=False)
 def way_to_ego_collision(network, drivers, car, ego):
-    """M from a car's middle along its path to where it must not get if it is not to run into the ego car.
+    """Way (m) along a car's path to its predicted collision with the ego car; 1e9 if it should drive on.
 
-    Both are taken to go on as they do: the car along its lanes at its speed, keeping to the right, the ego car at its
-    own on the arc that it steers. 1e9 if they do not touch within three seconds; or if the ego car runs into this one's
-    side or rear and it cannot well stop before that: then it had better go on.
-    Not inlined: the call is rare, and dear for all the network's arguments.
+    Both are predicted at constant speed: the car along its lanes, keeping to the right, the ego car on its current arc.
+    The car drives on if they do not touch within FORESIGHT, or if the ego car would hit its side or rear and it can no
+    longer stop before.
+    Not inlined: calls, with all the network's arguments, are expensive but rare.
     """
     lane = _I(car[LANE])
-    length, begin = lane_length(network, lane), -car[ALONG]  # m of the lane, and of way to its beginning
+    length, begin = lane_length(network, lane), -car[ALONG]  # length of the lane, way to its beginning (m)
     x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
     curvature = path_curvature(drivers.ego, speed, ego[STEERING])
     dx, dy = wrapped(x - car[X], network.width), wrapped(y - car[Y], network.height)
     t = _ZERO
     while True:
-        # Nothing can touch any sooner.
+        # The earliest time at which they can touch.
         hop = max((math.sqrt(dx * dx + dy * dy) - CONTACT_DISTANCE) / (car[SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
         if t > FORESIGHT:

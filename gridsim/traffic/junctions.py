@@ -1,4 +1,4 @@
-"""Junctions: who may enter. A junction lane is entered only with a permit, which nobody gets while its ground is taken.
+"""Right of way at junctions. A car needs a permit to enter a junction lane; it gets one when no other car conflicts.
 
 The ego car has the right of way.
 """
@@ -33,7 +33,7 @@ _ZERO, _HALF = _F(0.0), _F(0.5)
 
 @leaf
 def _blocked_by_waiting_car(network, drivers, lane, other):
-    """Whether a lane passes where a car's rear is that waits at the end of another lane with the same beginning."""
+    """Whether the rear of a car that waits at the end of `other` blocks a lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
     reach = _F(2.0) * drivers.half_width + _F(2.0) * CAUTION
@@ -47,7 +47,7 @@ def _blocked_by_waiting_car(network, drivers, lane, other):
 
 @leaf
 def _way_to_point(network, lane, x, y, within):
-    """M along a lane to its first point so many m or less from (x, y); 1e9 if it does not come so near."""
+    """Way (m) along a lane to its first point within `within` m of (x, y); 1e9 if there is none."""
     first, k = network.offsets[lane], network.offsets[lane]
     while k < network.offsets[lane + 1]:
         dx, dy = (
@@ -63,7 +63,7 @@ def _way_to_point(network, lane, x, y, within):
 
 @leaf
 def _in_ego_path(network, lane, ego, way):
-    """Whether a lane comes within `way` m of the ego car in front of it, or right beside it."""
+    """Whether a lane passes through the sector `way` m ahead of the ego car, or close to the ego car."""
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
         dx = wrapped_any(network.points[p, 0] - ego[X], network.width)
         dy = wrapped_any(network.points[p, 1] - ego[Y], network.height)
@@ -79,12 +79,12 @@ def _in_ego_path(network, lane, ego, way):
 
 @leaf
 def may_enter(network, drivers, world, i, ego):
-    """Whether car i may enter its next lane, a junction's: nobody's way crosses it, and there is room behind it."""
+    """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond."""
     car = world[i]
     here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[SECOND_NEXT])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
-    # Who enters must be able to leave, or junctions would block each other. Before another junction there is room for
-    # one, else for as many as the lane beyond holds.
+    # A car that enters must be able to leave, or junctions would block each other. If another junction follows at once,
+    # there is room for one car, else for as many as the lane beyond holds.
     chained = is_junction(network, beyond)
     place = _F(2.0) * drivers.half_length + drivers.jam
     room, needed = max(lane_length(network, beyond), place), place
@@ -93,7 +93,7 @@ def may_enter(network, drivers, world, i, ego):
             continue
         there, past, permit = _I(world[j, LANE]), _I(world[j, JUNCTION_BEHIND]), _I(world[j, PERMIT])
         onward = _I(world[j, NEXT])
-        # Most are nowhere near a junction.
+        # Most cars are not near a junction and need no check.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]
             if permit == other:
@@ -104,10 +104,10 @@ def may_enter(network, drivers, world, i, ego):
                 network.clear[c] + _HALF
             ):
                 return False
-        waits = _I(-1)  # lane at whose end the other may have to wait, still in this junction
+        waits = _I(-1)  # lane of this junction at whose end the other car may have to wait
         if there == here and world[j, ALONG] > car[ALONG]:
             if permit != onward:
-                return False  # who is in front of this one waits for others, who must not wait for this one
+                return False  # the car in front waits for others, which would then wait for this one
             if is_junction(network, _I(world[j, SECOND_NEXT])):
                 waits = permit
         elif permit != onward and is_junction(network, there) and is_junction(network, onward):
@@ -130,8 +130,8 @@ def may_enter(network, drivers, world, i, ego):
             onward == beyond and is_junction(network, there)
         ):
             needed += place
-    # The ego car goes first, unless it is behind this one. Which way it will turn nobody knows, so all the ground ahead
-    # of it is left to it; but who is in a junction already, as in a roundabout, goes on.
+    # The ego car goes first, unless it is behind this car. Its turn is unknown, so all the ground ahead of it is kept
+    # free. A car that is already in a junction, as in a roundabout, drives on.
     if ego[COS] != _ZERO or ego[SIN] != _ZERO:
         dx, dy = ego[X] - car[X], ego[Y] - car[Y]
         dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)

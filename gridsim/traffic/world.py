@@ -1,8 +1,7 @@
-"""Worlds: the other cars around one ego car, where they are on their lanes, and how they get there.
+"""Worlds: the state of the other cars around one ego car, and where they are spawned.
 
-A world is float32 [cars, FIELDS], the fields below. Whatever happens in it follows from that array and from the ego
-car alone. A car is on rails: its centre of mass lies on its lane, shifted sideways while it changes lanes or meets
-the ego car.
+A world is float32 [cars, FIELDS], with the fields below. Its evolution depends only on that array and on the ego car. A
+car's centre of mass lies on its lane, shifted sideways while it changes lanes or meets the ego car.
 """
 
 from __future__ import annotations
@@ -23,29 +22,29 @@ _ZERO, _ONE = _F(0.0), _F(1.0)
 X, Y = 0, 1  # m, centre of mass
 COS, SIN = 2, 3  # heading
 SPEED = 4  # m/s
-LANE = 5  # index of its lane, -1 for a car that is not there
+LANE = 5  # index of its lane; -1 for an absent car, which is ignored
 ALONG = 6  # m along it
-NEXT, SECOND_NEXT = 7, 8  # the two lanes that come then
-JUNCTION_BEHIND = 9  # junction lane that its rear may still be on, or -1
+NEXT, SECOND_NEXT = 7, 8  # its next two lanes
+JUNCTION_BEHIND = 9  # junction lane on which its rear may still be, or -1
 PERMIT = 10  # junction lane that it may enter next, or -1
 SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
-SPEED_FACTOR = 12  # desired speed over the lane's
-SEED = 13  # of its turns, below 2 ** 24
-DRAWS = 14  # lanes it has chosen so far
+SPEED_FACTOR = 12  # its desired speed, relative to the lane's
+SEED = 13  # of its random turns, below 2 ** 24
+DRAWS = 14  # random numbers drawn so far, one a lane
 ACCELERATION = 15  # m/s2, its acceleration in this step
 HORIZON = 16  # m ahead that it looks in this step
-GAP = 17  # m from its middle to where it must not get
-LEAD_SPEED = 18  # m/s of what is there
-LANE_TIMER = 19  # control steps until it thinks of another lane
+GAP = 17  # m from its middle to the nearest obstacle
+LEAD_SPEED = 18  # m/s, of that obstacle along its heading
+LANE_TIMER = 19  # control steps until its next decision on a change of lanes
 FIELDS = 20
 
-_MOST = 1 << 24  # float32 holds all whole numbers up to it
-_FASTEST = 40.0  # m/s; nobody drives as fast on any map, and nobody passes a whole lane in a control period
+_MOST = 1 << 24  # float32 represents all whole numbers up to it
+_FASTEST = 40.0  # m/s, above any car's speed; slow enough that no car skips a lane in a control period
 
 
 @leaf
 def set_pose(network, car, sway):
-    """Put a car where its lane, its metres along it and its shift say; `sway` is the shift's speed over the car's."""
+    """Set a car's pose from LANE, ALONG and SHIFT; `sway` is its sideways speed relative to its speed."""
     one, two = _U(1), _U(2)
     lane = _U(_I(car[LANE]))
     first = _U(network.offsets[lane])
@@ -55,7 +54,7 @@ def set_pose(network, car, sway):
     part = at - _F(_I(k))
     x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
     dx, dy = network.points[first + k + one, 0] - x0, network.points[first + k + one, 1] - y0
-    # The heading turns from the last piece's to the next one's, so that the car does not jerk at every point.
+    # The heading is interpolated between the pieces before and after, so that the car does not jerk at each point.
     before, after = max(k, one) - one, min(k + two, last + one)
     ax, ay = x0 + dx - network.points[first + before, 0], y0 + dy - network.points[first + before, 1]
     bx, by = network.points[first + after, 0] - x0, network.points[first + after, 1] - y0
@@ -63,7 +62,7 @@ def set_pose(network, car, sway):
     norm = _ONE / math.sqrt(max(tx * tx + ty * ty, _F(1e-12)))
     tx, ty = tx * norm, ty * norm
     x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
-    # NumPy's floor: that of `math` is an int64, whose product with a float32 is a float64.
+    # NumPy's floor, because that of `math` returns int64, whose product with float32 is float64.
     car[X] = x - np.floor(x / network.width) * network.width
     car[Y] = y - np.floor(y / network.height) * network.height
     if sway != _ZERO:
@@ -74,14 +73,14 @@ def set_pose(network, car, sway):
 
 @leaf
 def _draw(car):
-    """A random number in [0, 1) of a car's own."""
+    """A car's next random number in [0, 1)."""
     car[DRAWS] += _ONE
     return uniform(mix(mix(_U(car[SEED])) + _U(car[DRAWS]) * GOLDEN))
 
 
 @leaf
 def choose_lane(network, lane, car):
-    """A lane after `lane`, at random."""
+    """A random successor of `lane`."""
     count = 0
     for k in range(network.successors.shape[1]):
         if network.successors[lane, k] >= 0:
@@ -102,13 +101,13 @@ def _is_free(network, world, n, x, y, apart):
 
 @njit(nogil=True)
 def _spawn(network, mileage, start, key, gap, ego_gap, world):
-    """Fill a world [cars, FIELDS]: uniformly over the lanes outside junctions, away from each other and the ego car."""
+    """Spawn a world [cars, FIELDS]: uniformly over the lanes outside junctions, apart from each other and the ego."""
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
         car[:] = _ZERO
         car[LANE], car[JUNCTION_BEHIND], car[PERMIT] = -_ONE, -_ONE, -_ONE
-        car[LANE_TIMER] = _F(i) % LANE_CHANGE_PERIOD  # not all at once
+        car[LANE_TIMER] = _F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
         for _ in range(60):
             draws += 1
             bits = mix(key + _U(draws) * GOLDEN)
@@ -135,7 +134,7 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: TrafficConfig) -> np.ndarray:
     """Worlds float32 [n, cars, FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
-    Uniform over the lanes outside junctions; a car for which there is no room is not there (LANE is -1).
+    Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
     worlds = np.zeros((len(starts), cars, FIELDS), dtype=np.float32)
     if cars and len(network.offsets) > 1:
@@ -149,11 +148,11 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
 
 
 def check_worlds(worlds: np.ndarray, network: Network | None = None) -> None:
-    """Refuse traffic [..., FIELDS] with which kernels would read what is not there; they do not look for themselves.
+    """Check traffic [..., FIELDS], because kernels index by it without bounds checks.
 
-    Cars that are not there (LANE is -1) may hold any finite numbers. Without the network that the traffic is on, lanes
-    and metres along them are checked from below only.
-    Raises: ValueError with one line.
+    Absent cars (LANE is -1) may have any finite numbers. Without a network, lanes and metres along them have no upper
+    bound.
+    Raises: ValueError with one line if it is invalid.
     """
     if not np.isfinite(worlds).all():
         raise ValueError("traffic must be finite numbers")
