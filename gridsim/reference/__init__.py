@@ -1,1 +1,1 @@
-"""The reference driver, and how far a drive is from it."""
+"""The reference driver, and the errors of other drives relative to it."""

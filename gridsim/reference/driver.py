@@ -1,9 +1,9 @@
-"""The reference driver: pure pursuit along a route of lanes, as fast as its bends and the traffic allow.
+"""The reference driver: pure pursuit along a route of lanes, as fast as bends and traffic allow.
 
-It is no learner: it reads the map and the other cars' state. What it may do is what any driver may: one of the eight
-actions each control period. Steering is pure pursuit (Coulter 1992) of the centre of mass, slip included; speed is a
-profile limited by curvature, held behind others by IDM (Treiber et al. 2000); lanes are changed by MOBIL (Kesting et
-al. 2007). Its wish is continuous, the actions are not: the heading that an action owes the wish is given by later ones.
+It does not learn: it reads the map and the other cars' state. Like any driver it takes one of the eight actions each
+control period. Steering is pure pursuit (Coulter 1992) of the centre of mass with slip. Speed is a profile limited by
+curvature, behind other cars by IDM (Treiber et al. 2000). Lane changes are MOBIL (Kesting et al. 2007). It wants
+continuous steering, the actions are discrete: the difference in heading is carried over to later actions.
 """
 
 from __future__ import annotations
@@ -43,35 +43,35 @@ from gridsim.traffic.world import (
 _F, _I = np.float32, np.int32
 _ZERO, _HALF, _ONE, _TWO = _F(0.0), _F(0.5), _F(1.0), _F(2.0)
 
-# What the driver keeps in mind of a drive, float64.
+# Fields of the driver's memory during a drive, float64.
 POINT = 0  # index of the route's point behind the car
-HEADING_OWED = 1  # rad of heading that its actions have not yet given
-RAIL = 2  # which of the lanes abreast it is on
-RAIL_OFFSET = 3  # m to the left of that rail it still aims at, while it changes lanes
+HEADING_OWED = 1  # rad, wanted change of heading less that of its actions so far
+RAIL = 2  # its rail: which of the lanes side by side it is on
+RAIL_OFFSET = 3  # m to the left of its rail at which it aims, while it changes lanes
 OLD_RAIL = 4  # the rail it comes from
 MEMORY_FIELDS = 5
 
-_CAUTION = 0.3  # m, on every side of a car that waits
-_STOP_BEFORE = _F(2.5)  # m before where paths meet at which it waits
-_CREEP = _F(2.0)  # m of these that it then uses, bit by bit
-_CREEP_AFTER = _F(8.0)  # control steps of standing after which it moves up a bit, so as not to be idle
-_GO_FIRST_TIME = _F(1.0)  # s that it must be first there to go first
-_LIKELY_SPEED = _F(4.0)  # m/s that another car may soon go
-_WAITING_SPEED = _F(0.2)  # m/s below which another car waits
-_FIRM_BRAKING = _F(5.0)  # m/s2 of braking that it counts on
-_CROSSING_MARGIN = _F(2.5)  # m more that it leaves a car that crosses its way, or comes towards it
+_CAUTION = 0.3  # m, on every side of a waiting car
+_STOP_BEFORE = _F(2.5)  # m before a conflict at which it waits
+_CREEP = _F(2.0)  # m of these that it may creep forward while it waits
+_CREEP_AFTER = _F(8.0)  # idle control steps after which it creeps forward, so that the episode does not end
+_GO_FIRST_TIME = _F(1.0)  # s by which it must reach a conflict earlier than another car to go first
+_LIKELY_SPEED = _F(4.0)  # m/s to which a slower car may soon accelerate
+_WAITING_SPEED = _F(0.2)  # m/s below which another car is considered waiting
+_FIRM_BRAKING = _F(5.0)  # m/s2 with which it can stop if the other car does not clear the conflict
+_CROSSING_MARGIN = _F(2.5)  # m of extra gap to a car that crosses its way or is oncoming
 
 
 class Conflicts(NamedTuple):
-    """Where paths meet, for each of `Network.crossings`: float32 [c]."""
+    """Where the paths of two lanes conflict, for each of `Network.crossings`: float32 [c]."""
 
-    enter: np.ndarray  # m along the lane to where its car is in the other's way
-    meet: np.ndarray  # m along the other lane to where its car is in this one's way
-    free: np.ndarray  # m along the other lane from which on its car has gone, or goes ahead on the same ground
+    enter: np.ndarray  # m along the lane to where its car blocks the other lane
+    meet: np.ndarray  # m along the other lane to where its car blocks this lane
+    free: np.ndarray  # m along the other lane beyond which its car no longer conflicts: it has left, or drives ahead
 
 
 class Tuning(NamedTuple):
-    """`ReferenceConfig` as the kernels read it."""
+    """`ReferenceConfig` as kernels read it."""
 
     nearest: np.float32  # m
     preview: np.float32  # s
@@ -80,7 +80,7 @@ class Tuning(NamedTuple):
 
 @dataclass(frozen=True)
 class ReferenceDrive:
-    """An episode of the reference driver: its states before each of n control periods, and how it ended.
+    """An episode of the reference driver: its states before each of n control steps, and how it ended.
 
     Attributes:
         time: float64 [n], s.
@@ -89,10 +89,10 @@ class ReferenceDrive:
         steering: float32 [n], rad.
         action: int64 [n].
         arc: float64 [n], m along the route.
-        rail: int64 [n], which of the route's rails it was on.
+        rail: int64 [n], its rail of the route.
         car: float32 [ego.FIELDS], the state at the end.
         end: how it ended.
-        route: where it went.
+        route: its route.
     """
 
     time: np.ndarray
@@ -127,7 +127,7 @@ def _find_conflicts(network, half_length, half_width, enter, free):
                         vx = network.points[q + 1, 0] - network.points[q, 0]
                         vy = network.points[q + 1, 1] - network.points[q, 1]
                         if ux * vx + uy * vy > 0.5 * network.steps[other]:
-                            # They join: who is on the common ground is followed.
+                            # The lanes merge: a car on the common part is followed.
                             gone = _F(q - network.offsets[other]) * network.steps[other] + half_length
                             free[c] = min(free[c], gone)
                         found = True
@@ -147,11 +147,11 @@ def _find_meetings(network, enter, meet):
 
 
 def conflicts(road_map: Map, sim: SimConfig) -> Conflicts:
-    """Where the lanes of a map meet."""
+    """Where the lanes of a map conflict."""
     network, vehicle = road_map.network, sim.vehicle
     enter, meet = np.zeros_like(network.clear), np.zeros_like(network.clear)
     free = network.clear.copy()
-    # A car that stands further back leaves the others room for half their width, and for caution.
+    # A waiting car leaves the others half their width, and a margin.
     half_length = np.float32((vehicle.length + vehicle.width) / 2 + _CAUTION)
     _find_conflicts(network, half_length, np.float32(vehicle.width + _CAUTION), enter, free)
     _find_meetings(network, enter, meet)
@@ -163,7 +163,7 @@ def conflicts(road_map: Map, sim: SimConfig) -> Conflicts:
 
 @leaf
 def _at(route, rail, s, k):
-    """What is s m along a rail, looked for from point k on: (x m, y m, point before it, share to the next)."""
+    """The place s m along a rail, searched from point k on: (x m, y m, point before it, share to the next)."""
     last = _I(route.arc.shape[1] - 2)
     while k < last and route.arc[rail, k + 1] < s:
         k += _I(1)
@@ -180,7 +180,7 @@ def _at(route, rail, s, k):
 
 @leaf
 def _progress(network, route, rail, k, x, y):
-    """Where a car is along a rail, looked for from point k on: (point behind it, m along, m to the left of it)."""
+    """A car's place on a rail, searched from point k on: (point behind it, m along, m to the left)."""
     last = _I(route.arc.shape[1] - 2)
     while True:
         ux = route.points[rail, k + 1, 0] - route.points[rail, k, 0]
@@ -196,9 +196,9 @@ def _progress(network, route, rail, k, x, y):
 
 @leaf
 def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car):
-    """Curvature (1/m) of the circle that takes the centre of mass to a point of the route ahead, with its slip.
+    """Curvature (1/m) of the circle on which the centre of mass, with slip, reaches the route's point ahead.
 
-    With a the angle from the heading to the point and d its distance: tan(slip) = sin(a) / (d / (2 l_r) + cos(a)).
+    With a the angle from the heading to the point and d its distance, tan(slip) = sin(a) / (d / (2 l_r) + cos(a)).
     """
     speed = max(car[SPEED], _ZERO)
     ahead = tuning.nearest + speed * (tuning.preview + tuning.bend_share * speed / constants.grip)
@@ -218,17 +218,18 @@ def _wanted_curvature(network, constants, tuning, route, rail, k, s, blend, car)
 
 @leaf
 def _choose_action(constants, car, curvature, acceleration, owed):
-    """The action whose effect comes nearest to a wanted curvature (1/m) and acceleration (m/s2).
+    """The action whose effect is nearest to a wanted curvature (1/m) and acceleration (m/s2).
 
-    Heading is looked at over two periods, since the wheels turn by fixed steps; returns (action, rad then owed).
+    The heading is compared over two periods, since the wheels turn by fixed steps.
+    Returns: (action, rad of HEADING_OWED after it).
     """
     speed, steering = max(car[SPEED], _ZERO), car[STEERING]
     way = max(speed, _ONE) * constants.dt
     quantum = path_curvature(constants, speed, constants.steering_step) * way
-    # Steering further than grip allows gains nothing, and has to be taken back step by step.
+    # Steering beyond the grip limit gains nothing, and has to be undone step by step.
     tangent = constants.grip * constants.rear_axle / max(speed * speed, _ONE)
     furthest = max(math.atan(tangent / constants.rear_share), constants.steering_step)
-    weight = _ONE if acceleration > _F(-4.0) else _F(0.2)  # braking hard comes before keeping to the line
+    weight = _ONE if acceleration > _F(-4.0) else _F(0.2)  # hard braking has priority over steering
     best, cost, left = _I(4), _F(1e9), _ZERO
     for action in range(8):
         if action == 7 and speed < _HALF:
@@ -248,7 +249,7 @@ def _choose_action(constants, car, curvature, acceleration, owed):
 
 @leaf
 def _as_traffic_car(network, route, rail, m, s, car, me):
-    """Write the ego car down as a traffic car on lane m of a rail, s m along it."""
+    """Fill `me` with the ego car as a traffic car on lane m of a rail, s m along the rail."""
     last = _I(route.lanes.shape[1] - 1)
     me[X], me[Y], me[COS], me[SIN], me[SPEED] = car[X], car[Y], car[COS], car[SIN], max(car[SPEED], _ZERO)
     me[JUNCTION_BEHIND], me[PERMIT] = -_ONE, -_ONE
@@ -261,9 +262,9 @@ def _as_traffic_car(network, route, rail, m, s, car, me):
 
 @leaf
 def _give_way(network, conflicts, drivers, me, world):
-    """Meet nobody who is in a junction already, or may enter it: (greatest acceleration in m/s2, m to the meeting)."""
+    """Yield to cars in or entering a junction: (largest allowed acceleration m/s2, m to the nearest conflict)."""
     speed, allowed, least = me[SPEED], drivers.acceleration, _F(1e9)
-    ahead = -me[ALONG]  # m to the beginning of the lane
+    ahead = -me[ALONG]  # way (m) to the beginning of the lane
     for turn in range(3):
         lane = _I(me[LANE] if turn == 0 else (me[NEXT] if turn == 1 else me[SECOND_NEXT]))
         if ahead > me[HORIZON]:
@@ -271,7 +272,7 @@ def _give_way(network, conflicts, drivers, me, world):
         for c in range(network.crossing_offsets[lane], network.crossing_offsets[lane + 1]):
             way = ahead + conflicts.enter[c] - _STOP_BEFORE
             if way < -_CREEP or way > me[HORIZON]:
-                continue  # in the middle of it one goes on
+                continue  # already in the conflict: drive on
             other = network.crossings[c]
             for j in range(world.shape[0]):
                 if world[j, LANE] < _ZERO:
@@ -288,14 +289,14 @@ def _give_way(network, conflicts, drivers, me, world):
                 if rest <= _ZERO:
                     continue
                 time = rest / max(world[j, SPEED], _HALF)
-                stops = speed * speed < _TWO * _FIRM_BRAKING * way  # it still can, should the other one not go on
+                stops = speed * speed < _TWO * _FIRM_BRAKING * way  # it can still stop if the other car does
                 if stops and speed * (time + _HALF) < way:
-                    continue  # it has gone by then
+                    continue  # the other car will have left
                 if world[j, SPEED] < _WAITING_SPEED and speed < _ONE:
-                    continue  # it waits, for the ego car perhaps
+                    continue  # the other car waits, perhaps for the ego car
                 before = (conflicts.meet[c] - at) / max(world[j, SPEED], _LIKELY_SPEED)
                 if way / max(speed, _ONE) + _GO_FIRST_TIME < before:
-                    continue  # it comes later, and brakes for the ego car
+                    continue  # the other car comes later, and brakes for the ego car
                 if way < _ZERO or not stops:
                     slower = -drivers.braking
                 else:
@@ -307,7 +308,7 @@ def _give_way(network, conflicts, drivers, me, world):
 
 @leaf
 def _adapt_to_traffic(network, conflicts, drivers, route, memory, k, s, car, bend, acceleration, world, others):
-    """The acceleration (m/s2) that the other cars leave of a wanted one, and a change of lanes where it pays."""
+    """Limit a wanted acceleration (m/s2) by the other cars, and change lanes if that gains time."""
     n = _I(world.shape[0])
     me, nobody = others[n], others[n + 1]
     rail, speed = _I(memory[RAIL]), max(car[SPEED], _ZERO)
@@ -318,10 +319,10 @@ def _adapt_to_traffic(network, conflicts, drivers, route, memory, k, s, car, ben
             others[j, field] = world[j, field]
     me[HORIZON] = horizon(drivers, speed)
     me[GAP], me[LEAD_SPEED], me[SHIFT] = _F(1e9), _ZERO, _F(memory[RAIL_OFFSET])
-    touch = _F(1e9)  # m to where another car is in the way
+    touch = _F(1e9)  # way (m) to where another car blocks the path
     for side in range(2):
         if side == 0 and memory[RAIL_OFFSET] == 0.0:
-            continue  # only who changes lanes minds the one it comes from too
+            continue  # the old lane matters only during a change of lanes
         on = rail if side == 1 else _I(memory[OLD_RAIL])
         _as_traffic_car(network, route, on, m, s, car, me)
         for j in range(n):
@@ -341,7 +342,7 @@ def _adapt_to_traffic(network, conflicts, drivers, route, memory, k, s, car, ben
     allowed, way = _give_way(network, conflicts, drivers, me, world)
     acceleration = min(acceleration, allowed)
     if car[IDLE] >= _CREEP_AFTER and way > -_CREEP and touch > drivers.half_length + _F(0.1):
-        acceleration = drivers.acceleration  # standing too long is idleness in this world
+        acceleration = drivers.acceleration  # else the episode would end as idle
     if route.lanes.shape[0] > 1:
         lane = _I(me[LANE])
         at = network.offsets[lane] + _I(me[ALONG] / network.steps[lane])
@@ -360,8 +361,8 @@ def _adapt_to_traffic(network, conflicts, drivers, route, memory, k, s, car, ben
 def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others):
     """The driver's action for one control period.
 
-    Args: what it keeps in mind float64 [MEMORY_FIELDS], changed; `others` [cars + 2, world.FIELDS] is scratch, of which
-    the last row is 0.
+    Args: memory float64 [MEMORY_FIELDS], changed; `others` [cars + 2, world.FIELDS] is scratch, whose last row must
+    be 0.
     """
     rail = _I(memory[RAIL])
     speed = max(car[SPEED], _ZERO)
@@ -409,7 +410,7 @@ def _drive(
 
 
 class ReferenceDriver:
-    """Drives a batch of cars, each on a route of its own: `reset`, then `act` once each control period."""
+    """Drives a batch of cars, each on its own route: `reset`, then `act` once each control period."""
 
     def __init__(self, road_maps: Sequence[Map], sim: SimConfig | None = None, config: ReferenceConfig | None = None):
         self.road_maps = road_maps
@@ -431,7 +432,7 @@ class ReferenceDriver:
     ) -> None:
         """Begin drives at starts float32 [n, 5] on `road_maps[maps[k]]`, with turns at junctions from seeds [n].
 
-        Routes are `length` m long, or as long as the target and a tenth.
+        Routes are `length` m long, by default 1.1 times the target.
         """
         length = 1.1 * self.sim.episode.target if length is None else length
         self._maps = np.broadcast_to(np.asarray(maps, dtype=np.int64), len(starts))
@@ -471,7 +472,7 @@ class ReferenceDriver:
     ) -> ReferenceDrive:
         """A whole episode from a start float32 [5] in the traffic float32 [cars, world.FIELDS] around it.
 
-        Ends as `simulator.Simulator`'s episodes do; `target` (m) and `max_steps` are the configuration's unless given.
+        It ends as in `envs.simulator`. The defaults of `target` (m) and `max_steps` are the configuration's.
         """
         episode = self.sim.episode
         target = episode.target if target is None else target

@@ -1,8 +1,8 @@
-"""How far a drive is from a reference: velocity error and steering error along the route that was driven.
+"""Velocity error and steering error of a drive, relative to a reference along the same route.
 
-e_v = v - v_ref in m/s and e_delta = delta - delta_ref in degrees (Trasnea et al. 2019), taken at the same place of the
-route and not at the same time, so that who is late by a second is not wrong all the way. Means are over metres, not
-over seconds: standing weighs nothing. The reference is `routes.profile` along the driven path, or a recorded drive.
+e_v = v - v_ref in m/s and e_delta = delta - delta_ref in degrees (Trasnea et al. 2019), compared at the same place of
+the route, not at the same time: a delay of a second is not an error for the rest of the drive. Means are over metres,
+so that time at standstill has no weight. The reference is `routes.profile` along the driven path, or a recorded drive.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from gridsim.config import SimConfig, VehicleConfig
 from gridsim.maps.map import Map
 from gridsim.reference.routes import ReferenceConfig, profile, unwrapped
 
-APART = 3.5  # m beside the recorded path, a lane's width, from which on two drives are on two paths
-TURNED = math.radians(45.0)  # ... and between their headings
-TURN = 12.0  # m: the bend in which two paths part begins so far before they are apart
+APART = 3.5  # m beside the recorded path, a lane's width, beyond which a drive has left it
+TURNED = math.radians(45.0)  # difference of headings beyond which it has
+TURN = 12.0  # m left out before that, since the bend in which they part begins earlier
 _STANDING = 1e-6  # m
 
 
 class Driven(NamedTuple):
-    """A drive as a path: where a car came forward, without what it reversed and drove again."""
+    """A drive as a path of new ground, without what was reversed and driven again."""
 
     arc: np.ndarray  # float64 [n], m driven, increasing
     points: np.ndarray  # float64 [n, 2], m, not wrapped over the torus
     heading: np.ndarray  # float64 [n], rad
     speed: np.ndarray  # float64 [n], m/s
     steering: np.ndarray  # float64 [n], rad, left positive
-    rows: np.ndarray  # int64 [n], which of the drive's states these are
+    rows: np.ndarray  # int64 [n], indices of these states in the drive
 
 
 @dataclass(frozen=True)
 class Series:
-    """A drive and its reference at the same places of a route; linear between them.
+    """A drive and its reference at the same places of a route.
 
     Attributes:
-        arc: float64 [n], m that the agent drove, increasing.
+        arc: float64 [n], m driven by the agent, increasing.
         speed: float64 [n], m/s, the agent's.
         reference_speed: float64 [n], m/s.
         steering: float64 [n], rad, left positive, the agent's.
@@ -56,16 +56,16 @@ class Series:
 
     @property
     def velocity_error(self) -> np.ndarray:
-        """float64 [n], m/s, above 0 where the agent is faster."""
+        """float64 [n], m/s, positive where the agent is faster."""
         return self.speed - self.reference_speed
 
     @property
     def steering_error(self) -> np.ndarray:
-        """float64 [n], degrees, above 0 where the agent steers further to the left."""
+        """float64 [n], degrees, positive where the agent steers further to the left."""
         return np.degrees(self.steering - self.reference_steering)
 
     def errors(self, vehicle: VehicleConfig | None = None) -> Errors:
-        """Means over the metres (trapezoids) and maxima.
+        """Means over the metres (trapezoidal rule) and maxima.
 
         Raises: ValueError if nothing was driven.
         """
@@ -98,8 +98,8 @@ class Errors:
         reference_mps: mean speed of the reference over the same metres, m/s.
         steering_mean_deg: mean |e_delta| over the metres, degrees.
         steering_max_deg: greatest |e_delta|, degrees.
-        steering_limit_deg: how far the wheels turn, degrees.
-        metres: that were compared.
+        steering_limit_deg: the steering limit, degrees.
+        metres: m compared.
     """
 
     velocity_mean_mps: float
@@ -112,26 +112,26 @@ class Errors:
 
     @property
     def velocity_mean_percent(self) -> float:
-        """Of the reference's mean speed: a share of its speed on the spot has no bound where it starts from rest."""
+        """Relative to the reference's mean speed, since its speed at a place may be 0."""
         return 100.0 * self.velocity_mean_mps / self.reference_mps
 
     @property
     def velocity_max_percent(self) -> float:
-        """Of the reference's mean speed."""
+        """Relative to the reference's mean speed."""
         return 100.0 * self.velocity_max_mps / self.reference_mps
 
     @property
     def steering_mean_percent(self) -> float:
-        """Of the greatest steering angle: the reference's own is 0 on a straight."""
+        """Relative to the steering limit, since the reference's angle is 0 on a straight."""
         return 100.0 * self.steering_mean_deg / self.steering_limit_deg
 
     @property
     def steering_max_percent(self) -> float:
-        """Of the greatest steering angle, to one side."""
+        """Relative to the steering limit to one side."""
         return 100.0 * self.steering_max_deg / self.steering_limit_deg
 
     def figures(self) -> dict[str, float]:
-        """All of it under plain names, for tables and JSON."""
+        """The figures by name, for tables and JSON."""
         names = (
             "velocity_mean_mps", "velocity_max_mps", "velocity_mean_percent", "velocity_max_percent", "reference_mps",
             "steering_mean_deg", "steering_max_deg", "steering_mean_percent", "steering_max_percent", "metres",
@@ -140,9 +140,9 @@ class Errors:
 
 
 def combine(parts: Sequence[Errors]) -> Errors:
-    """Several drives as one: means weighted by metres, greatest maxima.
+    """The errors of several drives together: means weighted by metres, largest maxima.
 
-    Raises: ValueError if there are none, or of different cars.
+    Raises: ValueError if there are none, or their steering limits differ.
     """
     if not parts:
         raise ValueError("nothing was driven that could be compared with a reference")
@@ -173,10 +173,10 @@ def poses_of(states: np.ndarray) -> np.ndarray:
 def driven(poses: np.ndarray, road_map: Map) -> Driven:
     """A drive's path from its poses [n, 5] at the control steps, as `poses_of` gives them.
 
-    What was reversed, and as many metres after it, is left out: a reference only drives forward. So is standing, where
-    the wheels may be turned anyhow; a path from rest begins after the first control step that moves the car.
+    Reversing, and the same metres driven again, are left out, because a reference only drives forward. So is standing,
+    where steering has no effect: a path from rest begins after the first control step that moves the car.
 
-    Raises: ValueError if the car never came forward.
+    Raises: ValueError if the car never moved forward.
     """
     poses = np.asarray(poses, dtype=np.float64)
     if poses.ndim != 2 or poses.shape[1] != 5 or not np.isfinite(poses).all():
@@ -199,12 +199,12 @@ def error_series(
 ) -> Series:
     """A drive beside the reference driver's profile along its path.
 
-    The reference begins with the agent's speed, speeds up as fast as the car does, and is alone on the road: of a drive
-    in traffic, the error holds what the traffic costs. It takes its bends from the driven path, over 10 m of it: who
-    weaves in longer waves than that gives the reference bends to slow down for, so look at both errors.
+    The reference begins with the agent's speed and ignores traffic, so the error in traffic includes the delay by other
+    cars. Its curvature is that of the driven path over 10 m: an agent that weaves in longer waves slows the reference
+    down too, so look at both errors.
 
-    Left out is where the profile does not know the road: the path's first 5 m, half of those 10, and its end, from
-    where on the reference could not have stopped, since what it would have braked for there was not driven.
+    Left out are the first 5 m, where the curvature is not known, and the end, from where the reference could not have
+    stopped any more, because what it would have had to brake for is not known.
     """
     config = config or ReferenceConfig()
     interval = float(road_map.road.speed_low), float(road_map.road.speed_high)
@@ -216,11 +216,12 @@ def error_series(
 
 
 def error_series_beside(path: Driven, recorded: Driven, road_map: Map, row: int = 0) -> tuple[Series, float]:
-    """A drive beside a recorded one of which it began at point `row`, as far as it follows it.
+    """A drive beside a recorded one, from the recording's point `row`, until it leaves the recorded path.
 
-    Each of the agent's places is compared with the recorded path's nearest further on. They part where the agent is
-    more than APART beside that path, or TURNED; the TURN before it is left out, and what is after the recording's end.
-    Returns: (the series, empty if nothing is left; m along the recording that the agent came).
+    Each of the agent's places is compared with the nearest place further along the recording. The drive leaves it when
+    it is more than APART beside it or TURNED from it; the last TURN before that is left out, and all after the
+    recording's end.
+    Returns: (the series, empty if nothing is left; m along the recording that the agent reached).
     """
     sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     points = path.points - np.round((path.points[0] - recorded.points[row]) / sides) * sides

@@ -1,8 +1,8 @@
 """Routes along lanes, and the speed and steering of the reference driver along any path.
 
-The profile of a path is limited by curvature, and by braking and acceleration before and after its bends: what a driver
-without traffic can do. `plan` lays it along lanes; `profile` along a path that anybody drove, so that two drivers are
-compared at the same arc length without driving it again.
+The speed profile of a path is limited by curvature, and by braking before and accelerating after its bends, without
+traffic. `plan` computes it along lanes; `profile` along any driven path, so that a driver can be compared with the
+reference at the same arc length without another drive.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from gridsim.maps.roads import freeze
 class ReferenceConfig:
     """How the reference driver drives."""
 
-    pace: float = 0.9  # of the scenario's interval, from its lower to its upper end: speed on a straight
+    pace: float = 0.9  # speed on a straight: 0 is the lower end of the speed interval, 1 the upper
     lateral: float = 3.2  # m/s2 in bends, below the grip limit
     acceleration: float = 3.0  # m/s2 of the profile, and a of IDM
     braking: float = 2.5  # m/s2 before bends, and b of IDM
     headway: float = 1.0  # s, T of IDM
-    nearest: float = 2.0  # m that the pursued point is ahead, at least
-    preview: float = 0.25  # s of driving, added to that
-    bend_share: float = 0.15  # of the tightest radius that grip allows, added to that
-    window: float = 6.0  # m of a lane over which its curvature is taken
-    driven_window: float = 10.0  # m of a path that somebody drove, who steers by fits and starts
+    nearest: float = 2.0  # m to the pursued point, at standstill
+    preview: float = 0.25  # s, and the way driven in that time
+    bend_share: float = 0.15  # and this share of the tightest radius that grip allows
+    window: float = 6.0  # m of a lane over which its curvature is measured
+    driven_window: float = 10.0  # m of a driven path, whose steering is jerky
 
 
 class Route(NamedTuple):
-    """Lanes to drive, one after another, with those abreast of them as further rails; rails are left to right.
+    """A sequence of lanes to drive. Lanes beside them are further rails, from left to right.
 
-    Arrays are read-only; point i of a rail is beside point i of every other.
+    Arrays are read-only; point i of a rail is beside point i of the others.
     """
 
     points: np.ndarray  # float32 [rails, n, 2], m, continuous: not wrapped over the torus
     arc: np.ndarray  # float32 [rails, n], m along the rail
-    speeds: np.ndarray  # float32 [rails, n], m/s, at most: bends and braking for them
+    speeds: np.ndarray  # float32 [rails, n], m/s, limited by bends and braking for them
     lanes: np.ndarray  # int32 [rails, m]
     offsets: np.ndarray  # int32 [m + 1], where each lane's points begin
-    rail: int  # which one the start is on
+    rail: int  # the rail of the start
     first: int  # the point before the start
 
 
 class Profile(NamedTuple):
-    """The reference along a path, by arc length."""
+    """The reference's speed and steering along a path, by arc length."""
 
     arc: np.ndarray  # float64 [n], m along the path
     speed: np.ndarray  # float64 [n], m/s
@@ -67,9 +67,9 @@ class Profile(NamedTuple):
 
 
 def curvature_along(points: np.ndarray, arc: np.ndarray, window: float) -> np.ndarray:
-    """Curvature (1/m) at points [n, 2] of a path: between the chords of `window` / 2 m before and after each.
+    """Curvature (1/m) at points [n, 2] of a path, from the chords of `window` / 2 m before and after each.
 
-    At the path's ends it is that of the nearest point that has half as much on either side.
+    Near the path's ends it is that of the nearest point with `window` / 4 m on either side.
     """
 
     def point(s: np.ndarray) -> np.ndarray:
@@ -112,17 +112,17 @@ def profile(
     config: ReferenceConfig | None = None,
     sim: SimConfig | None = None,
 ) -> Profile:
-    """Speed and steering of the reference along a path that anybody drove, without traffic and without driving it.
+    """Speed and steering of the reference along a driven path, without traffic.
 
     Args: points [n, 2] in m, in order and not wrapped over the torus (`unwrapped`); the scenario's speed interval and
     the speed at the first point, m/s.
-    Raises: ValueError for a path that leads nowhere.
+    Raises: ValueError for a path of fewer than 2 different points.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
         raise ValueError(f"a path is finite points [n, 2], not {points.shape}")
     config, sim = config or ReferenceConfig(), sim or SimConfig()
-    kept = np.append(True, np.hypot(*np.diff(points, axis=0).T) > 1e-6)[: len(points)]  # at a stand is no heading
+    kept = np.append(True, np.hypot(*np.diff(points, axis=0).T) > 1e-6)[: len(points)]  # no heading there
     points = points[kept]
     if len(points) < 2:
         raise ValueError("a path needs 2 points or more that are not the same")
@@ -140,7 +140,7 @@ def profile(
 
 
 def unwrapped(points: np.ndarray, width: float, height: float) -> np.ndarray:
-    """A path [n, 2] on a torus of these sides (m), made continuous."""
+    """Unwrap a path [n, 2] on a torus with these sides (m), so that it is continuous."""
     points = np.asarray(points, dtype=np.float64)
     step = np.diff(points, axis=0)
     step -= np.round(step / [width, height]) * [width, height]
@@ -148,7 +148,7 @@ def unwrapped(points: np.ndarray, width: float, height: float) -> np.ndarray:
 
 
 def locate(road_map: Map, start: np.ndarray) -> tuple[int, float]:
-    """The lane that a start (x, y, heading, ...) is on, and the m along it: nearest in place and heading."""
+    """The lane nearest to a start (x, y, heading, ...) in place and heading, and the start's m along it."""
     lanes = road_map.lanes
     sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     ahead = np.diff(lanes.points.astype(np.float64), axis=0)
@@ -166,7 +166,7 @@ def locate(road_map: Map, start: np.ndarray) -> tuple[int, float]:
 
 
 def _abreast(road_map: Map, lane: int) -> list[int]:
-    """A lane and those beside it, from left to right."""
+    """A lane and its neighbours, from left to right."""
     while road_map.lanes.left[lane] >= 0:
         lane = int(road_map.lanes.left[lane])
     row = [lane]
@@ -176,9 +176,9 @@ def _abreast(road_map: Map, lane: int) -> list[int]:
 
 
 def plan(road_map: Map, start: np.ndarray, length: float, seed: int, config: ReferenceConfig | None = None) -> Route:
-    """A route of so many m or more from a start float32 [5] on, with random turns at junctions.
+    """A route of `length` m or more from a start float32 [5], with random turns at junctions.
 
-    No scenario has a loop of lanes so short that what is driven again counts nothing, so that any turn will do.
+    Any turn is allowed: all loops of lanes are so long that driving them again counts as distance.
 
     Raises: ValueError on a map without lanes.
     """

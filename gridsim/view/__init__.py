@@ -1,1 +1,1 @@
-"""Pictures, the window, a person at the keys and recorded drives."""
+"""Pictures, the window, manual driving and recorded drives."""

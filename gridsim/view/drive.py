@@ -1,7 +1,7 @@
-"""A person at the keys: driving in a window, keeping the drive as a CSV file, and reading it back.
+"""Manual driving: a person drives in a window; drives are recorded as CSV files, read and replayed.
 
-A row is a control step: where the car was, and the action that was taken there. So a file is a list of (state, action)
-pairs for whoever learns from it, and its actions alone, from the first row on, give the same poses again, bit for bit.
+A row is a control step: the car's state, and the action taken. So a file is a list of (state, action) pairs to learn
+from. Replaying its actions gives the same poses, bit for bit.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ COLUMNS = (
     "scenario", "map_seed",
 )  # fmt: skip
 """Time since the episode's start, pose, speed, steering and action (`vehicle.Action`); then which episode of the file
-(a restart begins the next one), how many other cars there were, and the map."""
+(a restart begins the next one), the number of other cars, and the map."""
 MAX_BYTES = 1 << 28  # of a file that is read
 FPS = 30  # pictures a second in the window
-STANDING = 0.05  # m/s, below which down means reverse and no longer brake
-_LIMITS = (1e7, 1e5, 1e5, 100.0, 200.0, 3.2)  # of time and pose: beyond, a number is nobody's
+STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
+_LIMITS = (1e7, 1e5, 1e5, 100.0, 200.0, 3.2)  # of time and pose, beyond which a number cannot be right
 _ENDLESS = 10_000_000  # control steps
 
 HELP = "arrows drive   space brakes   R restarts   Esc ends"
@@ -52,11 +52,11 @@ class Drive:
     Attributes:
         scenario: the map's name in the registry.
         map_seed: the seed it is built from.
-        traffic: other cars there were; map and episode say where they began.
-        episodes: int64 [n], 0 first; each begins where its first row says.
+        traffic: number of other cars; map and episode determine where they begin.
+        episodes: int64 [n], counted from 0; each begins at the pose of its first row.
         times: float64 [n], s since the episode's start.
         poses: float32 [n, 5]: x, y (m), heading (rad), speed (m/s), steering (rad) before each step.
-        actions: int64 [n], what was done then.
+        actions: int64 [n], taken in each step.
     """
 
     scenario: str
@@ -72,30 +72,30 @@ class Drive:
 
 
 def without_idle_limit(config: SimConfig | None = None) -> SimConfig:
-    """The configuration a person drives with: who stands still goes on standing."""
+    """The configuration for manual driving: standing still does not end an episode."""
     config = config or SimConfig()
     return dataclasses.replace(config, episode=dataclasses.replace(config.episode, patience=_ENDLESS))
 
 
 def _simulator(road_map: Map, config: SimConfig | None, traffic: int) -> Simulator:
-    """One car among so many others, whose episode ends with a collision and with nothing else."""
+    """A simulator of one car in traffic, whose episode ends only with a collision."""
     return Simulator([road_map], 1, without_idle_limit(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
 def _key(road_map: Map, episode: int) -> int:
-    """What the traffic of an episode is spawned from."""
+    """The key from which an episode's traffic is spawned."""
     return int(np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
 
 
 def pose(car: np.ndarray) -> np.ndarray:
-    """x, y (m), heading (rad), speed (m/s), steering (rad), float32 [5], of a state [FIELDS]."""
+    """The pose float32 [5] of a state [FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
     return np.array([car[X], car[Y], np.arctan2(car[SIN], car[COS]), car[SPEED], car[STEERING]], dtype=np.float32)
 
 
 def action_for(keys: set[str], speed: float) -> Action:
-    """The action that the held keys ask for: names as in "up"; speed in m/s.
+    """The action for the keys that are held (named as in "up"), at a speed in m/s.
 
-    Braking goes before all else, left and right together cancel, and down reverses once the car stands.
+    Braking has priority, left and right cancel each other, and down reverses once the car stands.
     """
     if "space" in keys or ("down" in keys and speed > STANDING):
         return Action.BRAKE
@@ -111,10 +111,10 @@ def action_for(keys: set[str], speed: float) -> Action:
 
 
 class Recorder:
-    """Writes a drive to a new file, row by row, so that whatever ends it, what was driven is there."""
+    """Writes a drive to a new file row by row, so that an interrupted drive is kept too."""
 
     def __init__(self, path: str | os.PathLike[str], road_map: Map, period: float, traffic: int = 0):
-        """Make the file. Raises: DriveError with one line if it is there already or cannot be made."""
+        """Create the file. Raises: DriveError with one line if it exists or cannot be created."""
         self._map = (traffic, road_map.name, road_map.seed)
         self._period = period
         self.path, self.rows = Path(path), 0
@@ -129,7 +129,7 @@ class Recorder:
 
     def write(self, step: int, pose: np.ndarray, action: int, episode: int) -> None:
         """Write one row: control steps since the episode's start; pose float32 [5]. Raises DriveError."""
-        # Nine digits tell any two float32 apart.
+        # Nine digits represent a float32 exactly.
         numbers = [f"{value:.9g}" for value in (round(step * self._period, 6), *pose.tolist())]
         try:
             self._writer.writerow([*numbers, int(action), episode, *self._map])
@@ -151,7 +151,7 @@ class Recorder:
 def read_drive(path: str | os.PathLike[str]) -> Drive:
     """Read a drive that `gridsim-drive --record` wrote.
 
-    Raises: DriveError with one line, the first thing that is wrong and where, for a file that is missing or no drive.
+    Raises: DriveError with one line that names the first problem and its place.
     """
     try:
         if os.stat(path).st_size > MAX_BYTES:
@@ -208,7 +208,7 @@ def _numbers(row: Sequence[str]) -> list[float]:
 
 
 def _whole(row: Sequence[str], column: int, most: int) -> int:
-    """A column's number, from 0. Raises ValueError."""
+    """A column's whole number from 0 to `most`. Raises ValueError."""
     text = row[column]
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
         raise ValueError(f"{COLUMNS[column]} is {text[:40]!r}, not a whole number from 0 to {most}")
@@ -216,11 +216,11 @@ def _whole(row: Sequence[str], column: int, most: int) -> int:
 
 
 def replay(drive: Drive, road_map: Map, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
-    """Drive a recorded drive again, by its actions alone.
+    """Replay a recorded drive by its actions.
 
     Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
     traffic float32 [n, others, world.FIELDS]).
-    Raises: DriveError with one line if an episode has a collision before its end: map and drive do not belong together.
+    Raises: DriveError with one line if an episode ends too early, which means that the map is another one.
     """
     simulator = _simulator(road_map, config, drive.traffic)
     n, rays = len(drive), simulator.config.sensors.rays
@@ -253,7 +253,7 @@ def drive(
     seconds: float = math.inf,
     traffic: int = 0,
 ) -> dict[str, float]:
-    """Let a person drive at true speed until the window is closed, or for so many seconds of simulated time.
+    """Let a person drive in real time until the window is closed, or for `seconds` of simulated time.
 
     Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them.

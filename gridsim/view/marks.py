@@ -1,7 +1,7 @@
-"""Lane marks: dashes on the line between neighbouring lanes, worked out from the lanes alone; none where ways cross.
+"""Lane marks: dashes between neighbouring lanes, computed from the lanes; none in junctions.
 
-A lane's neighbour is found a lane's width to its left, parallel to it, in either direction. Where a lane that is not
-parallel passes close by, there is a junction, and no mark.
+A lane's neighbour is a parallel lane, in either direction, about a lane's width to its left. Where a lane that is not
+parallel passes close by, there is a junction, and no mark is drawn.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
 
-STEP = 1.0  # m between the points at which lanes are looked at
+STEP = 1.0  # m between sampled points of a lane
 NEAREST, FARTHEST = 2.2, 4.6  # m between the centre lines of neighbours
 PARALLEL = 0.985  # cosine of the angle within which lanes are parallel: 10 degrees
 JUNCTION = 3.0  # m from a mark within which a lane that is not parallel makes a junction
-PERIOD, DASH = 6.0, 2.5  # m from dash to dash, and a dash
-CLAIM = 0.5  # m, side of the cells by which a line is known to be marked already
-SHORTEST = 5  # points of a line worth marking
+PERIOD, DASH = 6.0, 2.5  # m from dash to dash, and length of a dash
+CLAIM = 0.5  # m, side of the cells that record which lines are marked
+SHORTEST = 5  # least points of a marked line
 
 
 def _samples(road_map: Map) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -42,7 +42,7 @@ def lane_marks(road_map: Map) -> np.ndarray:
     size = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     points, direction, lane = _samples(road_map)
     wrapped = np.mod(points, size)
-    # Lanes often lie on one another (the ways into a junction): each place and direction once is enough to search.
+    # Lanes often overlap, for example at the entrance of a junction. Each place and direction is searched once.
     key = np.concatenate([np.round(wrapped), np.round(direction * 8)], axis=1)
     _, one = np.unique(key, axis=0, return_index=True)
     tree = cKDTree(wrapped[one], boxsize=size if road_map.torus else None)
@@ -81,7 +81,7 @@ def _dashes(
     lane: np.ndarray,
     size: np.ndarray,
 ) -> np.ndarray:
-    """Dashes [n, 6] along the runs of marked points: whole periods, each run by whichever lane comes first."""
+    """Dashes [n, 6] along runs of marked points, in whole periods; a line is marked once, for its first lane."""
     if not len(sample):
         return np.zeros((0, 6), dtype=np.float32)
     columns, rows = np.ceil(size / CLAIM).astype(int)

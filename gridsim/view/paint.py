@@ -1,6 +1,6 @@
-"""Painting into pictures: the ground by the clearance field, rounded boxes over it, what cars are made of.
+"""Painting into pictures: the ground from the clearance field, rounded boxes, the shapes of a car, and all colours.
 
-In pixels, and without knowing where they come from: `render` has the view. Colours are here, and here alone.
+Coordinates are pixels; `render` computes them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, freeze
 
 GROUND = (226, 231, 218)
-GROUND_OTHER = (220, 226, 211)  # of every other square, so that the ground is seen to move
+GROUND_OTHER = (220, 226, 211)  # of every other square, so that motion is visible
 VERGE = (190, 197, 178)
 ASPHALT = (66, 70, 79)
 EDGE_LINE = (236, 238, 240)
@@ -27,11 +27,11 @@ RAY, PATH = (92, 225, 200), (233, 172, 86)
 FREE, OCCUPIED, UNKNOWN = (92, 225, 200), (255, 70, 90), (16, 18, 24)
 HUD = (20, 22, 28)
 
-BLOCK = 8  # pixels, side of the blocks that are looked at together
+BLOCK = 8  # pixels, side of the blocks that are tested together
 SQUARE = 32  # cells of the field, side of the ground's squares
 EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and half that line's width
 VERGE_WIDTH = 0.7  # m
-DIP = 1.0  # m from any edge, from where on all is asphalt
+DIP = 1.0  # m from the edge beyond which dips of the clearance are removed
 
 _F, _I, _U = np.float32, np.int32, np.uint32
 SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, corner radius, red, green, blue, opacity
@@ -39,7 +39,7 @@ SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, co
 
 @leaf
 def _clear(field, columns, rows, wrap, turn, x, y):
-    """Clearance (m) at a place in cells of the field, from `turn` tiles before the first; off the map, a wall."""
+    """Clearance (m) at a place in cells of the field, counted from `turn` tiles before the first; off the map, wall."""
     ix, iy = _I(x), _I(y)
     mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
     if not wrap and (_U(ix - _I(turn) * _I(columns)) > mask_x or _U(iy - _I(turn) * _I(rows)) > mask_y):
@@ -64,8 +64,8 @@ def draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels
     zero, half, one = _F(0.0), _F(0.5), _F(1.0)
     scale = _F(pixels_per_m)
     line_half = _F(EDGE_HALF) * scale
-    inner = _F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge where there is nothing but asphalt
-    outer = -max(_F(VERGE_WIDTH), one / scale)  # ... and nothing but ground
+    inner = _F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge beyond which there is only asphalt
+    outer = -max(_F(VERGE_WIDTH), one / scale)  # ... and only ground
     reach = _F(0.75 * BLOCK) / scale  # m from a block's middle to its corners; clearance changes no faster than that
     ax, ay, bx, by = _F(step_x[0]), _F(step_x[1]), _F(step_y[0]), _F(step_y[1])
     for top in range(0, image.shape[0], BLOCK):
@@ -104,9 +104,9 @@ def draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels
 
 
 def smoothed(road_map: Map) -> np.ndarray:
-    """The map's clearance field without the dips where strips meet, away from any edge: packed as in `Road`.
+    """The map's clearance field without dips away from the edges, packed as in `Road`.
 
-    Such a dip, down to a point of clearance 0 in the middle of a junction, would be drawn as an edge.
+    The clearance dips where strips meet, in the middle of a junction even to 0, which would be drawn as an edge.
     """
     road = road_map.road
     nodes = (road.field & np.uint32(255)).astype(np.uint8).reshape(int(road.rows), int(road.columns))
@@ -134,7 +134,7 @@ def draw_shapes(shapes, image):
         for j in range(top, bottom):
             y = _F(j) - y0
             first, last = x0 - wide, x0 + wide
-            if abs(dy) > _F(0.01):  # of a slanted shape, only the stretch that this line of pixels crosses
+            if abs(dy) > _F(0.01):  # only the part of a slanted shape that crosses this row
                 middle, reach = x0 + y * dx / dy, (across + one) / abs(dy)
                 first, last = max(first, middle - reach), min(last, middle + reach)
             for i in range(max(int(first) - 1, 0), min(int(last) + 2, width)):

@@ -1,9 +1,9 @@
-"""Pictures: a state of the simulator as an RGB array, or in a window. It reads only.
+"""Pictures: a state of the simulator as an RGB array, or in a window. The state is not changed.
 
-Each pixel of the ground asks the road's clearance field how far the edge is, so that any map, turned and scaled in any
-way, has smooth edges, and a torus has no seam. All else but text is rounded boxes (lane marks, cars, rays and their
-dots, the path), blended by how much of a pixel they cover. Neither needs a display or a surface; pygame draws the text
-and opens the window.
+Each pixel of the ground is coloured by the road's clearance there, so that edges are smooth at any scale and rotation,
+and a torus has no seam. Everything else but text is rounded boxes (lane marks, cars, rays and their dots, the path),
+blended by the share of a pixel that they cover. None of this needs a display; pygame draws the text and opens the
+window.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from gridsim.view.marks import lane_marks
 if TYPE_CHECKING:
     import pygame
 
-CAR_AT = 0.74  # of the picture's height where the car is, where the view follows it
+CAR_AT = 0.74  # height of the car in a picture that follows it, as a share from the top
 GRID_CELL = 0.5  # m, of the occupancy grid
 
 
 class NoDisplayError(RuntimeError):
-    """There is nowhere to open a window; the message is one line that says what to do."""
+    """No window can be opened; the message is one line that says what to do."""
 
 
 class Renderer:
@@ -54,8 +54,8 @@ class Renderer:
     ):
         """Prepare pictures of `size` (width, height in pixels).
 
-        Args: metres that a picture is high, where it follows the car; whether it does, or shows the whole map.
-        Raises: ValueError with one line where a number makes no sense.
+        Args: metres: height of a picture that follows the car; follow: whether it does, or shows the whole map.
+        Raises: ValueError with one line if a number is out of range.
         """
         width, height = size
         if not (16 <= width <= 8192 and 16 <= height <= 8192):
@@ -72,7 +72,7 @@ class Renderer:
         self._anchor = np.array([width / 2, height * (CAR_AT if follow else 0.5)])
         self._centre, self._up = self._world / 2, np.array([0.0, 1.0])
         self._marks = lane_marks(road_map)
-        # Parked cars: boxes that are part of the map, where it has any.
+        # The map's blocks are parked cars.
         blocks = getattr(road_map.strips, "blocks", None)
         self._blocks = np.zeros((0, 5)) if blocks is None else np.asarray(blocks, dtype=np.float64)
         self._colours = freeze(
@@ -85,9 +85,9 @@ class Renderer:
     # ------------------------------------------------------------------------------------------------- the view
 
     def pixel(self, points: np.ndarray) -> np.ndarray:
-        """Where points [n, 2] (m) are in the last picture drawn: pixels float64 [n, 2], x right, y down.
+        """Pixels float64 [n, 2] (x right, y down) of points [n, 2] (m) in the last picture drawn.
 
-        Of a point of a torus, the one of its places that is nearest to the view's centre.
+        On a torus, the copy of a point that is nearest to the view's centre.
         """
         offset = np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre
         if self.road_map.torus and self.follow:
@@ -100,7 +100,7 @@ class Renderer:
         return np.stack([x * uy - y * ux, -(x * ux + y * uy)], axis=1)
 
     def _near(self, pixels: np.ndarray, margin: float) -> np.ndarray:
-        """Which of pixels [n, 2] are in the picture, or `margin` pixels from it."""
+        """Which of pixels [n, 2] are in the picture, or within `margin` pixels of it."""
         return np.all((pixels > -margin) & (pixels < np.array(self.size) + margin), axis=1)
 
     # ------------------------------------------------------------------------------------------------- drawing
@@ -117,12 +117,12 @@ class Renderer:
         """Draw a state: uint8 [h, w, 3].
 
         Args:
-            car: the car's state float32 [FIELDS] (`gridsim.car.ego`); it is read only.
+            car: the car's state float32 [FIELDS] (`gridsim.car.ego`).
             boxes: other cars [n, 4 or more]: x, y (m), heading (cosine, sine).
-            ranges: of the car's rays [rays], m.
+            ranges: ranges of the car's rays [rays], m.
             grid: occupancy grid uint8 [cells, cells]: row 0 farthest ahead, column 0 leftmost; 0 unknown, 127 free, 255
                 occupied.
-            path: where the car has been [n, 2], m.
+            path: the car's past positions [n, 2], m.
             text: a line at the lower left, or a pair of lines at the lower left and the upper left.
         """
         width, height = self.size
@@ -134,7 +134,7 @@ class Renderer:
         metre = 1.0 / self.pixels_per_m
         origin = self._centre - (self._anchor[0] - 0.5) * metre * right + (self._anchor[1] - 0.5) * metre * self._up
         road = self.road_map.road
-        # Float32 positions stay exact to a millimetre or two: tiles enough to be above 0, and no more.
+        # Just enough tiles to keep positions positive: float32 positions then stay exact to a millimetre or two.
         turn = 1 + math.ceil(math.hypot(width, height) * metre / self._world.min())
         paint.draw_ground(
             self._field, road.columns, road.rows, self.road_map.torus and self.follow, turn,
@@ -173,7 +173,7 @@ class Renderer:
     ) -> np.ndarray:
         """Shapes [n, 11]: pixels [n, 2], directions [n, 2] in the picture, half length, half width and radius in m.
 
-        What is thinner than `least` pixels (half) is drawn so wide, and fainter.
+        Shapes with a half width below `least` pixels are drawn that wide, and fainter.
         """
         scale = self.pixels_per_m
         shapes = np.empty((len(centre), paint.SHAPE), dtype=np.float32)
@@ -194,7 +194,7 @@ class Renderer:
         return self._shapes(at, self._turn(marks[:, 2:4]), marks[:, 4], 0.07, 0.02, colour, 0.9)
 
     def _block_shapes(self) -> np.ndarray:
-        """Parked cars: as cars of their own length and width."""
+        """Parked cars, with the length and width of their blocks."""
         blocks = self._blocks
         if not len(blocks):
             return np.zeros((0, paint.SHAPE), dtype=np.float32)
@@ -210,7 +210,7 @@ class Renderer:
         return np.concatenate(shapes) if shapes else np.zeros((0, paint.SHAPE), dtype=np.float32)
 
     def _placed(self, parts: np.ndarray, positions: np.ndarray, headings: np.ndarray) -> np.ndarray:
-        """A car's parts [k, 11] in m, put at positions [n, 2] with headings [n, 2]: shapes [n * k, 11] in pixels."""
+        """Shapes [n * k, 11] in pixels of a car's parts [k, 11] (m) at positions [n, 2] with headings [n, 2]."""
         scale = self.pixels_per_m
         at, along = self.pixel(positions), self._turn(headings)
         seen = self._near(at, 8.0 * scale)
@@ -222,7 +222,7 @@ class Renderer:
             shapes[:, :, to] = offset + factor * (
                 parts[None, :, to.start, None] * along[:, None] + parts[None, :, to.start + 1, None] * left[:, None]
             )
-        # Far away, a car is still a visible dot.
+        # At small scales, a car is still a visible dot.
         shapes[:, :, 4:7] *= max(scale, 2.0)
         return shapes.reshape(-1, paint.SHAPE)
 
@@ -233,7 +233,7 @@ class Renderer:
         step = at[1:] - at[:-1]
         length = np.hypot(step[:, 0], step[:, 1])
         middle = (at[1:] + at[:-1]) / 2
-        # A step across the picture is one over the torus's edge.
+        # A long step crosses the torus's edge.
         seen = (length > 0.01) & (length < 20.0 * self.pixels_per_m)
         seen &= self._near(middle, 20.0 * self.pixels_per_m)
         middle, length = middle[seen], length[seen]
@@ -293,7 +293,7 @@ class Renderer:
 
 
 def _pygame() -> Any:
-    """pygame, imported without its greeting."""
+    """pygame, imported without its banner."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     import pygame
 
@@ -316,9 +316,9 @@ def _glyphs(text: str, pixels: int) -> np.ndarray:
 
 
 def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Map) -> np.ndarray:
-    """A state float32 [FIELDS] between two, or boxes [n, 4 or more] (x, y, cosine, sine): for pictures, not physics.
+    """Interpolate states float32 [FIELDS] or boxes [n, 4 or more] (x, y, cosine, sine) linearly, for pictures.
 
-    Args: part in [0, 1] of the way from the first to the second, over the torus's edge where that is shorter.
+    Args: part in [0, 1] of the way from `before` to `after`, across the torus's edge if that is shorter.
     """
     size = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     gap = np.asarray(after, dtype=np.float64) - before
@@ -333,7 +333,7 @@ def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Ma
 
 @contextlib.contextmanager
 def _driver_for_display(chosen: str | None) -> Iterator[None]:
-    """On Linux, let SDL try no driver whose display is not there: some of them complain on stderr by themselves."""
+    """On Linux, keep SDL from trying drivers without a display, some of which print errors to stderr."""
     x11, wayland = os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY")
     if chosen or wayland or not sys.platform.startswith("linux"):
         yield
@@ -348,7 +348,7 @@ def _driver_for_display(chosen: str | None) -> Iterator[None]:
 
 
 class Window:
-    """A window on a display, and the keys that are pressed in it."""
+    """A window on a display, with its keys."""
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
         """Open it. Raises: NoDisplayError with one line that says what to do."""
@@ -357,7 +357,7 @@ class Window:
         try:
             with _driver_for_display(chosen):
                 pygame.display.init()
-            # SDL falls back on drivers that show nothing; that is right only for who asked for one.
+            # SDL falls back to drivers that show nothing; that is right only if one was chosen.
             if not chosen and pygame.display.get_driver() in ("dummy", "offscreen", "evdev"):
                 raise pygame.error("no display")
             self._screen = pygame.display.set_mode(size)
@@ -371,7 +371,7 @@ class Window:
         self.closed = False
 
     def show(self, image: np.ndarray, fps: float = 0.0) -> None:
-        """Show a picture uint8 [h, w, 3], and wait for so long that there are `fps` a second (0: do not wait)."""
+        """Show a picture uint8 [h, w, 3], and wait to keep a rate of `fps` (0: do not wait)."""
         pygame = self._pygame
         height, width = image.shape[:2]
         self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB"), (0, 0))
@@ -384,9 +384,9 @@ class Window:
             self._due += 1.0 / fps
 
     def keys(self) -> tuple[set[str], set[str]]:
-        """Names of the keys that went down since the last call, and of those that are down or were in between.
+        """Names of the keys pressed since the last call, and of those held now or pressed since.
 
-        Names are pygame's: "up", "space", "q", "escape". Closing the window, too, sets `closed`.
+        Names are pygame's: "up", "space", "q", "escape". Also sets `closed` if the window was closed.
         """
         pygame = self._pygame
         pressed: set[str] = set()
