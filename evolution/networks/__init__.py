@@ -1,1 +1,1 @@
-"""Networks: what a policy's text means, flat genomes, forward passes, export to PyTorch."""
+"""Networks: policy specifications, flat genomes, forward passes, export to PyTorch."""

@@ -1,9 +1,9 @@
-"""The forward pass of `cnn` policies, by kernels of our own: one car after the other, each sum in a fixed order.
+"""The forward pass of `cnn` policies in our own kernels: one car at a time, each sum in a fixed order.
 
-What a car does so depends on its genome and observations alone, never on the members and episodes that share a chunk
-with it. Compiled, a car-step of `cnn:8,16,32@1` takes 11 us on one core, against 27 us in PyTorch with the 12 episodes
-of a member in one batch (and only as long as all of them last); workers need not load PyTorch, 200 MB and seconds each.
-The tests hold it against PyTorch's convolutions.
+So a car's actions depend only on its genome and observations, not on the members and episodes in the same chunk. A
+car-step of `cnn:8,16,32@1` takes 11 us on one core. PyTorch takes 27 us with the 12 episodes of a member in one batch,
+and more once some of them have ended; and each worker would have to load it, which takes 200 MB and seconds. Tests
+compare the kernels with PyTorch's convolutions.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gridsim.sensing.grid import CELLS
 _F = np.float32
 _CODE = _F(1.0 / 255.0)
 _AREA = CELLS * CELLS
-_HALF_ROW = (SIDE_1 + 1) // 2  # two tiles make a row of 19; they share its middle
+_HALF_ROW = (SIDE_1 + 1) // 2  # two tiles cover a row of 19 and overlap in its middle
 _WIDE, _WIDEST = 2 * UNIT_MULTIPLE, 4 * UNIT_MULTIPLE
 
 _convolve_1, _convolve_1_wide = tile(_HALF_ROW, UNIT_MULTIPLE, True), tile(_HALF_ROW, _WIDE, True)
@@ -41,17 +41,17 @@ _linear = tile(1, UNIT_MULTIPLE, False)
 
 
 class Scratch(NamedTuple):
-    """What a forward pass writes: float32, of one car."""
+    """Buffers of a forward pass for one car: float32."""
 
     frames: np.ndarray  # [frames * 6400] cells of the frames, the newest last, in [0, 1]
     first: np.ndarray  # [19 * 19 * channels]
-    second: np.ndarray  # [8 * 8 * channels + 1], the last is the speed
+    second: np.ndarray  # [8 * 8 * channels + 1], the speed last
     dense: np.ndarray  # [units]
     outputs: np.ndarray  # [actions]
 
 
 def scratch(spec: CnnSpec) -> Scratch:
-    """Room for a forward pass."""
+    """Allocate the buffers of a forward pass."""
     first, second, dense = spec.hidden
     sizes = (spec.frames * _AREA, SIDE_1 * SIDE_1 * first, SIDE_2 * SIDE_2 * second + 1, dense, spec.outputs)
     return Scratch(*(np.zeros(n, dtype=np.float32) for n in sizes))
@@ -59,7 +59,7 @@ def scratch(spec: CnnSpec) -> Scratch:
 
 @leaf
 def push(grid, begun, scratch):
-    """Make grid uint8 [6400] the newest frame; where an episode has just `begun` it is all of them."""
+    """Append grid uint8 [6400] as the newest frame; if the episode has just `begun`, as all frames."""
     frames = scratch.frames
     older = frames.shape[0] - _AREA
     for i in range(older):
@@ -75,7 +75,7 @@ def push(grid, begun, scratch):
 def forward(genome, layers, speed, scratch):
     """Outputs of the network for the frames in `scratch` and a speed in m/s; left in `scratch.outputs`.
 
-    Args: genome float32 [genes]; layers of `CnnSpec.layers`. Any not-a-number stays one and reaches the outputs.
+    Args: genome float32 [genes]; layers of `CnnSpec.layers`. A NaN anywhere reaches the outputs.
     """
     frames, one, two, units = int(layers[0]), int(layers[1]), int(layers[2]), int(layers[3])
     bias = frames * KERNEL_1 * KERNEL_1 * one
@@ -131,7 +131,7 @@ def forward(genome, layers, speed, scratch):
 
 @leaf
 def decide(genome, layers, speed, scratch):
-    """Index of the greatest output, the first of equals; -1 where an output is not a number."""
+    """Index of the largest output, the first one of ties; -1 if an output is NaN."""
     forward(genome, layers, speed, scratch)
     outputs = scratch.outputs
     best, action = outputs[0], 0
@@ -159,8 +159,8 @@ def act_on(
 
     Args: observation uint8 [80, 80] for a network of one frame, [frames, 80, 80] for one of several, newest last, or
     either with a leading axis [n, ...]; speed m/s, a number or [n].
-    Returns: an action, or int64 [n]; -1 where the network gives no number.
-    Raises: ValueError with one line for an observation of another shape or type.
+    Returns: an action, or int64 [n]; -1 if an output is NaN.
+    Raises: ValueError with one line if the observation's shape or type is wrong.
     """
     grids = np.asarray(observation)
     frame = (CELLS, CELLS) if spec.frames == 1 else (spec.frames, CELLS, CELLS)

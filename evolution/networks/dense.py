@@ -1,8 +1,8 @@
-"""Vector code for layers, their sums held in registers.
+"""Vector code for network layers, with sums held in registers.
 
-`dense` is for some units of a perceptron's layer, `tile` for some positions times some units of a convolution's. A
-position's inputs lie in `planes` x `rows` runs of `run` numbers. The `vector_` ones emit LLVM vectors; the `plain_`
-ones are the same arithmetic in plain Python, for `NUMBA_DISABLE_JIT=1` and for the tests.
+`dense` computes some units of a perceptron's layer, `tile` some positions times some units of a convolution. The inputs
+of a position are `planes` x `rows` runs of `run` consecutive numbers. The `vector_` variants emit LLVM vectors; the
+`plain_` variants do the same arithmetic in plain Python, for `NUMBA_DISABLE_JIT=1` and for tests.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def vector_tile(positions: int, lanes: int, rectify: bool) -> Any:
 
             def load(pointer: ir.Value, at: ir.Value) -> ir.Value:
                 value = builder.load(vector_at(pointer, at))
-                value.align = 4  # a genome begins anywhere
+                value.align = 4  # a genome is aligned to one float only
                 return value
 
             def splat(value: ir.Value) -> ir.Value:
@@ -95,7 +95,7 @@ def vector_tile(positions: int, lanes: int, rectify: bool) -> Any:
             at = y_at
             for total in totals:
                 value = builder.load(total)
-                if rectify:  # so compared, not a number stays one
+                if rectify:  # this comparison keeps NaN
                     value = builder.select(builder.fcmp_ordered("<", value, zero), zero, value)
                 builder.store(value, vector_at(outputs, at)).align = 4
                 at = builder.add(at, y_step)
@@ -107,12 +107,12 @@ def vector_tile(positions: int, lanes: int, rectify: bool) -> Any:
 
 
 def tile(positions: int, lanes: int, rectify: bool) -> Any:
-    """A function for kernels: biases plus weights times inputs, of `positions` x `lanes` outputs, rectified if so.
+    """A function for kernels: biases plus weights times inputs for `positions` x `lanes` outputs, then maybe ReLU.
 
-    Its arguments: float32 [any] inputs x and, within it, where the first position's begin, how far the next position's
-    are, planes and how far they are apart, rows and how far they are apart, numbers in a row's run; weights w and where
-    they begin, units of the whole layer, where the biases begin; outputs y, where they begin, how far positions are
-    apart. Each output is summed in the order of its inputs, whatever the machine's vectors are.
+    Its arguments: inputs x float32 [any], with the offset of the first position and the stride of positions, number and
+    stride of planes, number and stride of rows, and length of a run; weights w, their offset, the units of the whole
+    layer, and the offset of the biases; outputs y, their offset and the stride of positions. Each output is summed in
+    the order of its inputs, on any machine.
     """
     return plain_tile(positions, lanes, rectify) if CONFIG.DISABLE_JIT else vector_tile(positions, lanes, rectify)
 
@@ -186,10 +186,10 @@ def vector_dense(lanes: int, chains: int) -> Any:
 
 
 def dense(lanes: int, chains: int) -> Any:
-    """A function for kernels: biases plus weights times inputs, of `lanes` units of a dense layer.
+    """A function for kernels: biases plus weights times inputs, for `lanes` units of a dense layer.
 
-    Its arguments: float32 [any] inputs x, where they begin and how many they are; weights w, where those of the first
-    input begin, how far the next one's are, where the biases begin; outputs y and where they begin. Inputs are summed
-    in `chains` parts, which do not wait for each other; where few lanes fill a register that is what takes time.
+    Its arguments: inputs x float32 [any], their offset and number; weights w, their offset, the stride from one input
+    to the next, and the offset of the biases; outputs y and their offset. Inputs are summed in `chains` independent
+    parts, which hides the latency of additions where there are few lanes.
     """
     return plain_dense(lanes, chains) if CONFIG.DISABLE_JIT else vector_dense(lanes, chains)

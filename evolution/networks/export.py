@@ -1,13 +1,13 @@
-"""A policy as a PyTorch module of plain operations, which runs, and can be exported, without GridSim.
+"""A policy as a PyTorch module of standard operations, which runs and can be exported without GridSim.
 
-What it takes is what the environment gives, float32 [n, inputs]:
+Its input is the environment's observation, float32 [n, inputs]:
 
-* rays: the environment's observation as it is (`policy.act_on`);
-* grid: the cells of all frames as the environment gives them, 0 to 255, frame after frame, the newest last, each row by
-  row, and then the speed in m/s, `info["speed_mps"]`.
+* rays: the observation unchanged (`policy.act_on`);
+* grid: the cells of all frames, 0 to 255, the newest frame last, each row by row; then the speed in m/s,
+  `info["speed_mps"]`.
 
-What it returns are the outputs, float32 [n, 8]; the greatest acts, the first of equals. They are the kernels' outputs
-up to float32's rounding, so that the same action is taken wherever two outputs do not tie.
+It returns the outputs, float32 [n, 8]; the action is the largest one, the first of ties. They equal the kernels'
+outputs up to float32 rounding, so the action is the same unless two outputs almost tie.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _ROAD = 8.0  # m, width of the straight road of `example`
 def to_torch(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> torch.nn.Module:
     """A genome float32 [genes] as a module in evaluation mode, on the CPU, without gradients.
 
-    `config` says what the environment divides its observations by. Imports torch, which takes seconds.
-    Raises: ValueError with one line for a genome that is none of such a policy.
+    `config` has the scales of the environment's observations. Imports torch, which takes seconds.
+    Raises: ValueError with one line if the genome does not fit the policy.
     """
     import torch
 
@@ -64,7 +64,7 @@ def to_torch(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> torch.n
         return loaded(torch.nn.Linear(*weights.shape), weights.T, biases)
 
     class Perceptron(torch.nn.Module):
-        """Encodes rays, speed, and what else is seen (`policy.encode`); then dense layers."""
+        """Encodes the inputs as `policy.encode` does; then dense layers."""
 
         def __init__(self, motion: bool, steering: bool):
             super().__init__()
@@ -89,12 +89,12 @@ def to_torch(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> torch.n
             return self.layers[-1](x)
 
     class Convolutional(torch.nn.Module):
-        """Two convolutions on the frames, a dense layer that also sees the speed, and the outputs."""
+        """Two convolutions on the frames, a dense layer with the speed as a further input, and the outputs."""
 
         def __init__(self, frames: int, first: int, second: int):
             super().__init__()
             self.frames = frames
-            # A genome orders a unit's inputs (frame, row, column), then (row, column, channel).
+            # Order of a unit's inputs in a genome: (frame, row, column), in the second layer (row, column, channel).
             weights = parts[0][0].view(frames, KERNEL_1, KERNEL_1, first).permute(3, 0, 1, 2)
             self.first = loaded(torch.nn.Conv2d(frames, first, KERNEL_1, STRIDE_1), weights, parts[0][1])
             weights = parts[1][0].view(KERNEL_2, KERNEL_2, first, second).permute(3, 2, 0, 1)
@@ -125,7 +125,7 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
 
 
 def example(spec: PolicySpec, config: SimConfig) -> np.ndarray:
-    """Inputs of `to_torch`'s module, float32 [2, inputs]: the middle of a straight road, standing and at 10 m/s."""
+    """Example inputs of `to_torch`'s module, float32 [2, inputs]: a straight road, at standstill and at 10 m/s."""
     speeds = np.array([0.0, 10.0], dtype=np.float32)
     if isinstance(spec, CnnSpec):
         ahead, left = centres()

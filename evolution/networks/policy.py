@@ -1,7 +1,7 @@
-"""Networks: what a policy's text means, how a flat genome is laid out, and the forward pass.
+"""Policies: their specification as text, the layout of a flat genome, and the perceptron's forward pass.
 
-This is the one file that knows layer shapes. A genome is a flat float32 vector: for each layer the weights, input-major
-[inputs, outputs], then the biases [outputs]. The forward pass here is the perceptron's; `convnet` has the other one.
+Layer shapes are defined here. A genome is a flat float32 vector: for each layer the weights, input-major [inputs,
+outputs], then the biases [outputs]. The forward pass of `cnn` policies is in `convnet`.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from gridsim.maps.roads import freeze
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
 
 RAYS = 31
-INPUTS = RAYS + 1  # and the speed
+INPUTS = RAYS + 1  # the rays and the speed
 ACTIONS = 8
 MAX_GENES = 1_000_000
 _F, _U = np.float32, np.uint64
-RAY_HALF = _F(8.0)  # m, the range whose input is 0
-SPEED_SCALE = _F(10.0)  # m/s, the speed whose input is 0
-STEERING_SCALE = _F(0.5)  # rad, the steering angle whose input is 1
+RAY_HALF = _F(8.0)  # m, the range that is encoded as 0
+SPEED_SCALE = _F(10.0)  # m/s, the speed that is encoded as 0
+STEERING_SCALE = _F(0.5)  # rad, the steering angle that is encoded as 1
 
 
 Observation = Literal["rays", "grid"]
@@ -39,7 +39,7 @@ class PolicySpec(ABC):
 
     Attributes:
         hidden: units, or channels, of the hidden layers.
-        outputs: one for each action; the greatest acts.
+        outputs: one for each action; the largest one is chosen.
     """
 
     observation: ClassVar[Observation]
@@ -77,16 +77,16 @@ class PolicySpec(ABC):
     @property
     @abstractmethod
     def inputs(self) -> int:
-        """Numbers that the network sees."""
+        """Number of the network's inputs."""
 
     @property
     @abstractmethod
     def layers(self) -> np.ndarray:
-        """Sizes as the kernels read them, int32."""
+        """The layers' sizes as kernels read them, int32."""
 
     @abstractmethod
     def shapes(self) -> tuple[tuple[int, int], ...]:
-        """(inputs of a unit, units) of each layer, the output's included."""
+        """(inputs of a unit, units) of each layer, including the outputs."""
 
     @property
     def size(self) -> int:
@@ -96,10 +96,10 @@ class PolicySpec(ABC):
 
 @dataclass(frozen=True)
 class MlpSpec(PolicySpec):
-    """A multi-layer perceptron on rays and speed: tanh hidden layers, a linear output, the greatest output acts.
+    """A multi-layer perceptron on rays and speed: tanh hidden layers, linear outputs.
 
-    With `motion` it also sees how fast the cars that rays meet come closer (`boxes.cast_boxes`), with `steering` how
-    its own wheels stand, which a driver without memory cannot know otherwise: they take half a second to turn.
+    With `motion` it also sees the closing speeds of cars hit by rays (`boxes.cast_boxes`), with `steering` its own
+    steering angle, which a network without memory cannot infer: the wheels take half a second to turn.
     """
 
     observation = "rays"
@@ -114,7 +114,7 @@ class MlpSpec(PolicySpec):
 
     @property
     def inputs(self) -> int:
-        """The rays, what they meet's motion if it is seen, the speed, and the steering angle if it is seen."""
+        """The rays, with `motion` their closing speeds, the speed, and with `steering` the steering angle."""
         return INPUTS + (RAYS if self.motion else 0) + self.steering
 
     @property
@@ -127,22 +127,22 @@ class MlpSpec(PolicySpec):
         return tuple(itertools.pairwise(units))
 
 
-# The convolutions of Mnih et al. (2015), which the paper's authors took over for their grid: kernels and strides.
+# Kernels and strides of the convolutions of Mnih et al. (2015), which the paper's authors use for their grid.
 KERNEL_1, STRIDE_1 = 8, 4
 KERNEL_2, STRIDE_2 = 4, 2
 SIDE_1 = (CELLS - KERNEL_1) // STRIDE_1 + 1  # 19, of the first convolution's output
 SIDE_2 = (SIDE_1 - KERNEL_2) // STRIDE_2 + 1  # 8
-UNIT_MULTIPLE = 8  # channels and units come in multiples of it, so that layers are whole vectors
+UNIT_MULTIPLE = 8  # of which channels and units are multiples, so that layers are whole vectors
 
 
 @dataclass(frozen=True)
 class CnnSpec(PolicySpec):
-    """A convolutional network on the occupancy grid and the speed: ReLU hidden layers, the greatest output acts.
+    """A convolutional network on the occupancy grid and the speed: ReLU hidden layers, linear outputs.
 
-    Two convolutions (8 x 8 with stride 4, 4 x 4 with stride 2), a dense layer that sees the speed beside the second
-    one's output, and the outputs. `cnn:16,32,256@4` names the channels of the convolutions, the units of the dense
-    layer, and the frames: grids of so many control steps in a row, the newest last. `cnn` alone is that network, which
-    but for the speed is the one of the paper's authors; without `@` there are 4 frames.
+    Two convolutions (8 x 8 with stride 4, 4 x 4 with stride 2), a dense layer with the speed as a further input, and
+    the outputs. `cnn:16,32,256@4` has the channels of the convolutions, the units of the dense layer, and the frames:
+    the grids of so many consecutive control steps, the newest last. `cnn` alone means this network, which is that of
+    the paper's authors plus the speed; without `@` there are 4 frames.
 
     A unit's inputs are ordered (frame, row, column) in the first layer, (row, column, channel) in the others; the
     speed is the dense layer's last.
@@ -178,12 +178,12 @@ class CnnSpec(PolicySpec):
 
 @cache
 def gene_scales(spec: PolicySpec) -> np.ndarray:
-    """The size float32 [genes] that genes have by nature: of a new genome's spread and of a mutation's step.
+    """The scale float32 [genes] of each gene: of the spread of new genomes and of mutations.
 
-    1 for a perceptron, whose few inputs are alike. In a convolutional network the standard deviation of He et al.
-    (2015), sqrt(2 / inputs of the unit), so that a step means as much in a layer of 64 inputs as in one of 2,000; half
-    the variance in the linear output layer. The speed's weights are of size 1: it is one input beside a thousand, and
-    would go unheard.
+    1 for a perceptron, whose few inputs are alike. In a convolutional network, the standard deviation of He et al.
+    (2015), sqrt(2 / inputs of the unit), so that a step has the same effect in a layer of 64 inputs as in one of 2,000;
+    half that variance in the linear output layer. The speed's weights have scale 1, because it is one input among a
+    thousand and would have no effect otherwise.
     """
     if spec.observation == "rays":
         return freeze(np.ones(spec.size, dtype=np.float32))
@@ -198,10 +198,10 @@ def gene_scales(spec: PolicySpec) -> np.ndarray:
 
 @leaf
 def encode(ranges, closing, speed, steering, inputs):
-    """What the network sees: float32 [rays + 2], or [2 * rays + 2] where closing is not None.
+    """Write the network's inputs: float32 [rays + 2], or [2 * rays + 2] if closing is not None.
 
-    Ranges r (m) as 2 r / (r + 8) - 1, so that near edges stand out; then how fast what they meet comes closer, the
-    speed, and the steering angle (rad), which is the last, so that who does not see it passes it over.
+    Ranges r (m) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds, the speed and the steering
+    angle (rad) follow. The angle is last, so that a network without it reads one input less.
     """
     rays = ranges.shape[0]
     for i in range(rays):
@@ -218,7 +218,7 @@ def encode(ranges, closing, speed, steering, inputs):
 @leaf
 def squash(x):
     """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere."""
-    x = _F(4.97) if x > _F(4.97) else x  # so written, not a number stays one
+    x = _F(4.97) if x > _F(4.97) else x  # this form keeps NaN
     x = _F(-4.97) if x < _F(-4.97) else x
     s = x * x
     return (
@@ -234,7 +234,7 @@ _dense_64, _dense_16, _dense_8 = dense(64, 1), dense(16, 2), dense(8, 4)
 
 @njit
 def packed_size(layers):
-    """Length of a genome laid out by `pack`."""
+    """Length of a genome packed by `pack`."""
     size = 0
     for k in range(layers.shape[0] - 1):
         size += (layers[k] + 1) * ((layers[k + 1] + BLOCK - 1) // BLOCK * BLOCK)
@@ -243,7 +243,7 @@ def packed_size(layers):
 
 @njit
 def scratch_size(layers):
-    """Numbers that `forward` needs room for: two layers of the widest."""
+    """Length of `forward`'s scratch: twice the widest layer."""
     widest = 0
     for k in range(layers.shape[0]):
         widest = max(widest, layers[k])
@@ -252,9 +252,9 @@ def scratch_size(layers):
 
 @njit
 def pack(genome, layers, packed):
-    """Lay a genome out for `forward`: of each layer the biases, then a row of weights for each input.
+    """Pack a genome for `forward`: for each layer the biases, then a row of weights for each input.
 
-    A row is as long as whole blocks of units are; missing units have weight 0.
+    Rows are padded with zeros to whole blocks.
     """
     packed[:] = _F(0.0)
     at, to = 0, 0
@@ -274,8 +274,8 @@ def pack(genome, layers, packed):
 def forward(packed, layers, scratch):
     """Outputs of the network in scratch[return value: + outputs].
 
-    Args: genome laid out by `pack`; scratch float32 [2 * (widest layer + 8)], the inputs at its beginning.
-    Any not-a-number stays one and reaches the outputs.
+    Args: genome packed by `pack`; scratch float32 [2 * (widest layer + 8)], which begins with the inputs.
+    A NaN anywhere reaches the outputs.
     """
     half = scratch.shape[0] // 2
     source, at = 0, 0
@@ -303,7 +303,7 @@ def forward(packed, layers, scratch):
 
 @leaf
 def decide(packed, layers, scratch):
-    """Index of the greatest output, the first of equals; -1 where an output is not a number."""
+    """Index of the largest output, the first one of ties; -1 if an output is NaN."""
     at = forward(packed, layers, scratch)
     best, action = scratch[at], 0
     number = best == best
@@ -349,7 +349,7 @@ def act_on(
     Args: observation float32 [32] or [n, 32]: ranges / reach, then speed / speed_limit; with motion [63] or [n, 63],
     closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit; reach m;
     speed limit m/s; steering limit rad.
-    Returns: an action, or int64 [n]; -1 where the network gives no number.
+    Returns: an action, or int64 [n]; -1 if an output is NaN.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if many.ndim != 2 or many.shape[1] != spec.inputs:

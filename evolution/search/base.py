@@ -1,6 +1,6 @@
-"""What every search shares: ask for a generation's recipes, tell their scores; and tournament selection in closed form.
+"""The base class of searches: ask for a generation's recipes, tell their scores. Also tournament selection.
 
-`recombination` has the default search, `two_parents` the classic one and random search.
+`recombination` is the default search; `two_parents` has the classic one and random search.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """Parameters of a search; `elites` and `mutation_rate` are those of two parents alone."""
+    """Parameters of a search; only `two_parents` uses `elites` and `mutation_rate`."""
 
     population: int = 256  # members of a generation
-    groups: int = 8  # of members, each of which meets episodes of its own
+    groups: int = 8  # of members; each group has its own episodes
     tournament: int = 8  # members of a tournament
     sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
-    elites: int = 8  # members that go on unmodified
+    elites: int = 8  # best members, kept unmodified
     mutation_rate: float = Mutation.rate  # share of genes that mutate
 
     def check(self) -> None:
-        """Raises: ValueError with one line for parameters that do not fit each other."""
+        """Raises: ValueError with one line for invalid parameters."""
         if self.population < 4:
             raise ValueError(f"population must be 4 or more, not {self.population}")
         if not 1 <= self.groups <= self.population // 2:
@@ -43,30 +43,30 @@ class SearchConfig:
 
 
 class Generation(NamedTuple):
-    """A generation to be evaluated."""
+    """A generation to evaluate."""
 
-    parents: np.ndarray  # float32 [p, genes], the rows that recipes name
+    parents: np.ndarray  # float32 [p, genes], the rows that recipes refer to
     recipes: np.ndarray  # RECIPE [population]
-    key: int  # 64 bits, of the generation's random numbers
+    key: int  # 64 bits, seed of the generation's random numbers
     mutation: Mutation
-    groups: list[slice]  # the members of each group, side by side
+    groups: list[slice]  # the members of each group, which are consecutive
 
 
 class Search(ABC):
-    """A search by ask and tell. All randomness comes from (seed, generation); its state is a few arrays and numbers."""
+    """A search by ask and tell. Random numbers depend on (seed, generation); the state is a few arrays and numbers."""
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         config.check()
         self.spec, self.config, self.seed = spec, config, seed
-        self.generation = 0  # generations that are done
+        self.generation = 0  # completed generations
         self.asked: Generation | None = None
 
     @abstractmethod
     def start_from(self, genome: np.ndarray) -> None:
-        """Begin with a genome float32 [genes] in place of random ones."""
+        """Start from a genome float32 [genes] in place of random ones."""
 
     def keep_champion(self, champion: np.ndarray) -> None:  # noqa: B027
-        """Carry a champion float32 [genes] among the elites, where the search has a place for it."""
+        """Use the run's champion float32 [genes] as an elite, if the search does so."""
 
     @abstractmethod
     def leader(self) -> np.ndarray | None:
@@ -74,15 +74,15 @@ class Search(ABC):
 
     @abstractmethod
     def candidates(self) -> np.ndarray:
-        """Who may become champion after a generation, float32 [k, genes]."""
+        """Candidates for champion after a generation, float32 [k, genes]."""
 
     @abstractmethod
     def state(self) -> tuple[Arrays, dict[str, float]]:
-        """What an exact resume needs beside the generation's number."""
+        """The arrays and numbers that an exact resume needs, beside the generation."""
 
     @abstractmethod
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
-        """The inverse of `state`. Raises: KeyError, TypeError, ValueError where it does not fit this search."""
+        """The inverse of `state`. Raises: KeyError, TypeError, ValueError if the state does not fit this search."""
 
     @abstractmethod
     def _ask(self, key: int) -> Generation: ...
@@ -91,17 +91,17 @@ class Search(ABC):
     def _tell(self, asked: Generation, scores: np.ndarray) -> None: ...
 
     def ask(self) -> Generation:
-        """The next generation. Raises: RuntimeError when the last one's scores were not told yet."""
+        """The next generation. Raises: RuntimeError if the last one was not told its scores."""
         if self.asked is not None:
             raise RuntimeError("ask() was called twice; tell() the scores first")
         self.asked = self._ask(int(self._rng(0).integers(1 << 63)))
         return self.asked
 
     def tell(self, scores: np.ndarray) -> None:
-        """Take the members' scores float64 [population], greater is better; they are compared within groups alone.
+        """Take the members' scores float64 [population]; higher is better. They are compared only within groups.
 
-        A score that is not a number counts as the worst.
-        Raises: RuntimeError without an open generation; ValueError for a wrong number of scores.
+        NaN counts as the worst score.
+        Raises: RuntimeError if no generation was asked for; ValueError for a wrong number of scores.
         """
         if self.asked is None:
             raise RuntimeError("tell() was called without ask()")
@@ -112,7 +112,7 @@ class Search(ABC):
         self.asked = None
 
     def genomes(self, members: np.ndarray) -> np.ndarray:
-        """Genomes float32 [k, genes] of some members of the generation that was asked for."""
+        """Genomes float32 [k, genes] of members [k] of the current generation."""
         if self.asked is None:
             raise RuntimeError("no generation was asked for")
         asked = self.asked
@@ -123,7 +123,7 @@ class Search(ABC):
 
 
 def split(members: int, groups: int, first: int = 0) -> list[slice]:
-    """Groups of about as many members each; after the `first` ones pairs stay together (0 and 1, 2 and 3, ...)."""
+    """Split members into groups of about equal size, without splitting pairs; pairs begin after the `first` members."""
     pairs = (members - first + 1) // 2
     bounds = first + 2 * np.round(np.linspace(0, pairs, groups + 1)).astype(int)
     bounds[0], bounds[-1] = 0, members
@@ -131,9 +131,9 @@ def split(members: int, groups: int, first: int = 0) -> list[slice]:
 
 
 def ranks(scores: np.ndarray, groups: list[slice]) -> np.ndarray:
-    """How a member stands in its group, float64 [n] in (0, 1): the share of it with lower scores, equals by half.
+    """Rank of each member in its group, float64 [n] in (0, 1): the share of lower scores plus half the share of ties.
 
-    So members of groups that met easier and harder episodes can be compared.
+    Ranks of members can be compared even if their groups had easier or harder episodes.
     """
     standing = np.empty(len(scores))
     for group in groups:
@@ -143,9 +143,9 @@ def ranks(scores: np.ndarray, groups: list[slice]) -> np.ndarray:
 
 
 def tournament_weights(scores: np.ndarray, size: int) -> np.ndarray:
-    """Share float64 [n] of all n ** size tournaments (members are drawn with replacement) that each member wins.
+    """Share float64 [n] of all n ** size tournaments (drawn with replacement) that each member wins.
 
-    The k worst of n win (k / n) ** size of them between them; equals share what they win together.
+    The k worst of n members together win (k / n) ** size of them; members with equal scores share equally.
     """
     _, place, count = np.unique(scores, return_inverse=True, return_counts=True)
     upto = np.cumsum(count)
@@ -154,20 +154,20 @@ def tournament_weights(scores: np.ndarray, size: int) -> np.ndarray:
 
 
 def tournaments(scores: np.ndarray, size: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Winners [count] of tournaments among `size` members drawn with replacement; the first drawn wins a tie."""
+    """Winners [count] of tournaments among `size` members drawn with replacement; the first drawn wins ties."""
     drawn = rng.integers(len(scores), size=(count, size))
     return drawn[np.arange(count), scores[drawn].argmax(axis=1)]
 
 
 def recipes(n: int) -> np.ndarray:
-    """Recipes RECIPE [n] with seeds 0 to n - 1, all else 0."""
+    """Recipes RECIPE [n] with seeds 0 to n - 1 and all other fields 0."""
     made = np.zeros(n, dtype=RECIPE)
     made["seed"] = np.arange(n)
     return made
 
 
 def checked(array: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    """An array from a checkpoint. Raises: ValueError where it is another or holds what is no number."""
+    """An array from a checkpoint. Raises: ValueError if its shape or type is wrong, or a value is not finite."""
     if array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
         raise ValueError(f"it holds {array.dtype}{list(array.shape)} in place of {np.dtype(dtype)}{list(shape)}")
     return array

@@ -1,7 +1,7 @@
 """Breeding: genomes from recipes, by kernels with a counter-based generator.
 
-A recipe is a few bytes. Together with the parents and the generation's key it *is* the child: whoever breeds it,
-wherever and how often, gets the same bits.
+A recipe is a few bytes. Together with the parents and the generation's key it determines the child, bit for bit, in
+every process.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from gridsim.maps.roads import freeze
 
 
 class Kind(IntEnum):
-    """How a child is made from the rows of `parents` that its recipe names."""
+    """How a child is made from the rows a and b of `parents` in its recipe."""
 
     COPY = 0  # parents[a], unmodified
-    NEW = 1  # a random genome, left-right symmetric (`symmetry`), as the noise of STEP and MIRRORED is
+    NEW = 1  # a random genome, left-right symmetric (`symmetry`), like the noise of STEP and MIRRORED
     STEP = 2  # parents[a] + parents[b] * N(0, 1): a centre, and a standard deviation for each gene
-    MIRRORED = 3  # parents[a] - parents[b] * N(0, 1): with the same seed the mirror image of a STEP
+    MIRRORED = 3  # parents[a] - parents[b] * N(0, 1): with the same seed, the opposite of a STEP
     CROSS = 4  # uniform crossover of parents[a] and parents[b], then Gaussian mutation
 
 
@@ -43,12 +43,12 @@ def _quantiles() -> np.ndarray:
 
 
 QUANTILES = _quantiles()
-"""Normal numbers are looked up by 12 random bits: ten times as fast as a logarithm and a cosine each."""
+"""Normal numbers are looked up by 12 random bits, ten times as fast as the Box-Muller transform."""
 
 
 @dataclass(frozen=True)
 class Mutation:
-    """How a child of two parents differs from what it inherits (Kind.CROSS)."""
+    """Mutation of a child of two parents (Kind.CROSS)."""
 
     rate: float = 0.03  # share of genes that get Gaussian noise
     sigma: float = 0.5  # its standard deviation, in units of `policy.gene_scales`
@@ -80,7 +80,7 @@ def _normals(quantiles, stream, scale, symmetry, out):
 
 @njit
 def _cross(a, b, stream, threshold, child, marked):
-    """Uniform crossover, and which genes are to mutate: no branches, so that it becomes vector code."""
+    """Uniform crossover, and marks of the genes to mutate. Without branches, so that it is vectorised."""
     for i in range(child.shape[0]):
         bits = mix(stream + _U(i + 1) * GOLDEN)
         x, y = a[i], b[i]
@@ -120,7 +120,7 @@ def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, chil
 def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, mutation: Mutation) -> np.ndarray:
     """Children float32 [n, genes] of recipes RECIPE [n] over parents float32 [p, genes].
 
-    Raises: ValueError where shapes or parents' rows do not fit.
+    Raises: ValueError if shapes do not fit or a recipe refers to a missing parent.
     """
     if parents.ndim != 2 or parents.shape[1] != spec.size:
         raise ValueError(f"parents of {spec} are [n, {spec.size}], not {parents.shape}")
@@ -156,7 +156,7 @@ def _moments(seeds, weights, squares, key, quantiles, symmetry, first, second):
 def moments(
     seeds: np.ndarray, weights: np.ndarray, squares: np.ndarray, key: int, spec: PolicySpec
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sums over the noise z [genes] of seeds [n]: of z by weights [n], and of z squared by squares [n]."""
+    """Sums over the noise z [genes] of seeds [n]: weights [n] times z, and squares [n] times z squared."""
     first, second = np.zeros(spec.size, dtype=np.float32), np.zeros(spec.size, dtype=np.float32)
     _moments(seeds.astype(np.uint32), weights, squares, _U(key), QUANTILES, symmetry(spec), first, second)
     return first, second

@@ -1,10 +1,10 @@
-"""The default search: the tournaments' winners are recombined into one centre, around which the next members lie.
+"""The default search: tournament winners are recombined into one centre, around which the next generation is sampled.
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
 adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Noise is
 left-right symmetric (`symmetry`). Children come in mirrored pairs (Brockhoff et al. 2010), the centre plus and minus
-the same noise, that meet the same episodes. The centre and the champion (before there is one, the average of centres)
-are the elites: they are driven unmodified, and may win like all others.
+the same noise, which drive the same episodes. The elites are the centre and the champion (before the first champion,
+the average of centres). They are evaluated unmodified, and can win like other members.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from evolution.search.base import (
 )
 from evolution.search.breeding import Kind, Mutation, moments
 
-_CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the parents that are broadcast
-_ELITES = 2  # the centre, and the champion: before there is one, the average
-_KEPT = 0.9  # of the average of centres, in each generation
-# The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so that without a
-# bound weights and step size grow for ever.
+_CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the broadcast parents
+_ELITES = 2  # the centre, and the champion or, before the first one, the average
+_KEPT = 0.9  # decay of the average of centres in each generation
+# The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
+# step size would grow without bound.
 _MAX_GROWTH = 2.0
 
 
@@ -41,18 +41,18 @@ class Recombination(Search):
 
     Attributes:
         centre: float64 [genes], or [0] before the first generation.
-        path: float64 [free genes], the evolution path: N(0, 1) in each under random selection, as at the beginning.
-        variances: float64 [genes], diagonal of the covariance, 1 at the beginning.
-        sigma: step size over all genes.
-        average: float64 [genes], of the latest centres, each of which weighs 0.9 times the next one.
-        champion: float32 [genes], of the run; None before there is one.
+        path: float64 [free genes], the evolution path; N(0, 1) in each initially and under random selection.
+        variances: float64 [genes], diagonal of the covariance, initially 1.
+        sigma: the overall step size.
+        average: float64 [genes], exponential moving average of the centres.
+        champion: float32 [genes], the run's champion, or None.
     """
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         super().__init__(spec, config, seed)
         self.centre = np.zeros(0)
         self._free = symmetry(spec).free
-        # Not 0: the step size would shrink until the path has grown to its expected length.
+        # From 0, the step size would shrink until the path has grown to its expected length.
         self.path = self._rng(1).standard_normal(len(self._free))
         self.variances = np.ones(spec.size)
         self.average = np.zeros(0)
@@ -93,18 +93,18 @@ class Recombination(Search):
         return Generation(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
 
     def _tell(self, asked: Generation, scores: np.ndarray) -> None:
-        if not len(self.centre):  # begin with the best score, although groups met different episodes
+        if not len(self.centre):  # start from the best score, although groups had different episodes
             self.start_from(self.genomes(np.array([scores.argmax()]))[0])
             return
         weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
         effective = 1.0 / float((weights**2).sum())  # mu_eff
-        pairs = (len(weights) - _ELITES) // 2  # an odd last member has no mirror image and is left out
+        pairs = (len(weights) - _ELITES) // 2  # an odd last member, without a mirror image, is left out
         plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
         genes, shift = len(self._free), plus - minus
         first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, self.spec)
         self.centre = self.centre + self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
-        # Under random selection, first / norm is N(0, 1) in each gene, whatever the weights of a pair are.
+        # Under random selection, first / norm is N(0, 1) in each gene for any weights of the pairs.
         norm = math.sqrt(float((shift**2).sum()))
         if norm > 0.0:
             rate = (effective + 2.0) / (genes + effective + 5.0)
@@ -117,7 +117,7 @@ class Recombination(Search):
         if share > 0.0:
             rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
             rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
-            # A gene without noise (factor 0 in `symmetry`) keeps its variance, which would shrink to 0.
+            # The variance of a gene without noise (factor 0 in `symmetry`) is kept, or it would shrink to 0.
             self.variances = self.variances * np.where(second > 0.0, 1.0 - rate + rate * second / share, 1.0)
 
     def state(self) -> tuple[Arrays, dict[str, float]]:

@@ -1,6 +1,6 @@
 """The classic genetic algorithm: tournaments, elitism, uniform crossover of two parents, Gaussian mutation.
 
-And random search, the baseline that every search must beat: elites alone go on, all others are new.
+Also random search, the baseline that every search must beat: it keeps only the elites, all other members are random.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from evolution.networks.policy import PolicySpec
 from evolution.search.base import Arrays, Generation, Search, SearchConfig, checked, ranks, recipes, split, tournaments
 from evolution.search.breeding import Kind, Mutation
 
-PARENTS = 64  # size of the mating pool, which bounds what is broadcast
+PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
 
 
 class TwoParents(Search):
-    """Elites go on unmodified; two parents of each other member are drawn from the winners of tournaments."""
+    """Elites are kept unmodified. Both parents of each other member are drawn from the winners of tournaments."""
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int, random: bool = False):
         super().__init__(spec, config, seed)
         self.random = random
-        self.parents = np.zeros((0, spec.size), dtype=np.float32)  # the best first; elites, then the mating pool
+        self.parents = np.zeros((0, spec.size), dtype=np.float32)  # elites, the best first, then the mating pool
         self.elites = 0  # rows of `parents` that are elites
 
     def start_from(self, genome: np.ndarray) -> None:
