@@ -1,16 +1,16 @@
-"""Experience: what episodes bring to a learner, as arrays, and the fixed point in which observations are kept.
+"""Experience of the DQN as arrays, and the compact format of observations.
 
-Episodes follow one another. An episode of T steps has T + 1 rows. Row t < T holds the observation before step t, its
-action, the reward of that step, and in `ends` 0, but for row T - 1, where it is the `gridsim.car.ego.End` that the step
-led to. Row T holds the observation after the last step, the action NO_ACTION, reward 0 and 0 in `ends`. COLLISION, IDLE
-and SUCCESS terminate: nothing comes after them. TIME truncates: what would have come is estimated from row T.
+Episodes are concatenated. An episode of T steps has T + 1 rows. Row t < T has the observation before step t, its
+action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.car.ego.End` of the episode. Row T has the
+observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. COLLISION, IDLE and SUCCESS terminate: the
+value after them is 0. TIME truncates: the value after it is estimated from row T.
 
-An observation is what the network sees, small enough to keep a million of them:
+Observations are the network's inputs in a format small enough to keep a million of them:
 
 * rays: int16 [inputs], what `policy.encode` makes, in units of 1/4096 and clipped to [-8, 8);
 * grid: uint8 [1602], one frame, and then the speed input as little-endian int16 in the same units. A cell takes two
   bits, 0, 1 and 2 for unknown, free and occupied: cell k is bits 2 (k mod 4) and the next of byte k // 4. The frames
-  of a stack are those of the rows before; those that would be before the episode's first row are that row's.
+  of a stack are those of the rows before; frames before the episode's first row are copies of that row's frame.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _F = np.float32
 
 NO_ACTION = 255  # of an episode's last row
 UNITS = _F(4096.0)  # of the fixed point, to 1
-OLDEST = 255  # an age that stands for all greater ones
+OLDEST = 255  # largest age; greater ones are clipped to it
 _AREA = CELLS * CELLS
 _FRAME = _AREA // 4  # bytes
 _LEAST, _GREATEST = _F(-32768.0), _F(32767.0)
-# What a network sees of a byte's four cells, and of what would be a fourth code: float32 [256, 4].
+# A network's inputs for the four cells of each byte: float32 [256, 4]. The unused fourth code means occupied.
 _SEEN = np.array([UNKNOWN, FREE, OCCUPIED, OCCUPIED]).astype(np.float32) * _F(1.0 / 255.0)
 _CELLS_OF = freeze(_SEEN[np.arange(256)[:, None] >> np.arange(0, 8, 2) & 3])
 
 
 class Experience(NamedTuple):
-    """Episodes, one after the other, as arrays with a row a step and one more for each episode; see above."""
+    """Concatenated episodes as arrays, with a row for each step and one more for each episode; see above."""
 
     observations: np.ndarray  # int16 [rows, inputs] of rays, uint8 [rows, 1602] of grids
     actions: np.ndarray  # uint8 [rows]
@@ -49,14 +49,14 @@ class Experience(NamedTuple):
 
 
 def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
-    """What a row of `Experience.observations` is for such a policy."""
+    """Type and length of a row of `Experience.observations` for a policy."""
     if isinstance(spec, CnnSpec):
         return np.dtype(np.uint8), _FRAME + 2
     return np.dtype(np.int16), spec.inputs
 
 
 def empty(spec: PolicySpec, rows: int) -> Experience:
-    """Room for so many rows; what is in it is not defined."""
+    """Uninitialised experience of so many rows."""
     dtype, width = observation_dtype_and_width(spec)
     return Experience(
         np.empty((rows, width), dtype=dtype),
@@ -67,14 +67,14 @@ def empty(spec: PolicySpec, rows: int) -> Experience:
 
 
 def join(spec: PolicySpec, parts: Sequence[Experience]) -> Experience:
-    """The episodes of all parts, in that order."""
+    """Concatenate parts in their order."""
     if not parts:
         return empty(spec, 0)
     return Experience(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def ages(experience: Experience) -> np.ndarray:
-    """How many rows of its episode come before each row, at most OLDEST: uint8 [rows]."""
+    """Number of rows before each row in its episode, at most OLDEST: uint8 [rows]."""
     row = np.arange(len(experience.actions))
     begins = np.zeros(len(row), dtype=np.intp)
     begins[1:] = np.where(experience.actions[:-1] == NO_ACTION, row[1:], 0)
@@ -83,20 +83,20 @@ def ages(experience: Experience) -> np.ndarray:
 
 @leaf
 def to_fixed_point(value):
-    """A network's input in fixed point: the nearest int16, clipped."""
+    """Convert a network's input to fixed point: the nearest int16, clipped."""
     return np.int16(min(max(math.floor(value * UNITS + _F(0.5)), _LEAST), _GREATEST))
 
 
 @leaf
 def store_rays(inputs, row):
-    """Keep the inputs float32 [inputs or more] of a network on rays as row int16 [inputs]."""
+    """Store the inputs float32 [inputs or more] of a network on rays as row int16 [inputs]."""
     for i in range(row.shape[0]):
         row[i] = to_fixed_point(inputs[i])
 
 
 @leaf
 def store_grid(grid, speed, row):
-    """Keep a grid uint8 [6400] and a speed (m/s) as row uint8 [1602]."""
+    """Store a grid uint8 [6400] and a speed (m/s) as row uint8 [1602]."""
     for i in range(_FRAME):
         byte = 0
         for j in range(4):  # the codes 0, 127 and 255 become 0, 1 and 2
@@ -137,15 +137,15 @@ def unpack(
     ages: np.ndarray | None = None,
     out: np.ndarray | None = None,
 ) -> np.ndarray:
-    """What a network sees at some rows: float32 [n, spec.inputs]; of grids the frames, the newest last, then the speed.
+    """A network's inputs at some rows: float32 [n, spec.inputs]; for grids the frames, newest last, then the speed.
 
     Args:
-        observations: as in `Experience`, or a ring of them, in which row 0 follows the last one.
+        observations: as in `Experience`, or a ring buffer of them, in which row 0 follows the last one.
         rows: int64 [n].
-        ages: [n], as `ages` gives them, of these rows; needed for grids. Where a ring has lost the beginning of an
-            episode, the age is the number of its rows that are left before this one.
-        out: float32 [n, spec.inputs], where it is to be written; None is a new array.
-    Raises: ValueError with one line where shapes or types do not fit. Rows are not checked.
+        ages: [n], `ages` of these rows; needed for grids. If a ring has lost the beginning of an episode, the age is
+            the number of its remaining rows before this one.
+        out: float32 [n, spec.inputs] to write to; None creates a new array.
+    Raises: ValueError with one line if shapes or types do not fit. Rows are not checked.
     """
     dtype, width = observation_dtype_and_width(spec)
     if observations.dtype != dtype or observations.ndim != 2 or observations.shape[1] != width:

@@ -1,7 +1,7 @@
-"""The DQN learner: a Q network, its target, and the updates that make them. The only file with gradients.
+"""The DQN learner: a Q network, its target network, and their updates. The only file with gradients.
 
-The Q network is a policy: it has the shape of a `PolicySpec`, its parameters are a genome, and the 8 outputs are the
-actions' values. So what is learned here drives wherever a policy drives.
+The Q network is a policy: it has the shape of a `PolicySpec`, its parameters are a genome, and its 8 outputs are the
+actions' values. So it can drive wherever a policy can.
 
 An update (Mnih et al. 2015, "Human-level control through deep reinforcement learning") takes a batch from the replay
 and moves Q(s_t, a_t) towards
@@ -12,9 +12,9 @@ with the n-step return R_t (`replay`), the action chosen by the network and valu
 Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning"), or both by the target where `double` is off.
 The loss is Huber's, the optimiser Adam (Kingma and Ba 2015).
 
-What a training gives depends on the seed, the parameters and the replay's contents alone: the random numbers of update
-u come from (seed, u), so that it may be cut into blocks of any size. On the CPU that holds to the bit, in every process
-of one machine type.
+The result depends only on the seed, the parameters and the replay's contents. The random numbers of update u depend on
+(seed, u), so training may be split into blocks of any size. On the CPU, results are bit-identical in all processes on
+one type of machine.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 
 @dataclass(frozen=True)
 class DqnConfig:
-    """The learner's parameters, beside the network's shape and those of the `Replay`, which makes the returns."""
+    """The learner's parameters, beside those of the network and of the `Replay`, which computes the returns."""
 
     batch: int = 256  # transitions of an update
-    learning_rate: float = 1e-3  # Adam's, when training begins
-    final_learning_rate: float = 0.1  # the share of it that is left at the end
-    learning_rate_updates: int = 50_000  # after which that is reached, linearly
+    learning_rate: float = 1e-3  # Adam's, at the beginning
+    final_learning_rate: float = 0.1  # its final value, relative to that
+    learning_rate_updates: int = 50_000  # over which it falls linearly
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
-    target_period: int = 500  # updates after which the target becomes the network
-    average: int = 2000  # updates that the average of the weights goes back (Polyak and Juditsky 1992), exponentially
+    target_period: int = 500  # updates between copies of the network to the target
+    average: int = 2000  # time constant, in updates, of the exponential average of weights (Polyak and Juditsky 1992)
     double: bool = True  # Double DQN
-    # Size of an error from which the loss grows linearly: as large as returns are. With 1 (Mnih et al. 2015) a rare
-    # crash weighs no more than any small error, values become medians instead of means, and drivers reckless.
+    # Error above which the loss is linear: as large as returns. With 1 (Mnih et al. 2015), the large error of a rare
+    # crash hardly counts: values become medians instead of means, and drivers reckless.
     huber_delta: float = 30.0
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
-    priorities: PriorityConfig | None = None  # None draws all transitions alike
+    priorities: PriorityConfig | None = None  # None draws transitions uniformly
 
     def check(self) -> None:
-        """Raises ValueError with one line for parameters that make no sense. `Replay` checks its own."""
+        """Raises ValueError with one line for invalid parameters. `Replay` checks its own."""
         for name in ("batch", "learning_rate_updates", "target_period", "average"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name.replace('_', ' ')} must be 1 or more, not {getattr(self, name)}")
@@ -70,14 +70,14 @@ class DqnConfig:
         return self.learning_rate * (1.0 + (self.final_learning_rate - 1.0) * share)
 
     def beta_at(self, update: int) -> float:
-        """The exponent of importance weights in an update, counted from 0; 1 where nothing is prioritised."""
+        """The exponent of importance weights in an update, counted from 0; 1 without priorities."""
         if self.priorities is None:
             return 1.0
         return self.priorities.beta + (1.0 - self.priorities.beta) * min(update / self.priorities.beta_updates, 1.0)
 
 
 class Step(NamedTuple):
-    """What an update found."""
+    """Statistics of an update."""
 
     loss: float
     q: float  # mean of the chosen actions' values
@@ -86,7 +86,7 @@ class Step(NamedTuple):
 
 
 class Training(NamedTuple):
-    """What some updates found, in the mean."""
+    """Means of the statistics of several updates."""
 
     loss: float
     q: float  # of the chosen actions' values
@@ -94,14 +94,14 @@ class Training(NamedTuple):
 
 
 def diverged(update: int) -> FloatingPointError:
-    """What is raised once the network has no finite numbers any more."""
+    """The error for a network whose loss is no longer finite."""
     return FloatingPointError(f"the Q network diverged at update {update}: try a lower learning rate")
 
 
 def device_of(name: str) -> torch.device:
     """The device that `auto`, `cpu`, `cuda` or `cuda:N` names; `auto` is cuda where there is one.
 
-    Raises: ValueError with one line for another name, or a device that is not there.
+    Raises: ValueError with one line for another name, or a missing device.
     """
     found = torch.cuda.device_count() if name != "cpu" and torch.cuda.is_available() else 0
     if name in ("auto", "cuda") and found:
@@ -154,7 +154,7 @@ def tanh(x: torch.Tensor) -> torch.Tensor:
 class QNetwork(torch.nn.Module):
     """A policy's network in PyTorch. Its one parameter is the genome; the layers are views of it.
 
-    So the optimiser, a copy to the target and the way out to a policy are one operation each.
+    So the optimiser's step, a copy to the target and a conversion to a policy are one operation each.
     """
 
     def __init__(self, spec: PolicySpec, device: torch.device):
@@ -169,7 +169,7 @@ class QNetwork(torch.nn.Module):
             at += (n + 1) * m
 
     def leaves(self) -> list[torch.Tensor]:
-        """The layers' tensors in the genome's order, which from now on require gradients."""
+        """The layers' tensors in the genome's order; sets them to require gradients."""
         return [tensor.requires_grad_() for layer in self.layers for tensor in layer]
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
@@ -196,7 +196,7 @@ class QNetwork(torch.nn.Module):
 
 
 def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
-    """A genome float32 [genes] to begin with: uniform within 1 / sqrt(inputs of the unit), as Mnih et al. (2015)."""
+    """An initial genome float32 [genes]: uniform within 1 / sqrt(inputs of the unit), as in Mnih et al. (2015)."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, _WEIGHTS]))
     bounds = np.concatenate([np.full((n + 1) * m, 1.0 / math.sqrt(n)) for n, m in spec.shapes()])
     return (rng.uniform(-1.0, 1.0, spec.size) * bounds).astype(np.float32)
@@ -207,14 +207,14 @@ class DqnLearner:
 
     Args:
         spec: the network's shape.
-        seed: of the first weights and of what is drawn from the replay.
+        seed: of the initial weights and of the samples from the replay.
         device: as for `device_of`.
-    Raises: ValueError with one line for parameters that make no sense, or a device that is not there.
+    Raises: ValueError with one line for invalid parameters or a missing device.
     """
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):
         config.check()
-        # For the whole process: sums over several threads depend on their number, and the other cores are the workers'.
+        # For the whole process: results depend on the number of threads, and the workers use the other cores.
         torch.set_num_threads(1)
         self.spec, self.config, self.seed = spec, config, seed
         self.device = device_of(device)
@@ -236,16 +236,16 @@ class DqnLearner:
 
     @property
     def average(self) -> np.ndarray:
-        """The average of the network over its last updates, as a genome: float32 [genes], a copy.
+        """The average of the network over its latest updates, as a genome: float32 [genes], a copy.
 
-        It drives better than any of those, which swing from update to update.
+        It drives better than the network itself, which fluctuates from update to update.
         """
         return self._average.cpu().numpy().copy()
 
     def load_weights(self, genome: np.ndarray) -> None:
-        """Begin training anew, with a genome [genes].
+        """Restart training from a genome [genes].
 
-        Raises: ValueError with one line if its size is not the network's, or a gene is not finite.
+        Raises: ValueError with one line if its size is wrong or a gene is not finite.
         """
         if genome.shape != (self.spec.size,) or not np.isfinite(genome).all():
             raise ValueError(f"a genome of {self.spec} has {self.spec.size} finite genes, not {list(genome.shape)}")
@@ -262,8 +262,8 @@ class DqnLearner:
         variance: np.ndarray,
         updates: int,
     ) -> None:
-        # Copies into memory that PyTorch made: views of NumPy's would not be aligned alike in every process, and what
-        # a matrix product rounds to depends on that.
+        # Copied into memory allocated by PyTorch: the alignment of NumPy's memory differs between processes, and the
+        # rounding of matrix products depends on it.
         self.online.genome.data.copy_(torch.from_numpy(weights))
         self.target.genome.data.copy_(torch.from_numpy(target))
         self._average.copy_(torch.from_numpy(average))
@@ -273,11 +273,11 @@ class DqnLearner:
         self.updates = updates
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        """A copy on the device; in aligned memory, see `_become`."""
+        """A copy on the device, in aligned memory (see `_become`)."""
         return torch.from_numpy(array).to(self.device, copy=True)
 
     def loss(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """The loss [] of a batch, which has gradients; the chosen actions' values [n] and their errors Q - y [n]."""
+        """The loss [] of a batch, with gradients; the taken actions' values [n] and their errors Q - y [n]."""
         observations, actions = self._tensor(batch.observations), self._tensor(batch.actions)[:, None]
         with torch.no_grad():
             following = self._tensor(batch.next_observations)
@@ -290,9 +290,9 @@ class DqnLearner:
         return torch.dot(self._tensor(batch.weights), huber) / len(q), q.detach(), q.detach() - y
 
     def update(self, batch: Batch) -> Step:
-        """Learn from a batch, once.
+        """Make one update from a batch.
 
-        Raises: FloatingPointError with one line once the network has diverged.
+        Raises: FloatingPointError with one line if the network has diverged.
         """
         loss, q, errors = self.loss(batch)
         step = Step(loss.item(), q.mean().item(), errors.abs().mean().item(), errors.cpu().numpy())
@@ -310,7 +310,7 @@ class DqnLearner:
         return step
 
     def _adam_step(self, learning_rate: float) -> None:
-        """PyTorch's Adam as a function: its class takes longer to come to it than the step itself does."""
+        """PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step."""
         adam(
             [self.online.genome],
             [self._gradient],
@@ -329,9 +329,9 @@ class DqnLearner:
         )
 
     def train(self, replay: Replay, updates: int) -> Training:
-        """Make so many updates from a replay. Two calls with half of them do the same.
+        """Make `updates` updates from a replay. Splitting them over several calls gives the same result.
 
-        Raises: ValueError while the replay has nothing to draw; FloatingPointError as `update`.
+        Raises: ValueError if the replay has no transitions; FloatingPointError as `update`.
         """
         sums = [0.0, 0.0, 0.0]
         for _ in range(updates):
@@ -349,7 +349,7 @@ class DqnLearner:
             return self.online(self._tensor(observations)).cpu().numpy()
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All that `restore` needs, as arrays of its own and plain numbers."""
+        """The learner's state as copied arrays and plain numbers."""
         tensors = {
             "weights": self.online.genome,
             "target": self.target.genome,
@@ -361,9 +361,9 @@ class DqnLearner:
         return arrays, {"updates": self.updates}
 
     def restore(self, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-        """Become what `state` described; names that are not the learner's are passed over.
+        """Restore a `state`; other names in it are ignored.
 
-        Raises: ValueError with one line for what no learner of this network can have written; nothing is changed.
+        Raises: ValueError with one line if the state is not one of such a learner; then nothing is changed.
         """
         updates = meta.get("updates")
         if type(updates) is not int or not 0 <= updates < 1 << 62:

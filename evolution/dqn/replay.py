@@ -1,15 +1,15 @@
-"""Replay: a ring of arrays that remembers the last rows of experience, and draws transitions from it.
+"""The replay buffer: a ring of the latest rows of experience, from which transitions are drawn.
 
-A row of `Experience` is a row of the ring: each observation is kept once, whatever n-step transitions begin or end at
-it. When rows are added, each with an action gets its n-step return (Sutton 1988; Hessel et al. 2018)
+A row of `Experience` is a row of the ring, so each observation is stored once, although several n-step transitions use
+it. When rows are added, each row with an action gets its n-step return (Sutton 1988; Hessel et al. 2018)
 
     R_t = sum over k < m of discount^k r_{t+k},   m = min(n, steps to the episode's end),
 
-the row t + m from whose observation the rest is estimated, and the factor of that estimate: discount^m, or 0 where one
-of the m steps ended in COLLISION, IDLE or SUCCESS. TIME truncates: the rest is estimated from the episode's last row.
+the row t + m whose observation gives the value of the rest, and the factor of that value: discount^m, or 0 if one of
+the m steps ended in COLLISION, IDLE or SUCCESS. After TIME, the value is estimated from the episode's last row.
 
-Old rows are overwritten in the order in which they came. What a transition needs lies at its row or after it, but for
-the earlier frames of a stack of grids: rows that lost some are drawn no more.
+The oldest rows are overwritten first. A transition needs only its row and later ones, except for the earlier frames of
+a stack of grids: rows that have lost some of these are no longer drawn.
 
 Prioritised replay (Schaul et al. 2016) is the proportional variant: a row is drawn with probability p^alpha / sum.
 """
@@ -31,8 +31,8 @@ from gridsim.jit import njit
 from gridsim.maps.roads import freeze, power_of_two
 
 MAX_CAPACITY = 1 << 30
-MAX_N_STEP = 255  # the row ahead is kept in a byte
-MAX_PRIORITY = 1e30  # what float32 holds
+MAX_N_STEP = 255  # m is stored in a byte
+MAX_PRIORITY = 1e30  # within float32's range
 _TIME = int(End.TIME)
 _U = np.uint64
 
@@ -41,13 +41,13 @@ _U = np.uint64
 class PriorityConfig:
     """Prioritised replay's parameters, by Schaul et al. (2016), "Prioritized Experience Replay", section 3."""
 
-    alpha: float = 0.6  # how much priorities count: 0 is uniform
-    beta: float = 0.4  # how much of the bias is taken back by importance weights when training begins
-    beta_updates: int = 50_000  # after which beta has risen to 1, linearly
-    epsilon: float = 1e-3  # added to an error's size, so that every row is drawn at times
+    alpha: float = 0.6  # exponent of priorities; 0 is uniform
+    beta: float = 0.4  # exponent of importance weights at the beginning; 1 corrects the bias entirely
+    beta_updates: int = 50_000  # over which beta rises linearly to 1
+    epsilon: float = 1e-3  # added to an error's size, so that no row has probability 0
 
     def check(self) -> None:
-        """Raises ValueError with one line for parameters that make no sense."""
+        """Raises ValueError with one line for invalid parameters."""
         if not 0 <= self.alpha <= 1 or not 0 <= self.beta <= 1:
             raise ValueError(f"alpha and beta of prioritised replay lie in [0, 1], not {self.alpha} and {self.beta}")
         if self.beta_updates < 1:
@@ -59,11 +59,11 @@ class PriorityConfig:
 class Batch(NamedTuple):
     """Transitions drawn from a `Replay`."""
 
-    observations: np.ndarray  # float32 [n, inputs], what the network sees at t
+    observations: np.ndarray  # float32 [n, inputs], the network's inputs at t
     actions: np.ndarray  # int64 [n]
-    returns: np.ndarray  # float32 [n], of the m steps from t on
+    returns: np.ndarray  # float32 [n], n-step returns from t
     next_observations: np.ndarray  # float32 [n, inputs], at t + m
-    bootstraps: np.ndarray  # float32 [n], the factor of what is estimated at t + m
+    bootstraps: np.ndarray  # float32 [n], the factor of the value at t + m
     rows: np.ndarray  # int64 [n], of the ring
     weights: np.ndarray  # float32 [n], importance weights in (0, 1]
 
@@ -91,7 +91,7 @@ def _uniform(bits):
 
 @njit(nogil=True)
 def _draw(ahead, size, key, rows):
-    """Fill rows [n] with rows below `size` that have something ahead, each as likely as the other."""
+    """Fill rows [n] uniformly with rows below `size` that can be drawn (ahead above 0)."""
     key, place = mix(key), _U(0)
     for i in range(rows.shape[0]):
         row = 0
@@ -105,7 +105,7 @@ def _draw(ahead, size, key, rows):
 
 @njit(nogil=True)
 def _draw_by_priority(tree, key, rows):
-    """Fill rows [n] in proportion to the leaves of a tree of sums, one from each n-th of the sum.
+    """Fill rows [n] in proportion to the leaves of a sum tree, one from each of n equal parts of the sum.
 
     tree float64 [2 * leaves]: node k has the children 2 k and 2 k + 1, the root is 1, the leaves are the upper half.
     """
@@ -116,7 +116,7 @@ def _draw_by_priority(tree, key, rows):
         node = 1
         while node < leaves:
             node *= 2
-            # Rounding may leave more than the right child holds; an empty one is never entered.
+            # Rounding may leave more than the right child's sum; a child with sum 0 is never entered.
             if left_over >= tree[node] and tree[node + 1] > 0.0:
                 left_over -= tree[node]
                 node += 1
@@ -136,7 +136,7 @@ def _raise_sums(tree, first, last):
 
 @njit(nogil=True)
 def _set_leaves(tree, rows, values):
-    """Set some leaves and recompute the sums over them; of a row that is there twice the last value counts."""
+    """Set some leaves and recompute the sums over them; for repeated rows the last value counts."""
     leaves = tree.shape[0] // 2
     for i in range(rows.shape[0]):
         tree[leaves + rows[i]] = values[i]
@@ -151,12 +151,12 @@ class Replay:
     """The last `capacity` rows of experience.
 
     Args:
-        spec: the network that will see the observations.
+        spec: the network that uses the observations.
         capacity: rows; an episode of T steps has T + 1 of them.
-        n_step: steps whose rewards are counted before the rest is estimated.
+        n_step: steps of rewards in a return.
         discount: of a control step.
-        prioritised: parameters of prioritised replay; None draws all rows alike.
-    Raises: ValueError with one line for arguments that make no sense.
+        prioritised: parameters of prioritised replay; None draws rows uniformly.
+    Raises: ValueError with one line for invalid arguments.
     """
 
     def __init__(
@@ -177,30 +177,30 @@ class Replay:
             prioritised.check()
         self.spec, self.capacity, self.n_step, self.discount = spec, capacity, n_step, discount
         self.prioritised = prioritised
-        self.added = 0  # rows, ever: the next one's place is added % capacity
+        self.added = 0  # rows added in total: the next one's place is added % capacity
         self.transitions = 0  # rows that can be drawn
-        self.max_priority = 1.0  # before alpha: what new rows get (Schaul et al. 2016, algorithm 1)
+        self.max_priority = 1.0  # before alpha; the priority of new rows (Schaul et al. 2016, algorithm 1)
         self._frames = spec.frames if isinstance(spec, CnnSpec) else 1
         self._factors = freeze(np.float64(discount) ** np.arange(n_step + 1))
         dtype, width = observation_dtype_and_width(spec)
-        # Zeros cost no memory before they are written, so that a large ring is paid for as it fills.
+        # Zeros take no memory before they are written, so a large ring grows as it fills.
         self._observations = np.zeros((capacity, width), dtype=dtype)
         self._actions = np.zeros(capacity, dtype=np.uint8)
         self._returns = np.zeros(capacity, dtype=np.float32)
-        self._ahead = np.zeros(capacity, dtype=np.uint8)  # m of each row; 0 where it is not to be drawn
+        self._ahead = np.zeros(capacity, dtype=np.uint8)  # m of each row; 0 if it cannot be drawn
         self._bootstraps = np.zeros(capacity, dtype=np.float32)
-        self._ages = np.zeros(capacity, dtype=np.uint8)  # rows of the episode before, at most frames - 1
+        self._ages = np.zeros(capacity, dtype=np.uint8)  # earlier rows of the episode, at most frames - 1
         self._tree = np.zeros(2 * power_of_two(capacity) if prioritised else 0, dtype=np.float64)
 
     def __len__(self) -> int:
-        """Rows that it holds."""
+        """Number of rows in the ring."""
         return min(self.added, self.capacity)
 
     def add(self, experience: Experience) -> None:
-        """Append whole episodes, over the oldest rows where there is no more room.
+        """Append whole episodes, overwriting the oldest rows of a full ring.
 
-        Of more rows than there is room for, the last ones are kept.
-        Raises: ValueError with one line for what is not experience of this replay's policy.
+        If there are more rows than the capacity, the last ones are kept.
+        Raises: ValueError with one line if the experience does not fit this replay's policy.
         """
         self._check(experience)
         rows = len(experience.actions)
@@ -208,7 +208,7 @@ class Replay:
             return
         returns, bootstraps = np.empty(rows, dtype=np.float32), np.empty(rows, dtype=np.float32)
         ahead = np.empty(rows, dtype=np.uint8)
-        # Views: what is read from bytes cannot be written, and kernels are compiled for one kind.
+        # Read-only views: arrays read from bytes are read-only, and kernels should be compiled for one kind only.
         columns = (freeze(experience.actions[:]), freeze(experience.rewards[:]), freeze(experience.ends[:]))
         _n_step(*columns, self._factors, returns, ahead, bootstraps)
         before = np.minimum(ages(experience), self._frames - 1).astype(np.uint8)
@@ -230,14 +230,14 @@ class Replay:
             leaves = self._tree[len(self._tree) // 2 :][: self.capacity]
             leaf = np.float32(self.max_priority**self.prioritised.alpha)
             _put(leaves, first, np.where(ahead[rows - kept :] > 0, leaf, np.float32(0.0)))
-            # A ring's two ends are set apart: between them the sums stay as they are.
+            # Rows that wrap round the ring's end are updated in two parts, because the sums between do not change.
             _raise_sums(self._tree, first, min(first + kept, self.capacity) - 1)
             if first + kept > self.capacity:
                 _raise_sums(self._tree, 0, first + kept - self.capacity - 1)
             _set_leaves(self._tree, lost, np.zeros(len(lost), dtype=np.float32))
 
     def _exclude_incomplete_stacks(self) -> np.ndarray:
-        """Take from what can be drawn the oldest rows whose earlier frames are gone; their places int64."""
+        """Exclude the oldest rows whose earlier frames are overwritten. Returns: their places, int64."""
         oldest = self.added - len(self)
         places = (oldest + np.arange(min(self._frames - 1, len(self)))) % self.capacity
         torn = places[self._ages[places] > np.arange(len(places))]
@@ -248,11 +248,11 @@ class Replay:
         """Draw transitions, with replacement.
 
         Args:
-            key: in [0, 2^64): what is drawn depends on it and on the replay's contents alone.
-            batch: how many.
-            beta: exponent of prioritised replay's importance weights, which are divided by the batch's greatest, so
+            key: in [0, 2^64); the sample depends only on it and on the replay's contents.
+            batch: number of transitions.
+            beta: exponent of prioritised replay's importance weights, which are divided by the batch's largest, so
                 that they only scale updates down.
-        Raises: ValueError while there is none to draw.
+        Raises: ValueError if there are no transitions.
         """
         if not self.transitions:
             raise ValueError("the replay holds no transition yet; add experience first")
@@ -276,9 +276,9 @@ class Replay:
         )
 
     def update_priorities(self, rows: np.ndarray, errors: np.ndarray) -> None:
-        """Take the temporal-difference errors [n] of the rows int64 [n] that `sample` drew, as sizes up to 1e30.
+        """Set the priorities of sampled rows int64 [n] from their temporal-difference errors [n], clipped to 1e30.
 
-        Raises: ValueError where they are no numbers, or rows cannot be drawn; RuntimeError if nothing is prioritised.
+        Raises: ValueError if errors are not finite or rows cannot be drawn; RuntimeError without prioritised replay.
         """
         if self.prioritised is None:
             raise RuntimeError("this replay draws all rows alike; it has no priorities")
@@ -295,21 +295,21 @@ class Replay:
         _set_leaves(self._tree, rows, (sizes**self.prioritised.alpha).astype(np.float32))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All that `restore` needs, as arrays and plain numbers.
+        """The replay's state as arrays and plain numbers.
 
         Most arrays are views of the ring: save them before more is added.
         """
         size = len(self)
         arrays = {name: ring[:size] for name, ring in self._rings().items()}
         if self.prioritised is not None:
-            # The leaves alone, which float32 holds exactly: the sums follow from them.
+            # Only the leaves, which float32 represents exactly: the sums follow from them.
             arrays["priorities"] = self._tree[len(self._tree) // 2 :][:size].astype(np.float32)
         return arrays, {"rows_added": self.added, "max_priority": self.max_priority}
 
     def restore(self, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-        """Become what `state` described; names that are not the replay's are passed over.
+        """Restore a `state`; other names in it are ignored.
 
-        Raises: ValueError with one line for what no replay of these arguments can have written; nothing is changed.
+        Raises: ValueError with one line if the state is not one of such a replay; then nothing is changed.
         """
         added, max_priority = meta.get("rows_added"), meta.get("max_priority")
         if type(added) is not int or not 0 <= added < 1 << 62:
@@ -347,7 +347,7 @@ class Replay:
         }
 
     def _check(self, experience: Experience) -> None:
-        """Raises ValueError with one line for what is not experience as `evolution.dqn.experience` describes it."""
+        """Raises ValueError with one line if experience breaks the format of `evolution.dqn.experience`."""
         dtype, width = observation_dtype_and_width(self.spec)
         observations, actions, rewards, ends = experience
         rows = len(actions)
@@ -371,7 +371,7 @@ class Replay:
             raise ValueError(f"an episode has its end at its last step, and then a row of action {NO_ACTION}")
 
     def _check_saved(self, added: int, saved: dict[str, np.ndarray]) -> None:
-        """Raises ValueError with one line for rings [size] that no replay can have after so many rows were added."""
+        """Raises ValueError with one line if rings [size] are inconsistent after `added` rows."""
         size = len(saved["actions"])
         if not size:
             return
@@ -384,7 +384,7 @@ class Replay:
         twice = (last[1:] & last[:-1]).any() or (last[0] and added == size)
         if ((actions >= self.spec.outputs) & ~last).any() or not last[-1] or twice:
             raise ValueError(f"a saved replay's actions are not whole episodes of {self.spec}")
-        # Rows before each in its episode, as far as they are kept; the oldest may have had more.
+        # Earlier rows of each row's episode that are in the ring; the oldest episode may have had more.
         begins = np.maximum.accumulate(np.where(np.concatenate([[True], last[:-1]]), row, 0))
         more = int(before[0]) if added > size else 0
         if (before != np.minimum(row - begins + np.where(begins == 0, more, 0), self._frames - 1)).any():
@@ -403,14 +403,14 @@ class Replay:
 
 
 def _put(ring: np.ndarray, first: int, rows: np.ndarray) -> None:
-    """Write rows into a ring from `first` on, and on from its beginning."""
+    """Write rows into a ring from `first` on, wrapping round its end."""
     room = len(ring) - first
     ring[first : first + len(rows)] = rows[:room]
     ring[: max(len(rows) - room, 0)] = rows[room:]
 
 
 def _column(arrays: Mapping[str, np.ndarray], name: str, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of a saved replay. Raises: ValueError with one line if it is missing or another."""
+    """An array of a saved replay. Raises: ValueError with one line if it is missing or has a wrong type or shape."""
     array = arrays.get(name)
     if not isinstance(array, np.ndarray) or array.dtype != dtype or array.shape != shape:
         found = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else "missing"

@@ -1,1 +1,1 @@
-"""Which episodes are driven, and driving them."""
+"""Choosing episodes, and driving them."""

@@ -1,7 +1,7 @@
-"""Experience for a learner: episodes of one policy that now and then does something else (epsilon-greedy).
+"""Experience for the DQN: episodes of one policy with some random actions (epsilon-greedy).
 
-The same fused loop as in `rollout`, of the same parts, that keeps what was seen, done and gained. Pure functions: what
-is returned depends on the arguments alone, and an episode on its own row, world, epsilon and key.
+The loop is that of `rollout`, and records observations, actions and rewards. Results depend only on the arguments, and
+those of an episode only on its own row, world, epsilon and key.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _IDLE = 2
 
 @leaf
 def _explore(key, step, epsilon, actions):
-    """A random action, or -1 where the policy is to act: a number a step, of which the upper 24 bits decide that."""
+    """A random action with probability epsilon, else -1 for the policy's action. Uses one random number a step."""
     bits = mix(key + _U(step) * GOLDEN)
     if uniform(bits) < epsilon:
         return int((bits & _U(0xFFFFFFFF)) * _U(actions) >> _U(32))
@@ -51,7 +51,7 @@ def _explore(key, step, epsilon, actions):
 
 @leaf
 def _keep(car, workspace, grid_buffers, row):
-    """Keep what was seen as a row of observations."""
+    """Store the observation in a row."""
     if grid_buffers is None:
         store_rays(workspace.scratch, row)
     else:
@@ -60,7 +60,7 @@ def _keep(car, workspace, grid_buffers, row):
 
 @njit(nogil=True)
 def _collect(simulation, packed, layers, setup, traffic, closing, grid_buffers, epsilon, key, kept, results, column):
-    """One episode; fills the first rows of `kept` and results[column]. Returns: its control steps."""
+    """Drive one episode; fills the first rows of `kept` and results[column]. Returns: its control steps."""
     workspace = make_workspace(simulation, layers, 0, 0)
     world = None if traffic is None else traffic.copy()
     road, constants, car = simulation.road, simulation.constants, workspace.car
@@ -73,7 +73,7 @@ def _collect(simulation, packed, layers, setup, traffic, closing, grid_buffers, 
     _keep(car, workspace, grid_buffers, observations[0])
     while end == 0:
         action = choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
-        if action < 0:  # not a number: what is left is lost, as in `rollout`
+        if action < 0:  # NaN: the episode ends, as in `rollout`
             end = _IDLE
             if steps > 0:
                 ends[steps - 1] = end
@@ -107,21 +107,20 @@ def collect(
     config: SimConfig,
     worlds: np.ndarray | None = None,
 ) -> tuple[Experience, np.ndarray]:
-    """Drive one policy through every episode, at times by a random action, and keep all of it.
+    """Drive one policy through every episode, with some random actions, and record its experience.
 
     Args:
         weights: float32 [spec.size].
         road_maps: the maps that the episodes index.
         episodes: EPISODE [e].
-        epsilons: float32 [e], each episode's share of random actions, which are uniform over all.
-        keys: uint64 [e], of each episode's random numbers.
+        epsilons: float32 [e], each episode's share of random actions, which are uniform over all actions.
+        keys: uint64 [e], seeds of each episode's random numbers.
         worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
 
-    Where the network gives no number the episode ends as in `rollout.evaluate`, IDLE: so does the last row before, if
-    there is one.
+    If an output is NaN, the episode ends as IDLE, as in `rollout.evaluate`; so does the last recorded step, if any.
 
     Returns: (the experience, in the order of the episodes; RESULT [e]).
-    Raises: ValueError with one line where shapes or numbers do not fit.
+    Raises: ValueError with one line if shapes or numbers do not fit.
     """
     if weights.shape != (spec.size,):
         raise ValueError(f"the weights of {spec} are [{spec.size}], not {weights.shape}")

@@ -1,12 +1,12 @@
-"""How the task grows: which episodes a generation meets, and who becomes champion.
+"""The curriculum: the episodes of each generation, and validation, which chooses the champion.
 
-Distance and speed alone are deceptive under limited grip: the best member is flat out into the first bend. So episodes
-begin short and double in length as the leader (the best genome known before a generation) succeeds. Half of them start
-just before a crash of a recent leader, where there is most to learn. A generation's members are in groups that meet
-different episodes, so that selection sees many, though each member drives few. The champion is chosen on validation
-maps that nobody is trained on.
+Distance and speed alone are deceptive under limited grip: at first, the best members drive into the first bend at full
+speed. So episodes begin short, and their length doubles when the leader (the best genome known before a generation)
+succeeds. Half of them start shortly before a crash of a recent leader, where there is most to learn. The groups of a
+generation have different episodes, so that selection uses many although each member drives few. The champion is chosen
+on validation maps, which are not used in training.
 
-State is arrays and numbers only; all randomness comes from (seed, generation).
+The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from gridsim.traffic.world import FIELDS, LANE, check_worlds
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
-TRIED_KEPT = 256  # members that are not validated again
+TRIED_KEPT = 256  # latest candidates remembered, so that they are not validated again
 
 
 class CrashError(ValueError):
-    """A remembered crash, from a checkpoint, that cannot be started from; the message is one line."""
+    """A crash from a checkpoint whose traffic does not fit its map; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -41,39 +41,39 @@ class CurriculumConfig:
     """The curriculum's parameters."""
 
     maps: int = 16  # training maps
-    first_maps: int = 4  # of these, how many the first generation meets ...
-    map_generations: int = 4  # ... and after how many there is one more, so that none needs to be waited for
+    first_maps: int = 4  # of these, how many the first generation uses ...
+    map_generations: int = 4  # ... and generations after which one more is used, so that maps are built in time
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
-    starts: int = 1  # new episodes of a group and generation
+    starts: int = 1  # new episodes for each group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
-    crash_target: float = 120.0  # m, their length
+    crash_target: float = 120.0  # m, target of crash starts
     crash_memory: int = 64  # crashes that are remembered
-    crowd: float = 2.0  # cars on the road in training, over those that are asked for: more meetings a metre
-    rewind: int = 64  # control steps before the crash
-    leader_episodes: int = 16  # that the leader drives in each generation
-    leader_stretch: float = 2.5  # their length, in targets
-    first_target: float = 150.0  # m, length of the first episodes
-    last_target: float = 400.0  # m; what is learned further on is learned as well from another start
-    growth: float = 0.6  # share of its episodes in which the leader must reach the target before it doubles
-    pace: float = 7.0  # m/s that the time limit of a training episode allows for; this and champion_pace: seamless
-    slack: float = 3.0  # s, added to it
-    promising: float = 0.5  # share of its episodes that a leader must finish before it is validated ...
-    latest: int = 4  # ... in so many generations together
-    validation_share: float = 0.25  # of all car-steps, above which validation waits
+    crowd: float = 2.0  # factor on the number of other cars in training, for more encounters on the same way
+    rewind: int = 64  # control steps from a crash start to the crash
+    leader_episodes: int = 16  # episodes of the leader in each generation
+    leader_stretch: float = 2.5  # target of the leader's episodes, relative to the members'
+    first_target: float = 150.0  # m, target of the first episodes
+    last_target: float = 400.0  # m, largest target of training; further starts teach as much as longer episodes
+    growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
+    pace: float = 7.0  # m/s, mean speed that a training episode's time limit requires; for seamless, as champion_pace
+    slack: float = 3.0  # s, added to that time limit
+    promising: float = 0.5  # least success rate of the leader before candidates are validated ...
+    latest: int = 4  # ... as the mean over so many generations
+    validation_share: float = 0.25  # largest share of validation in all car-steps
     first_validation: int = 48  # episodes of validation's first stage
     validation: int = 256  # ... and in all
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
 
 
 def spread_starts(build: Callable[[int], Map], seeds: range, episodes: int, traffic: int = 0) -> Episodes:
-    """Episodes over the maps of `seeds` in turn; the same for every run of a scenario with as much traffic."""
+    """Episodes on the maps of `seeds` in turn; they depend only on the scenario, the traffic and the arguments."""
     rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
     used = np.arange(episodes) % len(seeds)
     return Episodes(list(seeds), *lane_starts([build(seed) for seed in seeds], used, rng, traffic))
 
 
 class Curriculum:
-    """Episodes and champions of one run."""
+    """The curriculum of one run: its target, crashes, training maps and validation."""
 
     def __init__(
         self,
@@ -101,42 +101,42 @@ class Curriculum:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
 
     def maps_in_use(self, generation: int) -> int:
-        """Training maps in use: they come in one by one."""
+        """Number of training maps in use; it grows one by one."""
         return min(self.config.maps, self.config.first_maps + generation // self.config.map_generations)
 
     def limits(self) -> Limits:
-        """Of training episodes."""
+        """Limits of training episodes."""
         return Limits(self.target, self._steps(self.target))
 
     def leader_limits(self) -> Limits:
-        """Of the leader's episodes: longer, so that it meets what members do not."""
+        """Limits of the leader's episodes, which are longer than the members'."""
         target = min(self.config.leader_stretch * self.target, self.goal)
         return Limits(target, self._steps(target))
 
     def _steps(self, target: float) -> int:
-        """Control steps that a training episode of so many m is given."""
+        """Time limit (control steps) of a training episode with this target (m)."""
         return math.ceil((target / self.config.pace + self.config.slack) / self.period)
 
     def goal_limits(self) -> Limits:
-        """Of a full episode, as those of validation and the held-out ones are."""
+        """Limits of a full episode, in validation and held-out evaluation."""
         return Limits(self.goal, self.goal_steps)
 
     def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Training maps [count], by their place among `map_seeds`; different ones if there are as many."""
+        """Training maps [count] as indices into `map_seeds`; without repetition if there are enough."""
         n = self.maps_in_use(generation)
         return rng.choice(n, count, replace=count > n)
 
     def _new_starts(self, maps: np.ndarray, rng: np.random.Generator) -> Episodes:
-        """New episodes on training maps [e]."""
+        """Episodes with new starts on training maps [e]."""
         used, local = np.unique(maps, return_inverse=True)
         seeds = [self.map_seeds[m] for m in used]
         return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
 
     def episodes(self, generation: int) -> Episodes:
-        """What a generation meets, group by group: new episodes, then some that start before crashes.
+        """A generation's episodes, group by group: first new starts, then crash starts.
 
-        Each group has as many of either.
-        Raises: CrashError if the traffic of such a start does not fit its map.
+        All groups have the same number of each.
+        Raises: CrashError if the traffic of a crash start does not fit its map.
         """
         config, rng = self.config, self._rng(generation, 0)
         maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
@@ -155,13 +155,13 @@ class Curriculum:
         return Episodes(used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, worlds))
 
     def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
-        """Each group's share of each kind [e, ...], the groups one after another."""
+        """Distribute each kind [e, ...] over the groups, and concatenate group by group."""
         n = self.config.groups
         parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
         return np.concatenate(np.concatenate(parts, axis=1))
 
     def starts(self, batch: int, count: int) -> Episodes:
-        """So many new episodes on the training maps, for a learner that takes them in batches."""
+        """`count` new episodes on the training maps, for the DQN's batches."""
         return self._drawn(batch, count, 3)
 
     def _drawn(self, generation: int, count: int, purpose: int) -> Episodes:
@@ -169,7 +169,7 @@ class Curriculum:
         return self._new_starts(self._some_maps(generation, count, rng), rng)
 
     def _check(self, maps: np.ndarray, worlds: np.ndarray) -> None:
-        """Refuse traffic [n, cars, fields] that is not on its map [n]; only here are the maps at hand for nothing."""
+        """Check traffic [n, cars, fields] against its maps [n]; done here, where the maps are built already."""
         if worlds.shape[1]:
             for m in np.unique(maps):
                 seed = self.map_seeds[m]
@@ -179,7 +179,7 @@ class Curriculum:
                     raise CrashError(f"a crash in the checkpoint does not fit map {seed}: {error}") from error
 
     def leader_episodes(self, generation: int) -> Episodes:
-        """What the leader drives beside a generation; the states before its crashes are wanted back."""
+        """The leader's episodes beside a generation, with `rewind` set for crash starts."""
         episodes = self._drawn(generation, self.config.leader_episodes, 2).with_limits(self.leader_limits())
         episodes.rows["rewind"] = self.config.rewind
         return episodes
@@ -189,8 +189,8 @@ class Curriculum:
     ) -> None:
         """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
 
-        Args: `leader_episodes`; RESULT [e]; the states some steps before each end, float32 [e, 5], and the traffic of
-        then, float32 [e, cars, world.FIELDS].
+        Args: `leader_episodes`; RESULT [e]; the states `rewind` steps before each end, float32 [e, 5], and the traffic
+        at that time, float32 [e, cars, world.FIELDS].
         """
         crashed = np.isin(results["end"], (End.COLLISION, End.IDLE)) & (results["steps"] > 10)
         if crashed.any():
@@ -205,9 +205,10 @@ class Curriculum:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
     def validation(self) -> Episodes:
-        """What champions are chosen on, the same for every run of the scenario: the traffic that is asked for.
+        """Validation's episodes, the same for all runs of a scenario with the same traffic.
 
-        It is driven beside a generation's episodes, so that as many cars belong to it; the others are not there.
+        They are driven in one task with a generation's episodes, so their worlds are filled up with absent cars to the
+        same size.
         """
         if self._validation is None:
             maps, rows, worlds = spread_starts(self.build, VALIDATION_SEEDS, self.config.validation, self.traffic)
@@ -217,7 +218,7 @@ class Curriculum:
         return self._validation
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:
-        """How good members are, in [0, 1], by results [n, e] of validation: success, worth less below the pace."""
+        """Scores in [0, 1] of members from validation's results [n, e]: success rate, reduced below champion_pace."""
         metres = results["distance"].astype(np.float64).sum(axis=1)
         speed = metres / np.maximum(results["steps"].sum(axis=1) * self.period, 1e-9)
         return success_rate(results) * np.minimum(speed / self.config.champion_pace, 1.0)
@@ -225,17 +226,17 @@ class Curriculum:
 
 @dataclass
 class Trials:
-    """Members that are being validated, beside the evaluation of the generation that comes next.
+    """Candidates for champion that are being validated, while the next generation is evaluated.
 
-    Those of `first` are on validation's first stage; the best of them is then `last`, and is judged by the episodes of
-    the second stage alone, since it was chosen on the first.
+    Candidates in `first` drive validation's first stage. The best of them moves to `last` and drives the second stage.
+    Only that stage decides, since the candidate was chosen on the first.
 
     Attributes:
         first: genomes float32 [k, genes].
-        first_generation: the one that they come from.
+        first_generation: their generation.
         last: genomes float32 [0 or 1, genes].
-        last_generation: the one that it comes from.
-        tried: uint64 [n], digests of whom the first stage has seen lately.
+        last_generation: its generation.
+        tried: uint64 [n], digests of the latest candidates of the first stage.
     """
 
     first: np.ndarray
@@ -248,7 +249,7 @@ class Trials:
         return len(self.first) + len(self.last)
 
     def add_candidates(self, genomes: np.ndarray, generation: int) -> None:
-        """Let those of [k, genes] try who did not lately."""
+        """Start trials of the genomes [k, genes] that were not tried lately."""
         digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
         new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]
         self.first, self.first_generation = genomes[new], generation

@@ -1,7 +1,7 @@
-"""Episodes of whole populations: the fused loop sense -> network -> act -> control_step, until done.
+"""Drives the episodes of whole populations in one fused kernel: sense, network, act, advance until the end.
 
-With `collecting`, which shares the parts of that loop, the only user of the simulator within `evolution`. Pure
-functions: what is returned depends on the arguments alone.
+`collecting` has the same loop with a recorder and shares its parts. These two are the only users of the simulator in
+`evolution`. Results depend only on the arguments.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
 _F = np.float32
 
-#: An episode: index of its map among the task's; x, y (m), heading (rad), speed (m/s), steering (rad) at its start;
-#: its own target (m) and limit (control steps), where these are not 0; control steps before its end whose state is
-#: wanted back, 0 for none.
+#: An episode: index of its map in the task; x, y (m), heading (rad), speed (m/s), steering (rad) at its start; its
+#: target (m) and time limit (control steps), or 0 for those of `Limits`; rewind: return the state so many control steps
+#: before the end, or 0 for none.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
 
-#: What comes back of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
+#: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
 
 
@@ -66,14 +66,14 @@ MAX_STEPS = 65_535
 
 @dataclass(frozen=True)
 class Limits:
-    """Where an episode ends if nothing happens: m of new ground, and control steps."""
+    """Target (m of new ground) and time limit (control steps) of episodes."""
 
     target: float
     steps: int
 
 
 class GridBuffers(NamedTuple):
-    """What a policy on the occupancy grid needs beside its genome."""
+    """Table and buffers for a policy on the occupancy grid."""
 
     table: GridTable
     scratch: convnet.Scratch
@@ -81,7 +81,7 @@ class GridBuffers(NamedTuple):
 
 
 def make_grid_buffers(spec: PolicySpec, config: SimConfig) -> GridBuffers | None:
-    """None for a policy on rays. Raises: ValueError if it sees another number of them."""
+    """GridBuffers, or None for a policy on rays. Raises: ValueError if the sensor has a wrong number of rays."""
     if isinstance(spec, CnnSpec):
         return GridBuffers(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
     if config.sensors.rays != RAYS:
@@ -90,13 +90,13 @@ def make_grid_buffers(spec: PolicySpec, config: SimConfig) -> GridBuffers | None
 
 
 def make_closing(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
-    """Workspace for the motion that a policy sees, if it sees any."""
+    """A buffer for closing speeds, float32 [rays], or None if the policy does not see them."""
     sees = isinstance(spec, MlpSpec) and spec.motion
     return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
 
 
 class Simulation(NamedTuple):
-    """What the episodes on a map have in common, as the kernels read it."""
+    """A map and the simulator's parameters as kernels read them."""
 
     road: Road
     network: Network
@@ -107,14 +107,14 @@ class Simulation(NamedTuple):
 
 
 def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
-    """The simulations of episodes on these maps."""
+    """A Simulation for each map."""
     k, others = constants(config), drivers(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
     return [Simulation(s.road, s.network, k, others, rays, config.sensors.rays) for s in road_maps]
 
 
 class EpisodeSetup(NamedTuple):
-    """Where an episode begins and where it ends if nothing happens."""
+    """Start and limits of an episode as kernels read them."""
 
     start: np.ndarray  # float32 [5]
     target: np.float32  # m
@@ -122,20 +122,20 @@ class EpisodeSetup(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What an episode is driven in; it is used again for the next."""
+    """State and buffers of an episode; reused for the next one."""
 
     car: np.ndarray  # float32 [FIELDS]
     visits: np.ndarray  # float32 [cells]
     beams: np.ndarray  # float32 [3, SIMD_RAYS]
     ranges: np.ndarray  # float32 [rays]
     scratch: np.ndarray  # float32, of the network
-    ring: np.ndarray  # float32 [n, FIELDS], left with the last n states: that of step k in row k % n
+    ring: np.ndarray  # float32 [n, FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
 
 
 @leaf
 def _copy(state, kept):
-    """Copy a car's state [fields]. By numbers: to compile an assignment of slices takes a second longer."""
+    """Copy a car's state [fields], element by element: a slice assignment takes a second longer to compile."""
     for i in range(state.shape[0]):
         kept[i] = state[i]
 
@@ -150,7 +150,7 @@ def _copy_world(world, kept):
 
 @njit
 def make_workspace(simulation, layers, rows, cars):
-    """Workspace that keeps the last `rows` states of a car and of so many others."""
+    """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
     road = simulation.road
     return Workspace(
         np.empty(FIELDS, dtype=np.float32),
@@ -165,7 +165,7 @@ def make_workspace(simulation, layers, rows, cars):
 
 @njit
 def packed_genome(genome, layers, grid_buffers):
-    """A genome as its network reads it."""
+    """A genome as its network's kernel reads it."""
     if grid_buffers is not None:
         return genome
     packed = np.empty(packed_size(layers), dtype=np.float32)
@@ -175,7 +175,7 @@ def packed_genome(genome, layers, grid_buffers):
 
 @leaf
 def observe(simulation, car, world, workspace, closing, grid_buffers):
-    """What a car senses: its ranges, and then the network's inputs in `workspace.scratch`, or the grid."""
+    """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
     look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.beams, workspace.ranges, closing)
     if grid_buffers is None:
         encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
@@ -185,7 +185,7 @@ def observe(simulation, car, world, workspace, closing, grid_buffers):
 
 @leaf
 def choose_action(packed, layers, car, workspace, grid_buffers, begun):
-    """Index of the action for what was seen, which is overwritten; -1 where the network gives no number."""
+    """Index of the action for the observation, which is overwritten; -1 if an output is NaN."""
     if grid_buffers is None:
         return decide(packed, layers, workspace.scratch)
     convnet.push(grid_buffers.grid, begun, grid_buffers.scratch)
@@ -194,7 +194,7 @@ def choose_action(packed, layers, car, workspace, grid_buffers, begun):
 
 @leaf
 def control_step(simulation, setup, car, visits, world, action, steps):
-    """One control period of the car and its world, the episode's steps-th from 0. Returns: End as a number."""
+    """One control step of the car and its world, after `steps` steps of the episode. Returns: End as a number."""
     if world is not None:
         flow(simulation.network, simulation.drivers, world, car)
     end = drive(simulation.road, simulation.constants, car, visits, world, action)
@@ -208,9 +208,9 @@ def control_step(simulation, setup, car, visits, world, action, steps):
 
 @njit
 def _run(simulation, packed, layers, setup, workspace, world, closing, grid_buffers):
-    """One episode of one car, by an `mlp` whose genome is packed, or by a `cnn` where there are GridBuffers.
+    """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers.
 
-    What may be None is an argument of its own: Numba leaves out the branches that it rules out for those alone.
+    What may be None is a separate argument, because Numba removes dead branches only for arguments.
 
     Returns: End as a number.
     """
@@ -222,7 +222,7 @@ def _run(simulation, packed, layers, setup, workspace, world, closing, grid_buff
     while end == 0:
         observe(simulation, car, world, workspace, closing, grid_buffers)
         action = choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
-        if action < 0:  # not a number: the genome loses what is left
+        if action < 0:  # NaN: the episode ends
             end = 2
             break
         if keep > 0:
@@ -247,9 +247,9 @@ def write_result(car, end, row):
 def _rollout(
     simulation, genomes, layers, setup, traffic, closing, grid_buffers, rewind, results, rewound, rewound_worlds
 ):
-    """All genomes [n, genes] on one episode with traffic [cars, fields], or None; fills results [n].
+    """Drive all genomes [n, genes] through one episode with traffic [cars, fields] or None; fills results [n].
 
-    If rewind > 0 also rewound [n, 5] and rewound_worlds [n, cars, fields].
+    If rewind > 0, also fills rewound [n, 5] and rewound_worlds [n, cars, fields].
     """
     workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0])
     car = workspace.car
@@ -271,20 +271,20 @@ def _rollout(
 
 
 def episode_setup(episode: np.void, limits: Limits) -> EpisodeSetup:
-    """Where an EPISODE begins and ends."""
+    """The EpisodeSetup of an EPISODE, with `limits` as defaults."""
     target, steps = episode["target"] or limits.target, episode["steps"] or limits.steps
     return EpisodeSetup(freeze(episode["start"].copy()), _F(target), int(steps))
 
 
 def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
-    """Target of each episode in m: float64 [e]."""
+    """Target (m) of each episode: float64 [e]."""
     return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
 
 
 def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | None) -> np.ndarray:
-    """The traffic float32 [e, cars, world.FIELDS] of episodes, nobody for None.
+    """The traffic float32 [e, cars, world.FIELDS] of episodes; None becomes traffic without cars.
 
-    Raises: ValueError where its shape does not fit or an episode's limit makes no sense.
+    Raises: ValueError if its shape does not fit or the time limit is out of range.
     """
     if not 0 < limits.steps <= MAX_STEPS:
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
@@ -296,7 +296,7 @@ def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | No
 
 
 def kernel_world(worlds: np.ndarray, k: int) -> np.ndarray | None:
-    """The k-th of worlds as kernels take it."""
+    """Worlds[k] for kernels: read-only, or None without cars."""
     return freeze(worlds[k].copy()) if worlds.shape[1] else None
 
 
@@ -317,15 +317,15 @@ def evaluate(
         episodes: EPISODE [e].
         worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
 
-    Returns: (RESULT [n, e]; of the k episodes with a `rewind`, the states so many steps before their ends, or at the
-    starts of shorter ones, as starts float32 [n, k, 5]; and the traffic of then, float32 [n, k, cars, world.FIELDS]).
-    Raises: ValueError where shapes do not fit.
+    Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states so many steps before their ends, or at the
+    start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, world.FIELDS]).
+    Raises: ValueError if shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
     grid_buffers, worlds = make_grid_buffers(spec, config), checked_worlds(episodes, limits, worlds)
     genomes = freeze(genomes.astype(np.float32, copy=False))
-    # By columns: the kernel fills one at a time.
+    # Transposed, because the kernel fills one episode at a time.
     results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
     kept = np.cumsum(episodes["rewind"] > 0) - 1
     k = int(kept[-1]) + 1 if len(kept) else 0
@@ -350,7 +350,7 @@ def evaluate(
 
 
 def no_traffic(episodes: int) -> np.ndarray:
-    """Worlds float32 [episodes, 0, fields] with nobody in them."""
+    """Worlds float32 [episodes, 0, fields] without cars."""
     return np.zeros((episodes, 0, TRAFFIC_FIELDS), dtype=np.float32)
 
 
@@ -363,11 +363,11 @@ def trajectory(
     config: SimConfig,
     world: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drive one genome through one episode and keep its path.
+    """Drive one genome through one episode and record all states.
 
     Args: as `evaluate`'s; start float32 [5], world float32 [cars, world.FIELDS].
     Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
-    `gridsim.car.ego`, and the traffic then, float32 [steps + 1, cars, world.FIELDS]).
+    `gridsim.car.ego`, and the traffic at these times, float32 [steps + 1, cars, world.FIELDS]).
     """
     result, states, worlds = _trajectory(
         simulations_on([road_map], config)[0],

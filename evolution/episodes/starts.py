@@ -1,4 +1,4 @@
-"""Which episodes are driven: starts on lanes and the traffic around them, from a seed."""
+"""Episodes as data: starts on lanes with the traffic around them, from a seed."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from gridsim.traffic.world import FIELDS, spawn
 
 
 class Episodes(NamedTuple):
-    """Episodes that every member of a group meets."""
+    """Episodes with their maps and traffic."""
 
     maps: list[int]  # seeds of the maps
     rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
     worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
 
     def with_limits(self, limits: Limits) -> Episodes:
-        """The same, each with its own target and limit: these where it had none."""
+        """These episodes, with `limits` filled in where they have no target or time limit of their own."""
         rows = self.rows.copy()
         rows["target"] = np.where(rows["target"] > 0, rows["target"], limits.target)
         rows["steps"] = np.where(rows["steps"] > 0, rows["steps"], limits.steps)
         return Episodes(self.maps, rows, self.worlds)
 
     def and_then(self, others: Episodes) -> Episodes:
-        """These and others after them, which have as many cars around."""
+        """Concatenate these and other episodes with the same number of cars."""
         rows = others.rows.copy()
         rows["map"] += len(self.maps)
         return Episodes(
@@ -45,7 +45,7 @@ def lane_starts(
     traffic: int = 0,
     config: TrafficConfig | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes that start uniformly over the lanes of `road_maps[maps[k]]`, at rest, with so many other cars.
+    """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
 
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
     """
