@@ -158,9 +158,6 @@ def conflicts(road_map: Map, sim: SimConfig) -> Conflicts:
     return Conflicts(freeze(enter), freeze(meet), freeze(free))
 
 
-# --- Driving ---------------------------------------------------------------------------------------------------------
-
-
 @leaf
 def _at(route, rail, s, k):
     """The place s m along a rail, searched from point k on: (x m, y m, point before it, share to the next)."""
@@ -361,8 +358,7 @@ def _adapt_to_traffic(network, conflicts, drivers, route, memory, k, s, car, ben
 def _decide(network, conflicts, constants, drivers, tuning, route, memory, car, world, others):
     """The driver's action for one control period.
 
-    Args: memory float64 [MEMORY_FIELDS], changed; `others` [cars + 2, world.FIELDS] is scratch, whose last row must
-    be 0.
+    Args: memory float64 [MEMORY_FIELDS], changed; others [cars + 2, world.FIELDS], scratch whose last row is 0.
     """
     rail = _I(memory[RAIL])
     speed = max(car[SPEED], _ZERO)
