@@ -367,14 +367,14 @@ class DqnLearner:
         """
         updates = meta.get("updates")
         if type(updates) is not int or not 0 <= updates < 1 << 62:
-            raise ValueError(f"a saved learner's updates are not a number of them: {str(updates)[:40]!r}")
+            raise ValueError(f"a saved learner's updates is not a valid count: {str(updates)[:40]!r}")
         found = []
         for name in ("weights", "target", "average", "adam_mean", "adam_variance"):
             array = arrays.get(name)
             if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.shape != (self.spec.size,):
                 raise ValueError(f"a saved learner's {name} is not float32 [{self.spec.size}], as {self.spec} needs")
             if not np.isfinite(array).all() or (name == "adam_variance" and (array < 0).any()):
-                raise ValueError(f"a saved learner's {name} has numbers that training does not give")
+                raise ValueError(f"a saved learner's {name} has invalid values")
             found.append(array)
         weights, target, average, mean, variance = found
         self._become(weights, target, average, mean, variance, updates)

@@ -313,7 +313,7 @@ class Replay:
         """
         added, max_priority = meta.get("rows_added"), meta.get("max_priority")
         if type(added) is not int or not 0 <= added < 1 << 62:
-            raise ValueError(f"a saved replay's rows_added is not a number of rows: {str(added)[:40]!r}")
+            raise ValueError(f"a saved replay's rows_added is not a valid count: {str(added)[:40]!r}")
         if type(max_priority) is not float or not 1 <= max_priority <= MAX_PRIORITY:
             raise ValueError(
                 f"a saved replay's max_priority is not in [1, {MAX_PRIORITY:g}]: {str(max_priority)[:40]!r}"

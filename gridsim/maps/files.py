@@ -133,7 +133,7 @@ def read_map_file(path: Path) -> MapFile:
     except Exception as error:  # PyYAML raises many types of error on invalid input
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
-        raise ValueError(f"{path}: no plain YAML{where}: {getattr(error, 'problem', None) or _shown(error)}") from None
+        raise ValueError(f"{path}: not valid YAML{where}: {getattr(error, 'problem', None) or _shown(error)}") from None
     try:
         return _checked(path, values)
     except ValueError as error:
@@ -159,7 +159,7 @@ def _stamp(path: Path) -> tuple[str, int, int]:
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror or error}") from None
     except ValueError:
-        raise ValueError(f"{_shown(str(path))} is no path of a file") from None
+        raise ValueError(f"{_shown(str(path))} is not a valid path") from None
     if not stat.S_ISREG(status.st_mode):
         raise ValueError(f"{path}: not a file")
     return str(path), status.st_mtime_ns, status.st_size
@@ -168,7 +168,7 @@ def _stamp(path: Path) -> tuple[str, int, int]:
 def _bytes(path: Path, limit: int) -> bytes:
     size = _stamp(path)[2]
     if size > limit:
-        raise ValueError(f"{path}: {size:,} bytes are too many; at most {limit:,}")
+        raise ValueError(f"{path}: it has {size:,} bytes; the limit is {limit:,}")
     try:
         with path.open("rb") as file:
             return file.read(limit)
@@ -223,7 +223,7 @@ def _checked(path: Path, values: Any) -> MapFile:
         resolution = _number(values["resolution"], "resolution (m a pixel)", *RESOLUTION)
     mode = values.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
-        raise ValueError(f"mode must be trinary or scale (which mean the same here), not {_shown(mode)}")
+        raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
     origin = _list(values.get("origin", [0.0, 0.0, 0.0]), "origin", (3,))
     x, y, yaw = (_number(value, "origin's x, y (m) and yaw (rad)", -1e7, 1e7) for value in origin)
     if abs(yaw) > 1e-6:
@@ -237,7 +237,7 @@ def _checked(path: Path, values: Any) -> MapFile:
         for value in _list(values.get("speed", list(FILE_SPEEDS)), "speed", (2,))
     )
     if not low < high:
-        raise ValueError(f"speed must be an interval from low to high, not {low:g} to {high:g}")
+        raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
     return MapFile(
         image=_image_path(path, values["image"]),
         resolution=resolution,
@@ -274,7 +274,7 @@ def _image_path(path: Path, image: Any) -> Path:
     try:
         inside = not Path(image).is_absolute() and (folder / image).resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError):  # a null character, a link to itself
-        raise ValueError(f"image: {_shown(image)} is no path of a file") from None
+        raise ValueError(f"image: {_shown(image)} is not a valid path") from None
     if not inside:
         raise ValueError(f"image: {_shown(image)} must lie in the YAML's own folder or below it")
     return folder / image
@@ -297,7 +297,7 @@ def read_free(file: MapFile) -> np.ndarray:
     except Image.DecompressionBombError:
         raise ValueError(f"{file.image}: more than {MAX_PIXELS:,} pixels; make the picture smaller") from None
     except Exception:
-        raise ValueError(f"{file.image}: no picture that can be read ({', '.join(PICTURES)})") from None
+        raise ValueError(f"{file.image}: not a readable picture ({', '.join(PICTURES)})") from None
     if width * height > MAX_PIXELS:
         raise ValueError(f"{file.image}: {width:,} x {height:,} pixels are more than {MAX_PIXELS:,}; make it smaller")
     try:

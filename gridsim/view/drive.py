@@ -161,9 +161,9 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise DriveError(f"{path}: no recorded drive: it is not a CSV file ({type(error).__name__})") from error
+        raise DriveError(f"{path}: not a recorded drive: it is not a CSV file ({type(error).__name__})") from error
     if not rows or tuple(rows[0]) != COLUMNS:
-        raise DriveError(f"{path}: no recorded drive: its first line must be {','.join(COLUMNS)}")
+        raise DriveError(f"{path}: not a recorded drive: its first line must be {','.join(COLUMNS)}")
     if len(rows) < 2:
         raise DriveError(f"{path}: nothing was driven: it has no rows")
     numbers, actions, episodes = [], [], []
@@ -200,9 +200,9 @@ def _numbers(row: Sequence[str]) -> list[float]:
         try:
             value = float(text)
         except ValueError:
-            raise ValueError(f"{column} is {text[:40]!r}, no number") from None
+            raise ValueError(f"{column} is {text[:40]!r}, which is not a number") from None
         if not abs(value) <= limit:
-            raise ValueError(f"{column} is {value:g}, which no car can have")
+            raise ValueError(f"{column} is {value:g}, which is outside the possible range")
         values.append(value)
     return values
 

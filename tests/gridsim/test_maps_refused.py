@@ -55,10 +55,10 @@ def test_pictures_that_are_no_maps(tmp_path):
     (tmp_path / "empty.png").write_bytes(b"")
     (tmp_path / "folder.png").mkdir()
     assert "truncated" in refused(tmp_path / "cut.png")
-    assert "no picture" in refused(tmp_path / "empty.png")
+    assert "not a readable picture" in refused(tmp_path / "empty.png")
     assert "not a file" in refused(tmp_path / "folder.png")
     assert "No such file" in refused(tmp_path / "missing.png")
-    assert "no path" in refused("nul\0l.png")
+    assert "not a valid path" in refused("nul\0l.png")
     assert "picture" in refused(tmp_path / "map.tiff")
     assert "all road" in refused(save(tmp_path / "road.png", np.full((99, 99), 255, np.uint8)))
     assert "all wall" in refused(save(tmp_path / "wall.png", np.zeros((99, 99), np.uint8)))
@@ -71,9 +71,9 @@ def test_pictures_that_are_no_maps(tmp_path):
 WRONG = {
     "no mapping": ("[1, 2]", "mapping"),
     "empty": ("", "mapping"),
-    "no YAML": ("image: [", "no plain YAML"),
-    "deep": ("[" * 5000, "no plain YAML"),
-    "tag": ("!!python/object/apply:os.system ['true']", "no plain YAML"),
+    "no YAML": ("image: [", "not valid YAML"),
+    "deep": ("[" * 5000, "not valid YAML"),
+    "tag": ("!!python/object/apply:os.system ['true']", "not valid YAML"),
     "no image": ("resolution: 0.1", "image"),
     "no resolution": ("image: map.png", "resolution"),
     "both": ("{image: map.png, resolution: 0.1, scale: 10}", "either"),
@@ -88,7 +88,7 @@ WRONG = {
     "image type": ("{image: [map.png], resolution: 0.1}", "image must name"),
     "absolute": ("{image: /map.png, resolution: 0.1}", "own folder"),
     "outside": ("{image: ../map.png, resolution: 0.1}", "own folder"),
-    "null": ('{image: "a\\0.png", resolution: 0.1}', "no path"),
+    "null": ('{image: "a\\0.png", resolution: 0.1}', "not a valid path"),
     "link": ("{image: link.png, resolution: 0.1}", "own folder"),
     "loop": ("{image: loop.png, resolution: 0.1}", "loop.png"),
     "missing": ("{image: none.png, resolution: 0.1}", "No such file"),
@@ -105,7 +105,7 @@ WRONG = {
     "degrees": ("{image: map.png, resolution: 0.1, starts: [[1, 2, 90]]}", "heading"),
     "itself": ("{image: map.png, resolution: 0.1, starts: &a [*a, *a]}", "start"),
     "laughs": ("{image: map.png, resolution: [" + "&a [1,1,1]," + "*a," * 99 + "]}", "resolution"),
-    "huge": ("#" * 70_000, "too many"),
+    "huge": ("#" * 70_000, "the limit is"),
     "torus": ("{image: map.png, resolution: 0.1, torus: yes please}", "torus"),
     "large": ("{image: map.png, resolution: 1}", "is too large"),
 }
