@@ -272,7 +272,7 @@ def test_champions_are_looked_for_when_the_leader_does_well(maps):
         lambda: setattr(evolution, "validation_steps", 251),
         lambda: evolution.history.append({"leader/success_rate": config.promising - 0.01}),
         lambda: setattr(evolution, "champion", champion_of_rate(config.promising + 0.1)),
-        lambda: evolution.trials.enter(np.zeros((1, GENES), dtype=np.float32), 0),
+        lambda: evolution.trials.add_candidates(np.zeros((1, GENES), dtype=np.float32), 0),
     ):
         before = evolution.validation_steps, list(evolution.history), evolution.champion
         spoil()
@@ -309,9 +309,9 @@ def test_validation_takes_no_more_than_its_share(maps):
 def test_who_was_tried_is_not_tried_again(maps):
     evolution = begin(maps)
     genomes = np.random.default_rng(1).normal(size=(3, GENES)).astype(np.float32)
-    evolution.trials.enter(genomes[[0, 1, 0]], 0)
+    evolution.trials.add_candidates(genomes[[0, 1, 0]], 0)
     assert len(evolution.trials.first) == 2
-    evolution.trials.enter(genomes, 1)
+    evolution.trials.add_candidates(genomes, 1)
     assert evolution.trials.first.tobytes() == genomes[2:].tobytes()
 
 
