@@ -22,6 +22,8 @@ from typing import NoReturn, TypeVar
 import tyro
 from docstring_parser import attrdoc
 
+from gridsim.errors import GridSimError
+
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 CROWDED = 4  # workers to a core that are more than anybody means
@@ -33,7 +35,7 @@ attrdoc.ast_get_constant_value = lambda node: (
 )
 
 
-class UsageError(Exception):
+class UsageError(GridSimError):
     """Wrong use; the message is shown in one line."""
 
 

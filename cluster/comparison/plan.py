@@ -23,6 +23,7 @@ from cluster.runs import checkpoint
 from cluster.runs.run import CONFIG, SUMMARY, RunError, read_config
 from cluster.runs.settings import MAX_TRAFFIC
 from evolution.networks.policy import Observation
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
 from gridsim.view.drive import DriveError, read_drive
 
@@ -31,7 +32,7 @@ FORMAT = 1
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
 
 
-class CellError(Exception):
+class CellError(GridSimError):
     """A cell that could not be trained; the message is one line for the user."""
 
 

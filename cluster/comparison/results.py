@@ -20,6 +20,7 @@ from cluster.runs.champion import evaluate, load_champion
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import CHAMPION, CONFIG, SUMMARY, RunError, read_config
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import label
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ RUN_FIGURES = (
 the champion), and what training had cost when the final champion was bred."""
 
 
-class ExperimentError(Exception):
+class ExperimentError(GridSimError):
     """A comparison that cannot be made, read or resumed; the message is one line for the user."""
 
 

@@ -24,6 +24,7 @@ from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import DISTANCE, SPEED, End, X, Y
 from gridsim.envs.simulator import views
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import LANE
@@ -33,7 +34,7 @@ SUFFIXES = (".mp4", ".gif")
 SIZE, FPS, SECONDS = (640, 360), 15, 20.0  # of champion.mp4, which a run waits for: a second or two of one core
 
 
-class VideoError(Exception):
+class VideoError(GridSimError):
     """A film that cannot be written; the message is one line for the user."""
 
 

@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from gridsim.errors import GridSimError
+
 CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 """Files of a run's folder."""
 
@@ -33,7 +35,7 @@ _DIGEST = 64  # hex digits of a sha256
 _STALE_S = 60.0
 
 
-class CheckpointError(Exception):
+class CheckpointError(GridSimError):
     """A file that cannot be saved or that must not be trusted; its text is one line for the user."""
 
 

@@ -39,6 +39,7 @@ from cluster.workers.pool import WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS
 from evolution.episodes.rollout import trajectory as drive_trajectory
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 from gridsim.maps.files import map_digest, short_lap
 from gridsim.maps.scenarios import is_map_file, label
 
@@ -48,7 +49,7 @@ OLD_FORMATS = (1,)  # GridSim 0.1: other searches, other parameters
 NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
-class RunError(Exception):
+class RunError(GridSimError):
     """A run's folder that cannot be made, read or resumed; the message is one line for the user."""
 
 

@@ -15,6 +15,7 @@ from evolution.dqn.replay import MAX_N_STEP
 from evolution.episodes.curriculum import CurriculumConfig
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, speed_interval
 
 MAX_WORKERS = 10_000
@@ -33,7 +34,7 @@ CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 90_000_000
 S = TypeVar("S", bound="RunSettings")
 
 
-class SettingsError(ValueError):
+class SettingsError(GridSimError):
     """Settings that make no sense; the message is one line for the user."""
 
 

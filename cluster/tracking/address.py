@@ -15,13 +15,15 @@ import urllib.parse
 import urllib.request
 from pathlib import Path
 
+from gridsim.errors import GridSimError
+
 DEFAULT_URI = "sqlite:///mlflow.db"
 UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
 PROBE_S = 3.0
 _SERVERS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
 
 
-class TrackingError(Exception):
+class TrackingError(GridSimError):
     """MLflow cannot be used as asked; its text is one line for the user."""
 
 

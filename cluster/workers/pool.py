@@ -17,6 +17,7 @@ from evolution.dqn.experience import Experience, join
 from evolution.episodes.rollout import RESULT, targets
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
 
@@ -37,7 +38,7 @@ NOBODY = np.zeros(0, RECIPE)  # the recipes where experience is collected
 FINER = 2  # times as many workers' chunks experience is cut into: who crashes is done long before its target
 
 
-class PoolError(Exception):
+class PoolError(GridSimError):
     """No result can be had from the workers; the message is one line for the user."""
 
 

@@ -22,6 +22,7 @@ from evolution.episodes.rollout import EPISODE, Limits
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
 from gridsim.car.ego import End
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
 from gridsim.traffic.world import FIELDS, LANE, check_worlds
@@ -32,7 +33,7 @@ VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
 TRIED_KEPT = 256  # latest candidates remembered, so that they are not validated again
 
 
-class CrashError(ValueError):
+class CrashError(GridSimError):
     """A crash from a checkpoint whose traffic does not fit its map; the message is one line."""
 
 

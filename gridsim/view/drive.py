@@ -21,6 +21,7 @@ from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, 
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import check_name
 from gridsim.traffic.world import LANE
@@ -41,7 +42,7 @@ _ENDLESS = 10_000_000  # control steps
 HELP = "arrows drive   space brakes   R restarts   Esc ends"
 
 
-class DriveError(ValueError):
+class DriveError(GridSimError):
     """A recorded drive that cannot be written, read or replayed; the message is one line for the user."""
 
 

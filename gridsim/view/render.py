@@ -21,6 +21,7 @@ import numpy as np
 
 from gridsim.car.ego import COS, SIN, STEERING, X, Y
 from gridsim.config import SimConfig, constants
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.roads import CELLS_PER_M, freeze
 from gridsim.view import paint
@@ -33,7 +34,7 @@ CAR_AT = 0.74  # height of the car in a picture that follows it, as a share from
 GRID_CELL = 0.5  # m, of the occupancy grid
 
 
-class NoDisplayError(RuntimeError):
+class NoDisplayError(GridSimError):
     """No window can be opened; the message is one line that says what to do."""
 
 
