@@ -73,7 +73,7 @@ def soak(generations: int, workers: int) -> dict[str, list[int]]:
         # A short validation: all maps are in use at once, and a generation takes a tenth of a second.
         curriculum = this.learning.curriculum
         curriculum.config = dataclasses.replace(
-            curriculum.config, leader_episodes=4, validation=48, first_validation=24, validation_share=1.0
+            curriculum.config, leader_episodes=4, validation=48, validation_share=1.0
         )
         curriculum.target = curriculum.config.last_target
         compile_kernels(settings.policy, settings.traffic, settings.command)

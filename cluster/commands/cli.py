@@ -318,9 +318,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         status, code = "KILLED", TERMINATED
     except Exception as error:
         from cluster.runs.checkpoint import CheckpointError
-        from evolution.episodes.curriculum import CrashError
 
-        if not isinstance(error, PoolError | CheckpointError | CrashError | FloatingPointError | MemoryError | OSError):
+        if not isinstance(error, PoolError | CheckpointError | FloatingPointError | MemoryError | OSError):
             raise
         message = str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # to go on would be to come to the same

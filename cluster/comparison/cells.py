@@ -20,7 +20,6 @@ from cluster.tracking.mlflow_run import Status
 from cluster.training.trainer import Maps
 from cluster.workers import kernels
 from cluster.workers.pool import PoolError, SerialPool, WorkerPool
-from evolution.episodes.curriculum import CrashError
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 
@@ -57,7 +56,7 @@ class Cells:
         except PoolError as error:
             self.close()  # the next run has workers of its own
             raise CellError(str(error)) from error
-        except (CheckpointError, CrashError, RunError, SettingsError, FloatingPointError) as error:
+        except (CheckpointError, RunError, SettingsError, FloatingPointError) as error:
             raise CellError(str(error)) from error
 
     def close(self) -> None:

@@ -257,7 +257,11 @@ class Session:
         self.learning = new_learning(self.run.settings, self.pool, self.maps, self.initial, self.on_progress)
         self._digest = self.run.digest()
         if self.run.saved is not None:
-            self.learning.restore(*self.run.saved)
+            try:
+                self.learning.restore(*self.run.saved)
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                path = self.run.path / CHECKPOINT
+                raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
 
     def learn(self) -> None:
         """Learn to the end, saving after every step."""
@@ -343,7 +347,7 @@ class Session:
                 f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m",
             )  # fmt: skip
         self.tracker.wall_s = wall = self._wall_s()
-        best = learning.history[learning.champion.generation]
+        best = learning.history[learning.champion.step]
         summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracker.run_id or "",
@@ -355,7 +359,7 @@ class Session:
             "wall_s": round(wall, 3),
             "car_steps_per_s": round(learning.car_steps / wall, 1),
             "champion_sha256": champion.sha256,
-            f"champion_{learning.step_name}": learning.champion.generation,
+            f"champion_{learning.step_name}": learning.champion.step,
             "validation_success_rate": learning.champion.success_rate,
             "solved": learning.solved,
             "lost_chunks": learning.lost_chunks,

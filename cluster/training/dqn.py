@@ -166,24 +166,24 @@ class Dqn(Learning):
 
     # ------------------------------------------------------------------------------------------------- the evaluation
 
+    def candidate(self) -> np.ndarray | None:
+        return self.elites[-1] if self.elites else None
+
     def _evaluate_network(self) -> dict[str, float]:
-        """Try the averaged network on validation's first episodes, beside who is on trial. Returns its figures."""
+        """Validate the averaged network. Returns its figures."""
         network = _finite(self.learner.average, self.learner.updates)
         self.elites.append(network)
-        # Also who was tried before, where nothing was learned since: its figures are the row's.
-        self.trials.first, self.trials.first_generation = network[None], self.steps
-        episodes, asked = self._trial()
         driven = self._evaluate(
-            "validate", unmodified(np.concatenate([self.trials.first, self.trials.last])), episodes,
-            self.curriculum.goal_limits(), asked=asked, meanwhile=self._train,
+            "validate", unmodified(network[None]), self.curriculum.validation(), self.curriculum.goal_limits(),
+            meanwhile=self._train,
         )  # fmt: skip
         some_left(driven.lost, "validate")
-        self._judge(driven.results, driven.lost)
-        first = driven.results[0, : self.curriculum.config.first_validation]
+        self._judge(network, driven.results, self.steps)
+        results = driven.results[0]
         return {
-            "distance_m/best": float(first["distance"].mean()),
-            "speed_mps/best": made_good(first, self.sim.episode.control_period),
-            "network/success_rate": float(success_rate(first[None])[0]),
+            "distance_m/best": float(results["distance"].mean()),
+            "speed_mps/best": made_good(results, self.sim.episode.control_period),
+            "network/success_rate": float(success_rate(results[None])[0]),
         }
 
     def _watch(self, updates: int) -> float:
@@ -258,8 +258,8 @@ class Dqn(Learning):
         }
         return arrays, meta
 
-    def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        super()._restore(arrays, meta)
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        super().restore(arrays, meta)
         self.learner.restore(_named(arrays, "learner_"), meta["learner"])
         if "replay" in meta:  # a run that has ended kept none; extended, it fills a new one before it learns on
             self.replay.restore(_named(arrays, "replay_"), meta["replay"])

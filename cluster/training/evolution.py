@@ -1,7 +1,7 @@
 """The generation loop of the searches: ask, evaluate, tell, in one call of the pool a generation.
 
-Beside the members drive the leader (the best genome known before the generation) on longer episodes of its own, and who
-is on trial for champion on validation's.
+Beside the members, the leader (the best genome known before the generation) drives longer episodes of its own, and the
+candidate for champion drives the validation episodes.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from cluster.runs.settings import EvolveSettings
 from cluster.training.trainer import Bred, Learning, made_good, some_left
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
-from evolution.episodes.rollout import EPISODE, targets
+from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.search import fitness
 from evolution.search.base import Search
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
-from gridsim.traffic.world import check_worlds
 
 COLUMNS = (
     "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
@@ -74,28 +73,20 @@ class Evolution(Learning):
         """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
         self.outcomes.clear()
         curriculum, limits, period = self.curriculum, self.curriculum.limits(), self.sim.episode.control_period
-        leader = self.search.leader()
-        asked = self.search.ask()
-        n, episodes = len(asked.recipes), curriculum.episodes(self.generation)
-        e = len(episodes.rows) // len(asked.groups)
-        bred = Bred(asked.parents, asked.recipes, asked.key, asked.mutation)
-        groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
+        leader, candidate = self.search.leader(), self.candidate() if self._promising() else None
+        asked, episodes = self.search.ask(), curriculum.episodes(self.generation)
+        n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
         goals = targets(episodes.rows, limits)[:e]  # of any group
+        groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self._build_ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
 
-        # What takes longest is sent first: those on trial, then the leader.
-        parts = groups
+        call = _Call(Bred(asked.parents, asked.recipes, asked.key, asked.mutation), episodes, list(groups))
         if leader is not None:
             followed = curriculum.leader_episodes(self.generation)
-            parts = [_beside(bred, episodes, Chunk(slice(0, 1), slice(0, len(followed.rows)))), *parts]
-            bred, episodes = bred.and_copies(leader[None]), episodes.and_then(followed)
-        on_trial = _beside(bred, episodes, Chunk(slice(0, len(self.trials)), slice(0, curriculum.config.validation)))
-        if len(self.trials):
-            validation, tried = self._trial()
-            parts = [*(_beside(bred, episodes, part) for part in tried), *parts]
-            bred = bred.and_copies(np.concatenate([self.trials.first, self.trials.last]))
-            episodes = episodes.and_then(validation)
-        driven = self._evaluate("evolve", bred, episodes, limits, asked=parts, meanwhile=self.meanwhile)
+            leading = call.add(leader, followed)
+        if candidate is not None:
+            trial = call.add(candidate, curriculum.validation())
+        driven = self._evaluate("evolve", call.bred, call.episodes, limits, call.asked, self.meanwhile)
         some_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
@@ -106,15 +97,15 @@ class Evolution(Learning):
             led, led_score = results[best], float(score[best])
         else:
             self.elites.append(leader)
-            alone = slice(n, n + 1), slice(e * len(groups), e * len(groups) + len(followed.rows))
-            led = driven.results[alone][0]
-            led_score = float(self._score(driven.results[alone], curriculum.leader_limits().target)[0])
-            curriculum.learn_from_leader(followed, led, driven.rewound[alone[1]], driven.worlds[alone[1]])
+            led = driven.results[leading][0]
+            led_score = float(self._score(led[None], curriculum.leader_limits().target)[0])
+            columns = leading.columns
+            curriculum.learn_from_leader(followed, led, driven.rewound[columns], driven.worlds[columns])
         self.search.tell(score)
-        if len(self.trials):
-            self._judge(driven.results[on_trial], driven.lost[on_trial.rows])
-            if self.champion is not None:
-                self.search.keep_champion(self.champion.genome)
+        if candidate is not None and not driven.lost[trial.rows][0]:
+            self._judge(candidate, driven.results[trial], self.generation - 2)
+        if self.champion is not None:
+            self.search.keep_champion(self.champion.genome)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         row = {
             "fitness/best": led_score if np.isfinite(led_score) else -1.0,
@@ -130,24 +121,23 @@ class Evolution(Learning):
             "car_steps": float(self.car_steps),
         }
         self.history.append(row)
-        if self._promising():
-            self.trials.add_candidates(self.search.candidates(), self.generation - 1)
         return row
 
+    def candidate(self) -> np.ndarray | None:
+        return self.search.candidate()
+
     def _promising(self) -> bool:
-        """Whether to look for a champion: the leader does well, and validation has not had more than its share."""
+        """Whether to validate the candidate: the leader does well, and validation has not had more than its share."""
         config = self.curriculum.config
         latest = [row["leader/success_rate"] for row in self.history[-config.latest :]]
         least = max(config.promising, self.champion.success_rate if self.champion else 0.0)
+        candidate = self.candidate()
         return (
-            not len(self.trials)
+            candidate is not None
+            and not self._is_tried(candidate)
             and sum(latest) >= least * config.latest
             and self.validation_steps <= config.validation_share * self.car_steps
         )
-
-    def latest(self) -> np.ndarray:
-        """The search's candidates, and the last generation's elite."""
-        return np.concatenate([self.search.candidates(), self.elites[-1][None]])
 
     # ------------------------------------------------------------------------------------------------------- state
 
@@ -176,51 +166,34 @@ class Evolution(Learning):
         curriculum = self.curriculum
         searched, numbers = self.search.state()
         arrays |= {f"search_{name}": array for name, array in searched.items()}
-        arrays |= {"crashes": _plain(curriculum.crashes), "crash_worlds": curriculum.crash_worlds}
+        arrays |= {"crashes": curriculum.crashes, "crash_worlds": curriculum.crash_worlds}
         meta |= {"search": numbers, "target": curriculum.target}
         return arrays, meta
 
-    def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        super()._restore(arrays, meta)
-        curriculum, generation, target = self.curriculum, int(meta["generation"]), float(meta["target"])
-        crashes, worlds = arrays["crashes"], arrays["crash_worlds"]
-        fits = (
-            generation == len(self.history)
-            and crashes.ndim == 2
-            and crashes.shape[1] == 6
-            and worlds.shape == (len(crashes), *curriculum.crash_worlds.shape[1:])
-            and worlds.dtype == np.float32
-            and curriculum.target <= target <= curriculum.goal
-        )
-        if not fits:
-            raise ValueError("its parts do not fit each other")
-        maps = np.arange(len(curriculum.map_seeds))
-        if not np.isfinite(crashes).all() or not np.isin(crashes[:, 0], maps).all():
-            raise ValueError("a crash is nowhere on its maps")
-        check_worlds(worlds)  # and against its map when one is driven (`Curriculum.episodes`)
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        super().restore(arrays, meta)
         searched = {name.removeprefix("search_"): array for name, array in arrays.items() if name.startswith("search_")}
         self.search.restore(searched, meta["search"])
-        if generation and self.search.leader() is None:
-            raise ValueError("it has no genomes to go on with")
-        self.search.generation = generation
+        self.search.generation = meta["generation"]
         if self.champion is not None:
             self.search.keep_champion(self.champion.genome)
-        curriculum.crashes, curriculum.crash_worlds, curriculum.target = _crashes(crashes), worlds, target
+        curriculum = self.curriculum
+        curriculum.crashes, curriculum.crash_worlds = arrays["crashes"], arrays["crash_worlds"]
+        curriculum.target = meta["target"]
 
 
-def _beside(bred: Bred, episodes: Episodes, part: Chunk) -> Chunk:
-    """A part of what is driven beside these members and episodes, in the numbers of both together."""
-    n, e = len(bred.recipes), len(episodes.rows)
-    rows, columns = part
-    return Chunk(slice(n + rows.start, n + rows.stop), slice(e + columns.start, e + columns.stop))
+@dataclass
+class _Call:
+    """What one call of the pool drives: members on their groups' episodes, and single genomes on their own."""
 
+    bred: Bred
+    episodes: Episodes
+    asked: list[Chunk]
 
-def _plain(episodes: np.ndarray) -> np.ndarray:
-    """EPISODE [n] as float64 [n, 6]."""
-    return np.concatenate([episodes["map"][:, None].astype(np.float64), episodes["start"]], axis=1)
-
-
-def _crashes(plain: np.ndarray) -> np.ndarray:
-    episodes = np.zeros(len(plain), dtype=EPISODE)
-    episodes["map"], episodes["start"] = plain[:, 0], plain[:, 1:]
-    return episodes
+    def add(self, genome: np.ndarray, episodes: Episodes) -> Chunk:
+        """Drive a genome float32 [genes] on episodes; they are sent first, since they take longest."""
+        n, e = len(self.bred.recipes), len(self.episodes.rows)
+        part = Chunk(slice(n, n + 1), slice(e, e + len(episodes.rows)))
+        self.bred, self.episodes = self.bred.and_copies(genome[None]), self.episodes.and_then(episodes)
+        self.asked.insert(0, part)
+        return part

@@ -21,17 +21,14 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.settings import RunSettings
 from cluster.workers.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.workers.worker import Task
 from evolution.episodes.curriculum import (
     HELD_OUT_EPISODES,
     HELD_OUT_SEEDS,
-    TRIED_KEPT,
     VALIDATION_SEEDS,
     Curriculum,
-    Trials,
     spread_starts,
     success_rate,
 )
@@ -45,7 +42,6 @@ from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build, seed_of_map
 
-MAX_TRIED = 4  # members that are on validation's first stage at once
 MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
 
@@ -98,14 +94,14 @@ class Champion:
         score: of all validation episodes (`Curriculum.validation_score`).
         success_rate: of the same.
         distance_m: its mean distance there.
-        generation: the step in which it was found.
+        step: in which it was found.
     """
 
     genome: np.ndarray
     score: float = 0.0
     success_rate: float = 0.0
     distance_m: float = 0.0
-    generation: int = -1
+    step: int = -1
 
 
 @dataclass
@@ -133,6 +129,7 @@ class Learning(ABC):
     maps: Maps
     initial: np.ndarray | None = None
     champion: Champion | None = None
+    tried: np.ndarray | None = None  # the last candidate that was validated, float32 [genes]
     solved: bool = False
     history: list[dict[str, float]] = field(default_factory=list)
     elites: list[np.ndarray] = field(default_factory=list)
@@ -153,8 +150,6 @@ class Learning(ABC):
         self.curriculum = Curriculum(
             s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period, s.traffic
         )
-        none = np.zeros((0, self.spec.size), dtype=np.float32)
-        self.trials = Trials(none, none)
         self._for_validation = iter(VALIDATION_SEEDS)  # maps that are not begun
         self.outcomes: list[Outcome] = []  # of the last step, for statistics
 
@@ -189,34 +184,42 @@ class Learning(ABC):
         """Whether there is nothing left to learn."""
         return self.settings.ended({"solved": self.solved, **self.counts()})
 
-    def conclude(self) -> None:
-        """Find out about who is still on trial when a run ends, and then about the latest.
+    @abstractmethod
+    def candidate(self) -> np.ndarray | None:
+        """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
-        What a checkpoint holds is from before: a run that is extended goes on as if it had never ended.
+    def conclude(self) -> None:
+        """Validate the last candidate when a run ends.
+
+        This is not in the checkpoint: a run that is extended goes on as if it had never ended.
         """
-        self._settle_trials()
+        candidate = self.candidate()
+        if candidate is not None and not self.solved and not self._is_tried(candidate):
+            driven = self.drive(
+                "validate", candidate[None], self.curriculum.validation(), self.curriculum.goal_limits()
+            )
+            if not driven.lost[0]:
+                self._judge(candidate, driven.results, self.steps - 1)
         if self.champion is None:
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
 
-    def _settle_trials(self) -> None:
-        self._finish_trials()
-        if not self.solved:
-            self.trials.add_candidates(self.latest(), self.steps - 1)
-            self._finish_trials()
+    def _is_tried(self, candidate: np.ndarray) -> bool:
+        """Whether a candidate is the last one that was validated."""
+        return self.tried is not None and self.tried.tobytes() == candidate.tobytes()
 
-    def _finish_trials(self) -> None:
-        while len(self.trials) and not self.solved:
-            self._validate()
+    def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
+        """Make a step's candidate champion if its validation, RESULT [1, episodes], is better than the champion's."""
+        self.tried = candidate
+        self.validation_steps += int(results["steps"].sum())
+        score, distance = float(self.curriculum.validation_score(results)[0]), float(results["distance"].mean())
+        if self.champion is None or (score, distance) > (self.champion.score, self.champion.distance_m):
+            self.champion = Champion(candidate, score, float(success_rate(results)[0]), distance, step)
+        self.solved = self.champion.score >= self.settings.until
 
     def _build_ahead(self, seeds: Sequence[int]) -> None:
         """Begin to build maps that training needs soon, and some of validation's."""
         self.maps.ahead(seeds)
         self.maps.ahead(list(itertools.islice(self._for_validation, MAPS_A_STEP)), later=True)
-
-    def latest(self) -> np.ndarray:
-        """Networks of the last step that are tried if they were not, float32 [k, genes]."""
-        untried = [] if self.champion else self.elites[-1:]
-        return np.array(untried, dtype=np.float32).reshape(-1, self.spec.size)
 
     # ------------------------------------------------------------------------------------------------- evaluating
 
@@ -252,48 +255,6 @@ class Learning(ABC):
         """Results [n, e] of given genomes [n, genes]: recipes that are plain copies."""
         return self._evaluate(stage, unmodified(genomes), episodes, limits)
 
-    def _trial(self) -> tuple[Episodes, list[Chunk]]:
-        """Validation's episodes, and who of `trials` drives which of them."""
-        episodes = self.curriculum.validation().with_limits(self.curriculum.goal_limits())
-        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
-        parts = [
-            Chunk(slice(k, len(self.trials)), slice(stage, len(episodes.rows))),
-            Chunk(slice(0, k), slice(0, stage)),
-        ]
-        return episodes, [part for part in parts if part.rows.stop > part.rows.start]
-
-    def _validate(self) -> None:
-        """Go on with the trials, with nothing beside them."""
-        episodes, asked = self._trial()
-        bred = unmodified(np.concatenate([self.trials.first, self.trials.last]))
-        tried = self._evaluate("validate", bred, episodes, self.curriculum.goal_limits(), asked=asked)
-        self._judge(tried.results, tried.lost)
-
-    def _judge(self, results: np.ndarray, lost: np.ndarray) -> None:
-        """Find out whether `trials.last` beats the champion, and who of `trials.first` is tried next.
-
-        Args: RESULT [members, validation], zero where a member's stage has no such episode; and bool [members], who
-            was lost: it is neither.
-        """
-        trials, score = self.trials, self.curriculum.validation_score
-        self.validation_steps += int(results["steps"].sum())
-        stage, k = self.curriculum.config.first_validation, len(self.trials.first)
-        if len(trials.last) and not lost[k]:
-            whole = results[k:, stage:]
-            total, distance = float(score(whole)[0]), float(whole["distance"].mean())
-            if self.champion is None or (total, distance) > (self.champion.score, self.champion.distance_m):
-                rate = float(success_rate(whole)[0])
-                self.champion = Champion(trials.last[0].copy(), total, rate, distance, trials.last_generation)
-            self.solved = self.champion.score >= self.settings.until
-        trials.last = trials.first[:0]
-        if not lost[:k].all():
-            first = results[:k, :stage]
-            scores = np.where(lost[:k], -1.0, score(first))
-            best = int(np.lexsort((first["distance"].mean(axis=1), scores))[-1])
-            if self.champion is None or scores[best] >= self.champion.score - 0.02:
-                trials.last, trials.last_generation = trials.first[best : best + 1], trials.first_generation
-        trials.first = trials.first[:0]
-
     def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
         """Add the wall clock's columns to a row."""
         row["wall_s"] = wall_s
@@ -321,57 +282,27 @@ class Learning(ABC):
         arrays: dict[str, np.ndarray] = {
             "history": np.array(rows, dtype=np.float64).reshape(-1, len(self.columns)),
             "elites": np.array(self.elites, dtype=np.float32).reshape(-1, self.spec.size),
-            "trials_first": self.trials.first,
-            "trials_last": self.trials.last,
-            "trials_tried": self.trials.tried,
-            "champion": genes_of(champion),
+            "tried": genes_of(self.tried),
+            "champion": genes_of(champion.genome if champion else None),
         }
         meta: dict[str, Any] = {
             "solved": self.solved,
             "lost_chunks": self.lost_chunks,
             "validation_steps": self.validation_steps,
             **self.counts(),
-            "columns": list(self.columns),
-            "trials": [self.trials.first_generation, self.trials.last_generation],
-            "champion": told(champion),
+            "champion": champion and [champion.score, champion.success_rate, champion.distance_m, champion.step],
         }
         return arrays, meta
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        """Take up a state. Raises CheckpointError with one line where it does not fit this run."""
-        try:
-            self._restore(arrays, meta)
-            if self.solved and self.champion is None:
-                raise ValueError("it is solved, and has no champion")
-        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
-            raise CheckpointError(f"the checkpoint does not belong to this run: {error}") from error
-
-    def _restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        """`restore`; what does not fit raises any of the errors that it names."""
-        genes = self.spec.size
-        history, elites = arrays["history"], arrays["elites"]
-        first, last, tried = arrays["trials_first"], arrays["trials_last"], arrays["trials_tried"]
-        fits = (
-            meta["columns"] == list(self.columns)
-            and history.shape == (len(elites), len(self.columns))
-            and elites.shape == (len(elites), genes)
-            and elites.dtype == np.float32
-            and all(genomes.shape[1:] == (genes,) and genomes.dtype == np.float32 for genomes in (first, last))
-            and len(first) <= MAX_TRIED
-            and len(last) <= 1
-            and tried.ndim == 1
-            and len(tried) <= TRIED_KEPT
-            and tried.dtype == np.uint64
-        )
-        if not fits or not np.isfinite(history).all():
-            raise ValueError("its parts do not fit each other")
-        self.car_steps, self.solved = int(meta["car_steps"]), bool(meta["solved"])
-        self.lost_chunks, self.validation_steps = int(meta["lost_chunks"]), int(meta["validation_steps"])
-        self.history = [dict(zip(self.columns, row.tolist(), strict=True)) for row in history]
-        self.elites = list(elites)
-        first_generation, last_generation = (int(k) for k in meta["trials"])
-        self.trials = Trials(first, last, first_generation, last_generation, tried)
-        self.champion = champion_of(arrays["champion"], meta["champion"], genes)
+        """Continue from a `state` of the same settings; that a file holds one is what its checksum and digest say."""
+        self.car_steps, self.solved = meta["car_steps"], meta["solved"]
+        self.lost_chunks, self.validation_steps = meta["lost_chunks"], meta["validation_steps"]
+        self.history = [dict(zip(self.columns, row, strict=True)) for row in arrays["history"].tolist()]
+        self.elites = list(arrays["elites"])
+        self.tried = arrays["tried"] if arrays["tried"].size else None
+        if meta["champion"]:
+            self.champion = Champion(arrays["champion"], *meta["champion"])
         self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
 
     def history_csv(self) -> bytes:
@@ -384,24 +315,9 @@ class Learning(ABC):
         return text.getvalue().encode()
 
 
-def genes_of(champion: Champion | None) -> np.ndarray:
-    """A champion's genome, float32 [genes], or [0] of none."""
-    return champion.genome if champion else np.zeros(0, dtype=np.float32)
-
-
-def told(champion: Champion | None) -> list[float]:
-    """What a checkpoint tells of a champion beside its genome."""
-    return [champion.score, champion.success_rate, champion.distance_m, champion.generation] if champion else []
-
-
-def champion_of(genome: np.ndarray, figures: list[float], genes: int) -> Champion | None:
-    """The champion that was `told` of, if any. Raises: ValueError where it cannot have been."""
-    if genome.shape != (genes if figures else 0,) or genome.dtype != np.float32 or not np.isfinite(figures).all():
-        raise ValueError("its parts do not fit each other")
-    if not figures:
-        return None
-    score, rate, distance, found = figures
-    return Champion(genome, float(score), float(rate), float(distance), int(found))
+def genes_of(genome: np.ndarray | None) -> np.ndarray:
+    """A genome as a checkpoint has it: float32 [genes], or [0] of none."""
+    return np.zeros(0, dtype=np.float32) if genome is None else genome
 
 
 class Bred(NamedTuple):

@@ -11,10 +11,9 @@ The state is arrays and numbers; random numbers depend only on (seed, generation
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,19 +21,13 @@ from evolution.episodes.rollout import EPISODE, Limits
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
 from gridsim.car.ego import End
-from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
-from gridsim.traffic.world import FIELDS, LANE, check_worlds
+from gridsim.traffic.world import FIELDS, LANE
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
-TRIED_KEPT = 256  # latest candidates remembered, so that they are not validated again
-
-
-class CrashError(GridSimError):
-    """A crash from a checkpoint whose traffic does not fit its map; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +54,7 @@ class CurriculumConfig:
     promising: float = 0.5  # least success rate of the leader before candidates are validated ...
     latest: int = 4  # ... as the mean over so many generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
-    first_validation: int = 48  # episodes of validation's first stage
-    validation: int = 256  # ... and in all
+    validation: int = 256  # episodes of validation
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
 
 
@@ -137,7 +129,6 @@ class Curriculum:
         """A generation's episodes, group by group: first new starts, then crash starts.
 
         All groups have the same number of each.
-        Raises: CrashError if the traffic of a crash start does not fit its map.
         """
         config, rng = self.config, self._rng(generation, 0)
         maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
@@ -146,7 +137,6 @@ class Curriculum:
             return fresh
         chosen = self._rng(generation, 1).integers(len(self.crashes), size=config.groups * config.crash_starts)
         crashes, worlds = self.crashes[chosen].copy(), self.crash_worlds[chosen]
-        self._check(crashes["map"], worlds)
         target = min(config.crash_target, self.target)
         crashes["target"], crashes["steps"] = target, self._steps(target)
         seeds = [self.map_seeds[m] for m in crashes["map"]]
@@ -168,16 +158,6 @@ class Curriculum:
     def _drawn(self, generation: int, count: int, purpose: int) -> Episodes:
         rng = self._rng(generation, purpose)
         return self._new_starts(self._some_maps(generation, count, rng), rng)
-
-    def _check(self, maps: np.ndarray, worlds: np.ndarray) -> None:
-        """Check traffic [n, cars, fields] against its maps [n]; done here, where the maps are built already."""
-        if worlds.shape[1]:
-            for m in np.unique(maps):
-                seed = self.map_seeds[m]
-                try:
-                    check_worlds(worlds[maps == m], self.build(seed).network)
-                except ValueError as error:
-                    raise CrashError(f"a crash in the checkpoint does not fit map {seed}: {error}") from error
 
     def leader_episodes(self, generation: int) -> Episodes:
         """The leader's episodes beside a generation, with `rewind` set for crash starts."""
@@ -215,7 +195,8 @@ class Curriculum:
             maps, rows, worlds = spread_starts(self.build, VALIDATION_SEEDS, self.config.validation, self.traffic)
             absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
-            self._validation = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
+            episodes = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
+            self._validation = episodes.with_limits(self.goal_limits())
         return self._validation
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:
@@ -223,39 +204,6 @@ class Curriculum:
         metres = results["distance"].astype(np.float64).sum(axis=1)
         speed = metres / np.maximum(results["steps"].sum(axis=1) * self.period, 1e-9)
         return success_rate(results) * np.minimum(speed / self.config.champion_pace, 1.0)
-
-
-@dataclass
-class Trials:
-    """Candidates for champion that are being validated, while the next generation is evaluated.
-
-    Candidates in `first` drive validation's first stage. The best of them moves to `last` and drives the second stage.
-    Only that stage decides, since the candidate was chosen on the first.
-
-    Attributes:
-        first: genomes float32 [k, genes].
-        first_generation: their generation.
-        last: genomes float32 [0 or 1, genes].
-        last_generation: its generation.
-        tried: uint64 [n], digests of the latest candidates of the first stage.
-    """
-
-    first: np.ndarray
-    last: np.ndarray
-    first_generation: int = -1
-    last_generation: int = -1
-    tried: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.uint64))
-
-    def __len__(self) -> int:
-        return len(self.first) + len(self.last)
-
-    def add_candidates(self, genomes: np.ndarray, generation: int) -> None:
-        """Start trials of the genomes [k, genes] that were not tried lately."""
-        digests = [int.from_bytes(hashlib.blake2b(genome.tobytes(), digest_size=8).digest()) for genome in genomes]
-        new = [k for k, digest in enumerate(digests) if digest not in self.tried and digest not in digests[:k]]
-        self.first, self.first_generation = genomes[new], generation
-        entered = np.array([digests[k] for k in new], dtype=np.uint64)
-        self.tried = np.concatenate([self.tried, entered])[-TRIED_KEPT:]
 
 
 def success_rate(results: np.ndarray) -> np.ndarray:

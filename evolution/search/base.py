@@ -73,8 +73,8 @@ class Search(ABC):
         """The best genome known before a generation, float32 [genes]; None before the first."""
 
     @abstractmethod
-    def candidates(self) -> np.ndarray:
-        """Candidates for champion after a generation, float32 [k, genes]."""
+    def candidate(self) -> np.ndarray | None:
+        """The candidate for champion after a generation, float32 [genes]; None before the first."""
 
     @abstractmethod
     def state(self) -> tuple[Arrays, dict[str, float]]:
@@ -82,7 +82,7 @@ class Search(ABC):
 
     @abstractmethod
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
-        """The inverse of `state`. Raises: KeyError, TypeError, ValueError if the state does not fit this search."""
+        """The inverse of `state`."""
 
     @abstractmethod
     def _ask(self, key: int) -> Generation: ...
@@ -164,10 +164,3 @@ def recipes(n: int) -> np.ndarray:
     made = np.zeros(n, dtype=RECIPE)
     made["seed"] = np.arange(n)
     return made
-
-
-def checked(array: np.ndarray, shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    """An array from a checkpoint. Raises: ValueError if its shape or type is wrong, or a value is not finite."""
-    if array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
-        raise ValueError(f"it holds {array.dtype}{list(array.shape)} in place of {np.dtype(dtype)}{list(shape)}")
-    return array

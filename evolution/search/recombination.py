@@ -20,7 +20,6 @@ from evolution.search.base import (
     Generation,
     Search,
     SearchConfig,
-    checked,
     ranks,
     recipes,
     split,
@@ -34,6 +33,7 @@ _KEPT = 0.9  # decay of the average of centres in each generation
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
 _MAX_GROWTH = 2.0
+_ARRAYS = ("centre", "average", "path", "variances")  # of the state
 
 
 class Recombination(Search):
@@ -68,8 +68,8 @@ class Recombination(Search):
     def leader(self) -> np.ndarray | None:
         return self.centre.astype(np.float32) if len(self.centre) else None
 
-    def candidates(self) -> np.ndarray:
-        return self.average[None].astype(np.float32)
+    def candidate(self) -> np.ndarray | None:
+        return self.average.astype(np.float32) if len(self.average) else None
 
     def steps(self) -> np.ndarray:
         """Standard deviation of each gene, float64 [genes]."""
@@ -121,16 +121,9 @@ class Recombination(Search):
             self.variances = self.variances * np.where(second > 0.0, 1.0 - rate + rate * second / share, 1.0)
 
     def state(self) -> tuple[Arrays, dict[str, float]]:
-        names = ("centre", "average", "path", "variances")
-        return {name: getattr(self, name) for name in names}, {"sigma": self.sigma}
+        return {name: getattr(self, name) for name in _ARRAYS}, {"sigma": self.sigma}
 
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
-        genes, sigma = (self.spec.size,), float(numbers["sigma"])
-        centre = arrays["centre"]
-        path = checked(arrays["path"], self.path.shape, np.float64)
-        variances = checked(arrays["variances"], genes, np.float64)
-        if not 0.0 < sigma <= _MAX_GROWTH * self.config.sigma or (variances <= 0.0).any():
-            raise ValueError("its step sizes are out of range")
-        shape = genes if centre.size else (0,)
-        self.centre, self.average = checked(centre, shape, np.float64), checked(arrays["average"], shape, np.float64)
-        self.path, self.variances, self.sigma = path, variances, sigma
+        for name in _ARRAYS:
+            setattr(self, name, arrays[name])
+        self.sigma = numbers["sigma"]

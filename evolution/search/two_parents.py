@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import Arrays, Generation, Search, SearchConfig, checked, ranks, recipes, split, tournaments
+from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournaments
 from evolution.search.breeding import Kind, Mutation
 
 PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
@@ -30,8 +30,8 @@ class TwoParents(Search):
     def leader(self) -> np.ndarray | None:
         return self.parents[0] if len(self.parents) else None
 
-    def candidates(self) -> np.ndarray:
-        return self.parents[:1]
+    def candidate(self) -> np.ndarray | None:
+        return self.leader()
 
     def _ask(self, key: int) -> Generation:
         config, rng = self.config, self._rng(1)
@@ -58,8 +58,4 @@ class TwoParents(Search):
         return {"parents": self.parents}, {"elites": self.elites}
 
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
-        elites, parents = int(numbers["elites"]), arrays["parents"]
-        most = self.config.elites + PARENTS
-        if not 0 <= elites <= min(self.config.elites, max(len(parents) - 1, 0)) or len(parents) > most:
-            raise ValueError("its parents are not those of this search")
-        self.parents, self.elites = checked(parents, (len(parents), self.spec.size), np.float32), elites
+        self.parents, self.elites = arrays["parents"], int(numbers["elites"])

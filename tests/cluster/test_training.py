@@ -1,7 +1,6 @@
-"""The generation loop among traffic: what it remembers of crashes survives a checkpoint, and changes nothing."""
+"""The generation loop among traffic: its episodes, the champion, resuming, lost members, the user's fitness."""
 
 import dataclasses
-import math
 import time
 from typing import ClassVar
 
@@ -9,21 +8,21 @@ import numpy as np
 import pytest
 from commands import rows
 
-from cluster.runs.checkpoint import CheckpointError, load, save
+from cluster.runs.checkpoint import load, save
 from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run
 from cluster.runs.settings import EvolveSettings
 from cluster.training.evolution import Evolution
-from cluster.training.trainer import MAX_TRIED, Champion, Maps
+from cluster.training.trainer import Champion, Maps
 from cluster.workers.pool import PoolError, SerialPool
-from evolution.episodes.curriculum import CrashError
 from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, breed
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
+from gridsim.car.ego import End
 from gridsim.config import SimConfig
-from gridsim.traffic.world import ALONG, FIELDS, JUNCTION_BEHIND, LANE, NEXT, SPEED
+from gridsim.traffic.world import FIELDS, LANE
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
@@ -44,7 +43,7 @@ def begin(maps, settings=SETTINGS):
     """A run with a short validation."""
     evolution = Evolution(settings, SerialPool(maps.build), maps)
     curriculum = evolution.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4)
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8)
     return evolution
 
 
@@ -91,17 +90,14 @@ def state_of(evolution):
 
 @pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
 def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
-    """From every generation of three, also where somebody is on trial."""
-    straight = begin(maps, settings)
+    """From each generation of three, also with candidates validated, and as if it had never been concluded."""
+    straight = eager(begin(maps, settings))
     for generation in range(3):
         save(tmp_path / f"{generation}.npz", *straight.state())
-        straight.settings = settings
-        eager(straight)
         go_on(straight)
-    assert len(straight.trials) or straight.champion  # somebody was tried
+    assert straight.champion is not None
     for generation in range(3):
-        resumed = begin(maps, settings)
-        eager(resumed)
+        resumed = eager(begin(maps, settings))
         resumed.restore(*load(tmp_path / f"{generation}.npz"))
         assert resumed.generation == generation
         while resumed.generation < 3:
@@ -109,15 +105,15 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
         assert state_of(resumed) == state_of(straight)
     for run in (straight, resumed):
         run.conclude()
-    assert straight.champion is not None
     assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
     assert resumed.champion.score == straight.champion.score
 
 
 def eager(evolution):
-    """Whoever leads is tried for champion, at once and always."""
+    """Validates a candidate in every generation."""
     curriculum = evolution.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, promising=0.0, latest=1, validation_share=1.0)
+    curriculum.config = dataclasses.replace(curriculum.config, promising=0.0, latest=0, validation_share=1.0)
+    return evolution
 
 
 def test_a_search_is_what_was_asked_for(maps):
@@ -142,21 +138,6 @@ def test_a_run_may_begin_with_a_champion(maps):
         assert np.isfinite(list(evolution.history[0].values())).all()
 
 
-def test_what_ends_a_run_does_not_change_how_it_would_have_gone_on(maps, halfway):
-    concluded, straight = begin(maps), begin(maps)
-    for run in (concluded, straight):
-        run.restore(*load(halfway))
-    before = concluded.state()
-    concluded.conclude()
-    extended = begin(maps)
-    extended.restore(*before)
-    for run in (extended, straight):
-        go_on(run)
-    arrays, again = straight.state()[0], extended.state()[0]
-    for name, array in arrays.items():
-        assert again[name].tobytes() == array.tobytes()
-
-
 def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     arrays, _ = load(halfway)
     worlds = arrays["crash_worlds"]
@@ -179,20 +160,19 @@ class Watching(SerialPool):
 
     def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
         outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
-        self.seen = task, recipes, asked, outcome
+        self.seen = recipes, outcome
         return outcome
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(maps, settings, after):
-    """Also with the leader beside them, and two on trial: each is told the same as somebody who drives alone."""
+    """Also with leader and candidate beside them: results are those of each driving alone."""
     evolution = begin(maps, dataclasses.replace(settings, population=50))
     for _ in range(after):
         go_on(evolution)
-    if after == 2:  # one in each stage
-        two = np.random.default_rng(1).normal(size=(2, GENES)).astype(np.float32)
-        evolution.trials.first, evolution.trials.last = two[:1], two[1:]
+    eager(evolution)
+    candidate = evolution.candidate()
     told: dict[str, np.ndarray] = {}
     tell, evolution.search.tell = evolution.search.tell, lambda score: told.update(score=score)
     pool = evolution.pool = Watching(maps.build)
@@ -200,7 +180,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     limits, long = curriculum.limits(), curriculum.leader_limits()
     episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
     row = evolution.step()
-    task, recipes, _, outcome = pool.seen
+    recipes, outcome = pool.seen
     asked = evolution.search.asked
     groups, e = asked.groups, len(episodes.rows) // len(asked.groups)
     assert len(groups) == config.groups == 3
@@ -234,26 +214,15 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert row["distance_m/best"] == led["distance"].mean()
         assert row["fitness/best"] == evolution._score(alone.results, long.target)[0]
         assert row["fitness/mean"] == score.mean()
-    if after == 2:
-        assert len(recipes) == 53
-        validation = curriculum.validation().with_limits(curriculum.goal_limits())
-        alone = evolution.drive("alone", first_two(task, recipes), validation, curriculum.goal_limits())
-        tried = outcome.results[51:, -config.validation :]
-        assert tried[0, :4].tobytes() == alone.results[0, :4].tobytes()
-        assert tried[1, 4:].tobytes() == alone.results[1, 4:].tobytes()
-        assert not tried[0, 4:]["steps"].any()
-        assert not tried[1, :4]["steps"].any()
+        assert len(recipes) == 52
+        validation = evolution.drive("alone", candidate[None], curriculum.validation(), curriculum.goal_limits())
+        assert validation.results[0].tobytes() == outcome.results[51, -config.validation :].tobytes()
+        assert evolution.champion.success_rate == (validation.results["end"] == End.SUCCESS).mean()
     assert outcome.whole()
     tell(score)
 
 
-def first_two(task, recipes):
-    """The genomes of the last two members."""
-    return breed(task.parents, recipes[-2:], task.key, PolicySpec.parse(task.policy), task.mutation)
-
-
-def test_who_leads_is_what_the_search_knows(maps):
-    """A generation's elite is the genome that was best known before it."""
+def test_the_elite_of_a_generation_is_the_centre_before_it(maps):
     evolution = begin(maps)
     go_on(evolution)
     for _ in range(2):
@@ -262,57 +231,24 @@ def test_who_leads_is_what_the_search_knows(maps):
         assert evolution.elites[-1].tobytes() == centre.tobytes()
 
 
-def test_champions_are_looked_for_when_the_leader_does_well(maps):
+def test_a_candidate_is_validated_when_the_leader_does_well(maps):
     evolution = begin(maps)
+    go_on(evolution)
     config = evolution.curriculum.config
     evolution.history = [{"leader/success_rate": config.promising}] * config.latest
     evolution.car_steps = 1000
-    assert evolution._promising()
-    for spoil in (
-        lambda: setattr(evolution, "validation_steps", 251),
-        lambda: evolution.history.append({"leader/success_rate": config.promising - 0.01}),
-        lambda: setattr(evolution, "champion", champion_of_rate(config.promising + 0.1)),
-        lambda: evolution.trials.add_candidates(np.zeros((1, GENES), dtype=np.float32), 0),
+    for name, value in (
+        ("validation_steps", 251),
+        ("history", [*evolution.history, {"leader/success_rate": config.promising - 0.01}]),
+        ("history", evolution.history[1:]),  # not in enough generations yet
+        ("champion", Champion(np.zeros(GENES, np.float32), 0.6, success_rate=config.promising + 0.1)),
+        ("tried", evolution.candidate()),
     ):
-        before = evolution.validation_steps, list(evolution.history), evolution.champion
-        spoil()
+        assert evolution._promising()
+        before = getattr(evolution, name)
+        setattr(evolution, name, value)
         assert not evolution._promising()
-        evolution.validation_steps, evolution.history, evolution.champion = before
-    evolution.trials.first = evolution.trials.first[:0]
-    assert evolution._promising()
-    evolution.history = evolution.history[: config.latest - 1]
-    assert not evolution._promising()  # not in so many generations yet
-
-
-def champion_of_rate(rate):
-    return Champion(np.zeros(GENES, dtype=np.float32), rate, rate, 100.0, 0)
-
-
-def test_validation_takes_no_more_than_its_share(maps):
-    """It waits until what it took is a quarter of all, and one trial more."""
-    evolution = begin(maps)
-    curriculum = evolution.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, promising=0.0, latest=1, validation_share=0.25)
-    began = []
-    for _ in range(8):
-        share = evolution.validation_steps / max(evolution.car_steps, 1)
-        before = len(evolution.trials.first)
-        go_on(evolution)
-        if len(evolution.trials.first) and not before:
-            began.append(evolution.validation_steps / evolution.car_steps)
-        assert share <= 1.0
-    assert began
-    assert max(began) <= 0.25
-    assert 0 < evolution.validation_steps < evolution.car_steps
-
-
-def test_who_was_tried_is_not_tried_again(maps):
-    evolution = begin(maps)
-    genomes = np.random.default_rng(1).normal(size=(3, GENES)).astype(np.float32)
-    evolution.trials.add_candidates(genomes[[0, 1, 0]], 0)
-    assert len(evolution.trials.first) == 2
-    evolution.trials.add_candidates(genomes, 1)
-    assert evolution.trials.first.tobytes() == genomes[2:].tobytes()
+        setattr(evolution, name, before)
 
 
 def test_training_is_among_more_cars_than_validation(maps):
@@ -327,122 +263,16 @@ def test_training_is_among_more_cars_than_validation(maps):
     assert there[:, : SETTINGS.traffic].mean() > 0.95
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [lambda w: w[:-1], lambda w: w[:, :2], lambda w: w[..., :-1], lambda w: w.astype(np.float64), lambda w: w[0]],
-)
-def test_crash_worlds_that_do_not_fit_are_refused(maps, halfway, spoil):
-    arrays, meta = load(halfway)
-    arrays["crash_worlds"] = spoil(arrays["crash_worlds"])
-    with pytest.raises(CheckpointError, match="does not belong to this run"):
-        begin(maps).restore(arrays, meta)
-
-
-@pytest.mark.parametrize(
-    ("name", "field", "number"),
-    [
-        ("crash_worlds", LANE, -2.0),
-        ("crash_worlds", LANE, 0.5),
-        ("crash_worlds", NEXT, -1.0),
-        ("crash_worlds", ALONG, -1.0),
-        ("crash_worlds", SPEED, 1e9),
-        ("crash_worlds", FIELDS - 1, np.nan),
-        ("crashes", 0, 16.0),
-        ("crashes", 0, -1.0),
-        ("crashes", 0, 0.5),
-        ("crashes", 1, np.inf),
-    ],
-)
-def test_crashes_on_no_road_are_refused(maps, halfway, name, field, number):
-    arrays, meta = load(halfway)
-    there = arrays["crash_worlds"][..., LANE] >= 0
-    arrays[name] = arrays[name].copy()
-    arrays[name][there if name == "crash_worlds" else ..., field] = number
-    with pytest.raises(CheckpointError, match="does not belong to this run") as error:
-        begin(maps).restore(arrays, meta)
+@pytest.mark.parametrize("name", ["elites", "search_path", "crashes", "tried", "search", "generation", "champion"])
+def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, halfway, tmp_path, name):
+    path = run_folder(halfway, tmp_path)
+    arrays, meta = load(path / "checkpoint.npz")
+    arrays.pop(name, None)
+    meta.pop(name, None)
+    save(path / "checkpoint.npz", arrays, meta)
+    with pytest.raises(RunError, match=r"another version|not those of a run") as error:
+        go_on_in(path, maps)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(("field", "number"), [(LANE, 1e6), (NEXT, 1e6), (JUNCTION_BEHIND, 1e6), (ALONG, 1e4)])
-def test_a_crash_that_does_not_fit_its_map_is_refused_when_it_is_to_be_driven(maps, halfway, field, number):
-    arrays, meta = load(halfway)
-    arrays["crash_worlds"] = arrays["crash_worlds"].copy()
-    arrays["crash_worlds"][arrays["crash_worlds"][..., LANE] >= 0, field] = number
-    evolution = begin(maps)
-    evolution.restore(arrays, meta)
-    with pytest.raises(CrashError, match=r"a crash in the checkpoint does not fit map \d+: traffic's ") as error:
-        evolution.step()
-    assert "\n" not in str(error.value)
-
-
-def test_a_checkpoint_of_another_traffic_is_refused(maps, halfway):
-    with pytest.raises(CheckpointError, match="does not belong to this run"):
-        begin(maps, dataclasses.replace(SETTINGS, traffic=4)).restore(*load(halfway))
-
-
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("trials_first", lambda a: np.zeros((MAX_TRIED + 1, GENES), np.float32)),
-        ("trials_first", lambda a: np.zeros(GENES, np.float32)),
-        ("trials_last", lambda a: np.zeros((2, GENES), np.float32)),
-        ("trials_tried", lambda a: np.zeros(257, np.uint64)),
-        ("trials_tried", lambda a: np.zeros(2, np.int64)),
-        ("search_centre", lambda a: a[:-1]),
-        ("search_centre", lambda a: a.astype(np.float32)),
-        ("search_path", lambda a: np.full(GENES, np.nan)),
-        ("search_variances", lambda a: np.zeros(GENES)),
-        ("champion", lambda a: np.zeros(GENES, np.float32)),  # of which nothing is known
-        ("elites", lambda a: np.concatenate([a, a])),
-        ("trials", lambda m: [math.inf, 1]),
-        ("trials", lambda m: [1]),
-        ("generation", lambda m: math.inf),
-        ("generation", lambda m: 1),
-        ("car_steps", lambda m: math.inf),
-        ("search", lambda m: {"sigma": 0.0}),
-        ("search", lambda m: {"sigma": math.nan}),
-        ("search", lambda m: {"sigma": None}),
-        ("search", lambda m: {}),
-        ("search", lambda m: []),
-        ("target", lambda m: 149.0),
-        ("target", lambda m: 1e9),
-        ("target", lambda m: math.nan),
-        ("champion", lambda m: [0.5, 0.5, 100.0, 0]),  # of which there are no genes
-        ("solved", lambda m: True),  # without a champion
-    ],
-)
-def test_states_that_no_run_has_are_refused(maps, halfway, name, change):
-    arrays, meta = load(halfway)
-    part = meta if name in meta and (name != "champion" or isinstance(change(arrays[name]), list)) else arrays
-    part[name] = change(part[name])
-    with pytest.raises(CheckpointError, match="does not belong to this run") as error:
-        begin(maps).restore(arrays, meta)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("search_parents", np.zeros((67, GENES), np.float32)),  # 2 elites and 64
-        ("search_parents", np.zeros((2, GENES), np.float32)),  # elites alone
-        ("search_parents", np.zeros((66, GENES), np.float64)),
-        ("search", {"elites": 3}),
-        ("search", {"elites": math.inf}),
-    ],
-)
-def test_states_that_no_run_of_two_parents_has_are_refused(maps, name, value):
-    evolution = begin(maps, TWO)
-    go_on(evolution)
-    arrays, meta = evolution.state()
-    begin(maps, TWO).restore(arrays, meta)
-    (arrays if name in arrays else meta)[name] = value
-    with pytest.raises(CheckpointError, match="does not belong to this run"):
-        begin(maps, TWO).restore(arrays, meta)
-
-
-def test_a_state_of_another_search_is_refused(maps, halfway):
-    with pytest.raises(CheckpointError, match="does not belong to this run"):
-        begin(maps, TWO).restore(*load(halfway))
 
 
 def run_folder(halfway, path, **changed):
@@ -453,23 +283,6 @@ def run_folder(halfway, path, **changed):
     meta |= {"digest": run.digest(), "tracking": {"uri": "sqlite:///m.db", "run_id": None, "key": "k"}, **changed}
     save(path / "checkpoint.npz", arrays, meta)
     return path
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("generation", math.inf),
-        ("car_steps", None),
-        ("solved", "no"),
-        ("tracking", []),
-        ("tracking", {"uri": 1, "run_id": None, "key": "k"}),
-    ],
-)
-def test_a_checkpoint_with_other_parts_is_refused_in_one_line(halfway, tmp_path, name, value):
-    path = run_folder(halfway, tmp_path, **{name: value})
-    with pytest.raises(RunError, match="not those of a run") as error:
-        open_run(path)
-    assert "\n" not in str(error.value)
 
 
 class InterruptedOnce(Session):
@@ -490,7 +303,7 @@ def go_on_in(path, maps, session=Session):
     tracker = make_tracker(run, f"sqlite:///{path}/m.db", "test")
     resumed = session(run, SerialPool(maps.build), maps, tracker, time.perf_counter())
     curriculum = resumed.learning.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, validation=8, first_validation=4)
+    curriculum.config = dataclasses.replace(curriculum.config, validation=8)
     return resumed
 
 
@@ -542,11 +355,11 @@ def losing(maps, settings=SETTINGS, **rows):
 
 
 @pytest.mark.parametrize(("settings", "last"), [(SETTINGS, 24), (TWO, 9)], ids=["all", "two"])
-def test_who_was_lost_cannot_win_whatever_the_fitness(maps, settings, last):
-    """Not an elite, not a parent (where tournaments of lost ones alone are rare), not tried."""
+def test_lost_members_cannot_win_whatever_the_fitness(maps, settings, last):
+    """They are no elites, no parents (where tournaments of lost ones alone are rare) and no candidates."""
     evolution = losing(maps, settings, evolve=slice(3, last))
     go_on(evolution)
-    kept = [*evolution.search.candidates(), *evolution.elites, *evolution.trials.first]
+    kept = [evolution.candidate(), *evolution.elites]
     kept += list(getattr(evolution.search, "parents", []))
     assert len(evolution.pool.genomes) == last - 3 == evolution.lost_chunks
     assert not {genome.tobytes() for genome in evolution.pool.genomes} & {genome.tobytes() for genome in kept}
@@ -572,15 +385,12 @@ def test_where_all_are_lost_the_run_stops(maps):
         losing(maps, evolve=slice(0, None)).step()
 
 
-def test_who_was_lost_in_validation_is_no_champion(maps):
+def test_a_candidate_lost_in_validation_is_no_champion(maps):
     evolution = losing(maps, validate=slice(0, None))
     go_on(evolution)
     with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
         evolution.conclude()
     assert evolution.champion is None
-
-
-# --- A fitness of one's own ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
