@@ -1,0 +1,136 @@
+"""The drive's page: one HTML file that plays drives in any browser, offline.
+
+Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, a row a channel; their
+differences from moment to moment are compressed. Positions are in 65,536ths of the map's sides and headings in
+65,536ths of a turn, so that both wrap as the torus and the angle do.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import os
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+import numpy as np
+
+from cluster.report.film import Recording
+from cluster.runs.checkpoint import write_atomic
+from gridsim.car.ego import DISTANCE, SPEED
+from gridsim.car.vehicle import Action
+from gridsim.config import SimConfig, constants
+from gridsim.maps.map import Map
+from gridsim.maps.roads import clearances, freeze
+from gridsim.view.marks import lane_marks
+
+TURN = 1 << 16
+PIXELS_PER_M, MOST_PIXELS = 4.0, 2048
+OFF_ROAD, ROAD = (223, 228, 220), (112, 120, 126)  # colours
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A drive on a page.
+
+    Attributes:
+        label: whose it is.
+        short: the same, beside its car.
+        drive: the recording.
+        outputs: float32 [steps + 1, 8], the network's, or None.
+        stride: control steps from moment to moment of the page; rays and outputs are shown if it is 1.
+    """
+
+    label: str
+    short: str
+    drive: Recording
+    outputs: np.ndarray | None = None
+    stride: int = 1
+
+    def packed(self) -> dict[str, object]:
+        """It, as the page's script reads it."""
+        drive, size = self.drive, (self.drive.scenario.road.width, self.drive.scenario.road.height)
+        cars, boxes = drive.cars[:: self.stride], drive.boxes[:: self.stride]
+        channels = [
+            *_place(cars, size),
+            np.clip(cars[:, SPEED], 0.0, None) * 100.0,
+            cars[:, DISTANCE] * 10.0,
+        ]
+        for k in range(boxes.shape[1]):
+            channels += _place(boxes[:, k], size)
+        rays = outputs = 0
+        if self.stride == 1:
+            rays = drive.ranges.shape[1]
+            channels += [ray * 100.0 for ray in drive.ranges.T]
+            if self.outputs is not None:
+                outputs = self.outputs.shape[1]
+                low, high = self.outputs.min(axis=1, keepdims=True), self.outputs.max(axis=1, keepdims=True)
+                channels += list(((self.outputs - low) / np.maximum(high - low, 1e-9) * (TURN - 1)).T)
+        numbers = np.rint(channels).astype(np.int64).astype("<u2")
+        series = np.diff(numbers, axis=1, prepend=np.zeros((len(numbers), 1), dtype="<u2"))
+        return {
+            "label": self.label,
+            "short": self.short,
+            "end": drive.end.name.lower(),
+            "period": drive.period * self.stride,
+            "cars": boxes.shape[1],
+            "rays": rays,
+            "outputs": outputs,
+            "series": base64.b64encode(zlib.compress(series.tobytes(), 9)).decode(),
+        }
+
+
+def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
+    """Channels x, y and heading of cars [n, 4 or more]: x, y (m), heading (cosine, sine)."""
+    x, y, cosine, sine = cars[:, :4].T.astype(float)
+    return [x / size[0] * TURN, y / size[1] * TURN, np.arctan2(sine, cosine) / math.tau * TURN]
+
+
+def write_page(path: str | os.PathLike[str], title: str, shown: Sequence[Shown], config: SimConfig) -> None:
+    """Write a page of drives on one map, at first with the last of them. Raises: CheckpointError with one line."""
+    road_map, constant = shown[-1].drive.scenario, constants(config)
+    data = {
+        "title": title,
+        "width": float(road_map.road.width),
+        "height": float(road_map.road.height),
+        "torus": road_map.torus,
+        "interval": [float(road_map.road.speed_low), float(road_map.road.speed_high)],
+        "fastest": 1.2 * float(road_map.road.speed_high),
+        "car": [config.vehicle.length, config.vehicle.width],
+        "sensor": float(constant.front_axle),
+        "fan": [float(constant.ray_first), float(constant.ray_step)],
+        "actions": [action.name.lower().replace("_", " ") for action in Action],
+        "marks": _marks(road_map),
+        "picture": base64.b64encode(_picture(road_map)).decode(),
+        "first": len(shown) - 1,
+        "drives": [each.packed() for each in shown],
+    }
+    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+    page = files("cluster.report").joinpath("drive.html").read_text(encoding="utf-8")
+    write_atomic(path, page.replace('type="application/json">{}<', f'type="application/json">{text}<').encode())
+
+
+def _marks(road_map: Map) -> list[list[float]]:
+    """Lane marks as centre x, y (m) and half of the dash dx, dy (m)."""
+    x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
+    return np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist()
+
+
+def _picture(road_map: Map) -> bytes:
+    """The map as a PNG, its road with smooth edges; the first row is the map's upper side."""
+    from matplotlib.image import imsave
+
+    width, height = float(road_map.road.width), float(road_map.road.height)
+    scale = min(PIXELS_PER_M, MOST_PIXELS / max(width, height))
+    columns, rows = round(width * scale), round(height * scale)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) / scale, height - (np.arange(rows) + 0.5) / scale)
+    points = freeze(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32))
+    share = np.clip(clearances(road_map.road, points) * scale + 0.5, 0.0, 1.0).reshape(rows, columns, 1)
+    colours = np.array(OFF_ROAD) + share * (np.array(ROAD) - np.array(OFF_ROAD))
+    picture = io.BytesIO()
+    imsave(picture, (np.rint(colours / 4.0) * 4.0).astype(np.uint8), format="png")  # fewer colours: a smaller file
+    return picture.getvalue()

@@ -1,0 +1,65 @@
+"""The drive's page: what a browser reads from it is the drive."""
+
+import base64
+import json
+import re
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cluster.report.film import record
+from cluster.report.page import Shown, write_page
+from cluster.runs.champion import load_champion
+from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, X, Y
+from gridsim.maps.map import sample_starts
+from gridsim.maps.scenarios import build
+from gridsim.traffic.world import spawn
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def read(path):
+    """A page's data."""
+    found = re.search(r'<script id="data" type="application/json">(.*)</script>', path.read_text())
+    assert found is not None
+    return json.loads(found[1])
+
+
+def channels(drive):
+    """A drive's channels [channels, moments]: sums of differences that wrap at 16 bits, as the script has them."""
+    count = 5 + 3 * drive["cars"] + drive["rays"] + drive["outputs"]
+    series = np.frombuffer(zlib.decompress(base64.b64decode(drive["series"])), dtype="<u2").reshape(count, -1)
+    return np.cumsum(series, axis=1, dtype=np.uint16).astype(float)
+
+
+def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
+    champion = load_champion(ROOT / "benchmarks/champion_traffic.npz")
+    road_map = build("seamless", 2_000_000)
+    start = sample_starts(road_map, 1, np.random.default_rng(1))
+    world = spawn(road_map.network, start, 3, np.array([1]), champion.sim.traffic)[0]
+    drive = record(champion, road_map, start[0], 60.0, world)
+    outputs = np.random.default_rng(2).normal(size=(len(drive.cars), 8)).astype(np.float32)
+    title = "</script><script>alert(1)</script>"  # a name of the user's own
+    shown = [Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive, outputs)]
+    write_page(tmp_path / "drive.html", title, shown, champion.sim)
+    assert (tmp_path / "drive.html").stat().st_size < 1_500_000
+    assert "http://" not in (tmp_path / "drive.html").read_text()
+    data = read(tmp_path / "drive.html")
+    assert data["title"] == title
+    for each, stride in zip(data["drives"], (2, 1), strict=True):
+        found, cars, boxes = channels(each), drive.cars[::stride], drive.boxes[::stride]
+        for first, states in ((0, cars), *((5 + 3 * k, boxes[:, k]) for k in range(boxes.shape[1]))):
+            for offset, field, size in ((0, X, data["width"]), (1, Y, data["height"])):
+                off = found[first + offset] / 65536 * size - states[:, field]
+                assert np.abs(off - np.round(off / size) * size).max() < 0.01
+            turned = found[first + 2] / 65536 * 2 * np.pi
+            assert np.abs(np.cos(turned) - states[:, COS]).max() < 1e-3
+            assert np.abs(np.sin(turned) - states[:, SIN]).max() < 1e-3
+        assert found[3] / 100 == pytest.approx(np.maximum(cars[:, SPEED], 0.0), abs=0.006)
+        assert found[4] / 10 == pytest.approx(cars[:, DISTANCE], abs=0.06)
+        assert each["period"] == pytest.approx(0.1 * stride)
+    first = 5 + 3 * boxes.shape[1]
+    np.testing.assert_allclose(found[first : first + 31].T / 100, drive.ranges, atol=0.006)
+    assert (found[first + 31 :].argmax(axis=0) == outputs.argmax(axis=1)).all()
