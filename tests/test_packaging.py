@@ -45,10 +45,10 @@ def test_every_folder_is_a_package_and_typed(root: Path) -> None:
     assert [top for top in sorted(tops) if not (root / top / "py.typed").is_file()] == []
 
 
-def test_cluster_files_are_packaged(root: Path) -> None:
+def test_files_that_are_no_python_are_packaged(root: Path) -> None:
     patterns = PROJECT["tool"]["setuptools"]["package-data"]["cluster"]
     packaged = {path.name for pattern in patterns for path in (root / "cluster").glob(pattern)}
-    assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml"}
+    assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml", "drive.html"}
 
 
 def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path) -> None:

@@ -53,7 +53,8 @@ class Shown:
 
     def packed(self) -> dict[str, object]:
         """It, as the page's script reads it."""
-        drive, size = self.drive, (self.drive.scenario.road.width, self.drive.scenario.road.height)
+        drive, road = self.drive, self.drive.scenario.road
+        size = float(road.width), float(road.height)
         cars, boxes = drive.cars[:: self.stride], drive.boxes[:: self.stride]
         channels = [
             *_place(cars, size),
