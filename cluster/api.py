@@ -1,47 +1,71 @@
-"""GridSim from Python, without folders or MLflow: evolve with a fitness of one's own, load, drive, evaluate.
+"""GridSim from Python, without folders or MLflow: train with a fitness of one's own, load, drive, evaluate.
 
->>> from cluster.api import evaluate, evolve, load_champion
+`import gridsim` has all of this: `gridsim.evolve(scenario="city", workers=2)`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from cluster.runs.champion import Champion, evaluate, load_champion
-from cluster.runs.settings import EvolveSettings
+from cluster.runs.run import new_learning
+from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool, WorkerPool
 from gridsim.config import SimConfig
 
-__all__ = ["Champion", "EvolveSettings", "evaluate", "evolve", "load_champion"]
+__all__ = ["Champion", "DqnSettings", "EvolveSettings", "evaluate", "evolve", "load_champion", "train_dqn"]
 
 Fitness = Callable[[np.ndarray, np.ndarray | float], np.ndarray]
+OnStep = Callable[[int, dict[str, float]], None]
+Trained = tuple[Champion, list[dict[str, float]]]
 
 
 def evolve(
     settings: EvolveSettings | None = None,
     fitness: Fitness | None = None,
     workers: int = 0,
-    on_generation: Callable[[int, dict[str, float]], None] | None = None,
-) -> tuple[Champion, list[dict[str, float]]]:
+    on_generation: OnStep | None = None,
+    **flags: Any,
+) -> Trained:
     """Evolve a driver in memory.
 
+    >>> import gridsim
+    >>> champion, history = gridsim.evolve(scenario="curved", population=32, generations=2)
+    >>> len(history)
+    2
+
     Args:
-        settings: as the command's flags; default all of theirs.
+        settings: as the command's flags; or give those by name, such as scenario="city".
         fitness: scores float64 [n], greater is better, from the episodes' results (structured, [n, episodes], with
             fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.car.ego.End`)) and
             the episodes' targets (m). It runs here, never in the workers. Default: `evolution.search.fitness.scalar`.
         workers: Ray workers on this machine; 0 evaluates in this process.
-        on_generation: told the number of generations done and the last one's figures.
+        on_generation: called with the number of generations done and the last one's figures.
 
     Returns: the champion, and the history, a row of figures for each generation, by the names of a run's history.csv:
     `.../mean` is of all members on training's episodes, `.../best` of the best genome so far on episodes of its own.
     Raises: SettingsError, PoolError with one line.
     """
-    settings = settings or EvolveSettings()
+    return _train(settings or EvolveSettings(**flags), workers, on_generation, fitness)
+
+
+def train_dqn(
+    settings: DqnSettings | None = None, workers: int = 0, on_evaluation: OnStep | None = None, **flags: Any
+) -> Trained:
+    """Train a driver by deep Q-learning, in memory. As `evolve`; the history has a row for each evaluation.
+
+    >>> import gridsim
+    >>> champion, history = gridsim.train_dqn(scenario="curved", car_steps=1000)
+    """
+    return _train(settings or DqnSettings(**flags), workers, on_evaluation)
+
+
+def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:
     settings.check()
     maps = Maps(settings.scenario, SimConfig())
     pool: WorkerPool
@@ -52,19 +76,18 @@ def evolve(
     else:
         pool = SerialPool(maps.build)
     try:
-        evolution = Evolution(settings, pool, maps)
-        if fitness is not None:
-            evolution.score = fitness
-        while not evolution.done():
-            row = evolution.step()
-            if on_generation:
-                on_generation(evolution.generation, row)
-        evolution.conclude()
-        assert evolution.champion is not None
-        champion = Champion(
-            evolution.champion.genome, settings.policy, settings.scenario, evolution.sim, settings.traffic
-        )
-        return champion, evolution.history
+        learning = new_learning(settings, pool, maps)
+        if fitness is not None and isinstance(learning, Evolution):
+            learning.score = fitness
+        while not learning.done():
+            row = learning.step()
+            if on_step:
+                on_step(learning.steps, row)
+        learning.conclude()
+        assert learning.champion is not None
+        genome = learning.champion.genome
+        champion = Champion(genome, settings.policy, settings.scenario, learning.sim, settings.traffic)
+        return champion, learning.history
     finally:
         pool.close()
         maps.close()

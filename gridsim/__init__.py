@@ -2,7 +2,13 @@
 
 Importing it registers the Gymnasium environments. That takes milliseconds, because Numba and the maps are loaded only
 when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
+
+`gridsim.evolve` and the others of `cluster.api` are looked up there when they are first used: everybody looks for them
+here, and the simulator does not import what trains in it.
 """
+
+from importlib import import_module as _import_module
+from typing import Any as _Any
 
 from gymnasium.envs.registration import register as _register
 
@@ -15,6 +21,9 @@ ENVIRONMENTS = {
 }
 """The scenario of each environment id."""
 
+_API_MODULE = "cluster.api"
+_API = ("Champion", "DqnSettings", "EvolveSettings", "evaluate", "evolve", "load_champion", "train_dqn")
+
 for _id, _scenario in ENVIRONMENTS.items():
     _register(
         id=_id,
@@ -22,3 +31,13 @@ for _id, _scenario in ENVIRONMENTS.items():
         vector_entry_point="gridsim.envs.env:GridSimVectorEnv",
         kwargs={"scenario": _scenario},
     )
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _API:
+        return getattr(_import_module(_API_MODULE), name)
+    raise AttributeError(f"module 'gridsim' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_API]

@@ -1,10 +1,13 @@
 """GridSim from Python: the three lines, evaluate, and a fitness of one's own."""
 
 import dataclasses
+import doctest
 
 import numpy as np
 import pytest
 
+import gridsim
+from cluster import api
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
 from cluster.runs.checkpoint import CheckpointError, save
 from cluster.runs.run import RunFolder
@@ -201,3 +204,12 @@ def test_a_champion_of_the_grid_drives_what_its_environment_shows(frames, seer):
 
 def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):
     assert evolve(ON_THE_GRID, workers=2)[0].sha256 == seer.sha256
+
+
+def test_gridsim_itself_has_the_python_api_and_its_examples_run():
+    assert {name for name in api.__all__ if getattr(gridsim, name) is getattr(api, name)} == set(api.__all__)
+    assert set(api.__all__) < set(dir(gridsim))
+    with pytest.raises(AttributeError, match="no attribute 'evolv'"):
+        gridsim.evolv  # type: ignore[attr-defined]  # noqa: B018
+    done = doctest.testmod(api)
+    assert (done.attempted >= 5, done.failed) == (True, 0)
