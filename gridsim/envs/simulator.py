@@ -6,15 +6,14 @@ What one car does in a control period is in `ego.py`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import leaf, njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
 from gridsim.maps.roads import VISIT_CELL, Road
@@ -23,125 +22,78 @@ from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic.world import check_worlds, spawn
 
-_F = np.float32
-_ZERO = _F(0.0)
-
 ACTIONS = len(Action)
 
 
-@njit
-def _place_some(road, constants, fan, order, which, starts, cars, visits, worlds, beams, ranges, closing):
-    for k in order:
-        i = which[k]
-        place(road, starts[k], cars[i], visits[i])
-        if worlds is not None:
-            look(road, constants, fan, cars[i], worlds[i], beams, ranges[k], closing[i])
-        else:
-            look(road, constants, fan, cars[i], None, beams, ranges[k], None)
+class Physics(NamedTuple):
+    """What is the same for all cars, as kernels read it; arrays are read-only."""
+
+    atlas: Atlas
+    constants: Constants
+    drivers: Drivers
+    fan: np.ndarray
+
+
+class State(NamedTuple):
+    """A batch of cars; arrays with one leading axis, one row a car. Copy the arrays to keep a state."""
+
+    cars: np.ndarray  # float32 [n, ego.FIELDS]
+    visits: np.ndarray  # float32 [n, cells], odometer (m) when the car was last in each visit cell of its map
+    maps: np.ndarray  # int32 [n], index of the car's map among the simulator's scenarios
+    ends: np.ndarray  # uint8 [n], End
+    worlds: np.ndarray  # float32 [n, traffic, world.FIELDS], the other cars around each
+
+
+@leaf
+def step_car(road, network, constants, drivers, car, visits, world, acceleration, steering, target, max_steps):
+    """One control step of a car, and before it of the traffic around it. Returns an End as a number."""
+    if world is not None:
+        flow(network, drivers, world, car)
+    car[STEERING] = steering
+    return control(road, constants, car, visits, world, acceleration, target, max_steps)
 
 
 @njit(nogil=True)
-def _place_all(atlas, constants, fan, order, runs, which, starts, cars, visits, worlds, ranges, closing):
+def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
     beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
-        road = road_of(atlas, row)
-        _place_some(
-            road, constants, fan, order[first:last], which, starts, cars, visits, worlds, beams, ranges, closing
-        )
-
-
-@njit
-def _control_some(
-    road,
-    network,
-    constants,
-    drivers,
-    fan,
-    order,
-    actions,
-    target,
-    max_steps,
-    cars,
-    visits,
-    worlds,
-    ends,
-    beams,
-    ranges,
-    closing,
-    speeds,
-    progress,
-):
-    for i in order:
-        car = cars[i]
-        progress[i] = _ZERO
-        if ends[i] == 0:
-            before = car[DISTANCE]
-            if actions.ndim == 1:
-                acceleration, steering = act(constants, actions[i], car[SPEED], car[STEERING])
-            else:
-                acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
-            if worlds is not None:
-                flow(network, drivers, worlds[i], car)
-                car[STEERING] = steering
-                ends[i] = control(road, constants, car, visits[i], worlds[i], acceleration, target, max_steps)
-            else:
-                car[STEERING] = steering
-                ends[i] = control(road, constants, car, visits[i], None, acceleration, target, max_steps)
-            progress[i] = car[DISTANCE] - before
-        if worlds is not None:
-            look(road, constants, fan, car, worlds[i], beams, ranges[i], closing[i])
-        else:
-            look(road, constants, fan, car, None, beams, ranges[i], None)
-        speeds[i] = car[SPEED]
+        road = road_of(physics.atlas, row)
+        for k in order[first:last]:
+            i = which[k]
+            world = None if worlds is None else worlds[i]
+            place(road, starts[k], cars[i], visits[i])
+            look(road, physics.constants, physics.fan, cars[i], world, beams, ranges[k], closing[i])
 
 
 @njit(nogil=True)
-def _control_all(
-    atlas,
-    constants,
-    drivers,
-    fan,
-    order,
-    runs,
-    actions,
-    target,
-    max_steps,
-    cars,
-    visits,
-    worlds,
-    ends,
-    ranges,
-    closing,
-    speeds,
-    progress,
-):
-    """One control period of every car; who has ended stands still.
+def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen):
+    """One control period of every car; one whose episode has ended stands still.
 
     Cars are taken in `order`; runs int64 [maps, 3] says which map of the atlas a stretch of it is on: row, from, to.
+    seen: ranges and closing speeds [n, rays], speeds [n] and progress [n], to be filled.
     """
+    constants = physics.constants
+    ranges, closing, speeds, progress = seen
     beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
-        _control_some(
-            road_of(atlas, row),
-            network_of(atlas, row),
-            constants,
-            drivers,
-            fan,
-            order[first:last],
-            actions,
-            target,
-            max_steps,
-            cars,
-            visits,
-            worlds,
-            ends,
-            beams,
-            ranges,
-            closing,
-            speeds,
-            progress,
-        )
+        road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
+        for i in order[first:last]:
+            car = cars[i]
+            world = None if worlds is None else worlds[i]
+            before = car[DISTANCE]
+            if ends[i] == 0:
+                if actions.ndim == 1:
+                    acceleration, steering = act(constants, actions[i], car[SPEED], car[STEERING])
+                else:
+                    acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
+                ends[i] = step_car(
+                    road, network, constants, physics.drivers, car, visits[i], world, acceleration, steering, target,
+                    max_steps,
+                )  # fmt: skip
+            progress[i] = car[DISTANCE] - before
+            look(road, constants, physics.fan, car, world, beams, ranges[i], closing[i])
+            speeds[i] = car[SPEED]
 
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,25 +101,6 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(rows, kind="stable")
     names, first = np.unique(rows[order], return_index=True)
     return order, np.stack([names, first, np.append(first[1:], len(rows))], axis=1).astype(np.int64)
-
-
-@dataclass(frozen=True)
-class State:
-    """A batch of cars; arrays with one leading axis, one row a car. Copy the arrays to keep a state.
-
-    Attributes:
-        cars: float32 [n, FIELDS], the fields above.
-        visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
-        maps: int32 [n], index of the car's map among the simulator's scenarios.
-        ends: uint8 [n], End.
-        worlds: float32 [n, traffic, world.FIELDS], the other cars around each.
-    """
-
-    cars: np.ndarray
-    visits: np.ndarray
-    maps: np.ndarray
-    ends: np.ndarray
-    worlds: np.ndarray
 
 
 class Simulator:
@@ -186,10 +119,9 @@ class Simulator:
         max_steps: int | None = None,
         traffic: int = 0,
     ):
-        """Make room for `cars` cars; `target` (m) and `max_steps` (control steps) are the configuration's unless given.
+        """Make room for `cars` cars, each with a world of `traffic` other cars.
 
-        Each car has a world of its own, with `traffic` other cars in it.
-
+        `target` (m) and `max_steps` (control steps) are the configuration's unless given.
         Raises: ValueError with one line where a number makes no sense.
         """
         self.config = config or SimConfig()
@@ -202,11 +134,9 @@ class Simulator:
             raise ValueError(f"there are 0 other cars or more, not {traffic}")
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode has a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
-        self._limit = _F(self.target)
+        constants(self.config)  # raises for a wrong configuration
         self.scenarios = list(scenarios)
-        self._constants: Constants = constants(self.config)
-        self._drivers: Drivers = drivers(self.config)
-        self._fan = fan(self.config.sensors.rays, self._constants.ray_first, self._constants.ray_step)
+        rays = self.config.sensors.rays
         self.state = State(
             cars=np.zeros((cars, FIELDS), dtype=np.float32),
             visits=np.zeros((cars, 0), dtype=np.float32),
@@ -215,20 +145,15 @@ class Simulator:
             worlds=np.zeros((cars, traffic, TRAFFIC_FIELDS), dtype=np.float32),
         )
         #: float32 [n, rays]: m/s at which what each ray last met came closer over ground; 0 for the road's edge.
-        self.closing = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
-        self._atlas: Atlas | None = None  # maps that cars are on; None before the first reset
-        self._shown: list[Map] = []  # what the atlas shows
+        self.closing = np.zeros((cars, rays), dtype=np.float32)
+        self._physics: Physics | None = None  # made when a kernel first needs it
+        self._charted: list[Map] = []  # the maps in its atlas
         self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
-        self._order, self._runs = _by_map(self._rows)
+        self._groups = _by_map(self._rows)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without arrays that are read-only: copies of them are not, and kernels would be compiled anew for these."""
-        return {**vars(self), "_atlas": None, "_fan": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._fan = fan(self.config.sensors.rays, self._constants.ray_first, self._constants.ray_step)
-        self._lay_out()
+        """Without read-only arrays: their copies can be written to, and kernels would be compiled anew for these."""
+        return {**vars(self), "_physics": None}
 
     def __len__(self) -> int:
         return len(self.state.ends)
@@ -271,53 +196,49 @@ class Simulator:
         rows = self._chart(maps, everyone=len(cars) == n)
         cells = max(_visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
-            visits = np.full((n, cells), -1e6, dtype=np.float32)
-            visits[:, : self.state.visits.shape[1]] = self.state.visits
-            self.state = replace(self.state, visits=visits)
+            more = ((0, 0), (0, cells - self.state.visits.shape[1]))
+            self.state = self.state._replace(visits=np.pad(self.state.visits, more, constant_values=-1e6))
         state = self.state
         if traffic is not None:
             state.worlds[cars] = traffic
         _place_all(
-            self._atlas,
-            self._constants,
-            self._fan,
-            *_by_map(rows),
-            cars,
-            starts,
-            state.cars,
-            state.visits,
-            self._traffic_or_none(),
-            ranges,
-            self.closing,
-        )
+            self._kernel_physics(), *_by_map(rows), cars, starts, state.cars, state.visits, self._kernel_worlds(),
+            ranges, self.closing,
+        )  # fmt: skip
         state.maps[cars] = maps
         state.ends[cars] = End.RUNNING
         if (self._rows[cars] != rows).any():
             self._rows[cars] = rows
-            self._order, self._runs = _by_map(self._rows)
+            self._groups = _by_map(self._rows)
         return ranges, starts[:, 3].copy()
 
-    def _traffic_or_none(self) -> np.ndarray | None:
-        """The worlds as kernels take them."""
+    def _kernel_worlds(self) -> np.ndarray | None:
         return self.state.worlds if self.state.worlds.shape[1] else None
+
+    def _kernel_physics(self) -> Physics:
+        if self._physics is None:
+            k, rays = constants(self.config), self.config.sensors.rays
+            atlas = make_atlas([each.road for each in self._charted], [each.network for each in self._charted])
+            self._physics = Physics(atlas, k, drivers(self.config), fan(rays, k.ray_first, k.ray_step))
+        return self._physics
 
     def _traffic(
         self, starts: np.ndarray, maps: np.ndarray, keys: np.ndarray | int, worlds: np.ndarray | None
     ) -> np.ndarray:
         """The traffic [k, traffic, FIELDS] that episodes begin with."""
-        count = self.state.worlds.shape[1]
+        shape = (len(starts), *self.state.worlds.shape[1:])
         if worlds is not None:
             worlds = np.asarray(worlds, dtype=np.float32)
-            if worlds.shape != (len(starts), count, TRAFFIC_FIELDS):
-                raise ValueError(f"traffic must be {len(starts)} worlds of {count} cars, not {worlds.shape}")
+            if worlds.shape != shape:
+                raise ValueError(f"traffic must be {shape[0]} worlds of {shape[1]} cars, not {worlds.shape}")
             for m in np.unique(maps):
                 check_worlds(worlds[maps == m], self.scenarios[m].network)
             return worlds
         keys = np.broadcast_to(np.asarray(keys, dtype=np.uint64), maps.shape)
-        spawned = np.empty((len(starts), count, TRAFFIC_FIELDS), dtype=np.float32)
+        spawned = np.empty(shape, dtype=np.float32)
         for m in np.unique(maps):
             of = np.flatnonzero(maps == m)
-            spawned[of] = spawn(self.scenarios[m].network, starts[of], count, keys[of], self.config.traffic)
+            spawned[of] = spawn(self.scenarios[m].network, starts[of], shape[1], keys[of], self.config.traffic)
         return spawned
 
     def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:
@@ -326,18 +247,13 @@ class Simulator:
         One car alone is always on an atlas of one map, which is no copy.
         """
         wanted = {m: self.scenarios[m] for m in np.unique(maps).tolist()}
-        shown = [] if len(self) == 1 else self._shown
-        missing = [scenario for scenario in wanted.values() if not any(scenario is other for other in shown)]
+        kept = [] if len(self) == 1 else self._charted
+        missing = [scenario for scenario in wanted.values() if not any(scenario is other for other in kept)]
         if missing:
-            self._shown = list(wanted.values()) if everyone else shown + missing
-            self._lay_out()
-        row = {id(scenario): k for k, scenario in enumerate(self._shown)}
+            self._charted = list(wanted.values()) if everyone else kept + missing
+            self._physics = None
+        row = {id(scenario): k for k, scenario in enumerate(self._charted)}
         return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int64)
-
-    def _lay_out(self) -> None:
-        """Make the atlas of the maps that it shows."""
-        if self._shown:
-            self._atlas = make_atlas([shown.road for shown in self._shown], [shown.network for shown in self._shown])
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
@@ -347,32 +263,16 @@ class Simulator:
         this step, ends uint8 [n], End); arrays of the caller's own.
         Raises: ValueError with one line for anything but an action for each car; RuntimeError before the first reset.
         """
-        n = len(self)
-        if self._runs[0, 0] < 0:
+        n, state = len(self), self.state
+        if self._rows.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
         actions = checked_actions(actions, n)
-        state = self.state
-        ranges = np.empty((n, self.config.sensors.rays), dtype=np.float32)
+        ranges = np.empty_like(self.closing)
         speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)
         _control_all(
-            self._atlas,
-            self._constants,
-            self._drivers,
-            self._fan,
-            self._order,
-            self._runs,
-            actions,
-            self._limit,
-            self.max_steps,
-            state.cars,
-            state.visits,
-            self._traffic_or_none(),
-            state.ends,
-            ranges,
-            self.closing,
-            speeds,
-            progress,
-        )
+            self._kernel_physics(), *self._groups, actions, np.float32(self.target), self.max_steps, state.cars,
+            state.visits, self._kernel_worlds(), state.ends, (ranges, self.closing, speeds, progress),
+        )  # fmt: skip
         return ranges, speeds, progress, state.ends.copy()
 
 
@@ -411,11 +311,7 @@ def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
         return np.ascontiguousarray(np.clip(array, -1.0, 1.0), dtype=np.float32)
     if array.shape != (n,):
         raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")
-    if array.dtype.kind not in "iu":
-        wrong = f"{array.dtype} ({array[0]!s} is the first)"
-        raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {wrong}")
-    array = np.ascontiguousarray(array, dtype=np.int64)
-    if array.view(np.uint64).max() >= ACTIONS:  # what is below 0 is far above
-        wrong = array[(array < 0) | (array >= ACTIONS)][0]
-        raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {wrong}")
-    return array
+    wrong = (array < 0) | (array >= ACTIONS) if array.dtype.kind in "iu" else np.ones(n, dtype=np.bool_)
+    if wrong.any():
+        raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {array[wrong][0]}")
+    return np.ascontiguousarray(array, dtype=np.int64)
