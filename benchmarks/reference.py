@@ -8,10 +8,10 @@ import numpy as np
 
 from cluster.training.trainer import Maps, held_out_episodes
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
-from gridsim.car.ego import DISTANCE, PACED, End
+from gridsim.car.ego import DISTANCE, PACED, STEPS, End
 from gridsim.config import SimConfig
 from gridsim.maps.scenarios import REGISTRY
-from gridsim.reference.driver import ReferenceDriver
+from gridsim.reference.driver import drive_reference
 
 TRAFFIC = {"seamless": 6, "curved": 6}  # beside 0, where the scenario's default is none
 
@@ -31,19 +31,18 @@ def main() -> None:
         for cars in (0, spec.traffic or TRAFFIC[name]):
             episodes = held_out_episodes(maps, cars)
             scenarios = [maps.get(seed) for seed in episodes.maps]
-            driver = ReferenceDriver(scenarios)
             drives = [
-                driver.drive(scenarios[row["map"]], row["start"], world, k)
+                drive_reference(scenarios[row["map"]], row["start"], world, k)
                 for k, (row, world) in enumerate(
                     zip(episodes.rows[: options.episodes], episodes.worlds[: options.episodes], strict=True)
                 )
             ]
-            speeds = [drive.car[DISTANCE] / drive.time[-1] for drive in drives]
+            speeds = [drive.car[DISTANCE] / drive.car[STEPS] * 10.0 for drive in drives]
             paced = np.mean([drive.car[PACED] / drive.car[DISTANCE] for drive in drives])
             ends = [drive.end for drive in drives]
             low, high = spec.speed_interval
             bad = [
-                (k, end.name, len(d.time))
+                (k, end.name, len(d.poses))
                 for k, (end, d) in enumerate(zip(ends, drives, strict=True))
                 if end != End.SUCCESS
             ]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
 from gridsim.config import SimConfig, VehicleConfig
 from gridsim.maps.map import Map
-from gridsim.reference.routes import ReferenceConfig, profile, unwrapped
+from gridsim.reference.routes import BRAKING, DRIVEN_WINDOW, profile, unwrapped
 
 APART = 3.5  # m beside the recorded path, a lane's width, beyond which a drive has left it
 TURNED = math.radians(45.0)  # difference of headings beyond which it has
@@ -36,23 +35,14 @@ class Driven(NamedTuple):
     rows: np.ndarray  # int64 [n], indices of these states in the drive
 
 
-@dataclass(frozen=True)
-class Series:
-    """A drive and its reference at the same places of a route.
+class Series(NamedTuple):
+    """A drive and its reference at the same places of a route; float64 [n]."""
 
-    Attributes:
-        arc: float64 [n], m driven by the agent, increasing.
-        speed: float64 [n], m/s, the agent's.
-        reference_speed: float64 [n], m/s.
-        steering: float64 [n], rad, left positive, the agent's.
-        reference_steering: float64 [n], rad.
-    """
-
-    arc: np.ndarray
-    speed: np.ndarray
-    reference_speed: np.ndarray
-    steering: np.ndarray
-    reference_steering: np.ndarray
+    arc: np.ndarray  # m driven by the agent, increasing
+    speed: np.ndarray  # m/s, the agent's
+    reference_speed: np.ndarray  # m/s
+    steering: np.ndarray  # rad, left positive, the agent's
+    reference_steering: np.ndarray  # rad
 
     @property
     def velocity_error(self) -> np.ndarray:
@@ -88,79 +78,51 @@ class Series:
         )
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Velocity and steering errors of one or several drives.
+class Errors(NamedTuple):
+    """Velocity and steering errors of one or several drives: of |e_v| and |e_delta|."""
 
-    Attributes:
-        velocity_mean_mps: mean |e_v| over the metres, m/s.
-        velocity_max_mps: greatest |e_v|, m/s.
-        reference_mps: mean speed of the reference over the same metres, m/s.
-        steering_mean_deg: mean |e_delta| over the metres, degrees.
-        steering_max_deg: greatest |e_delta|, degrees.
-        steering_limit_deg: the steering limit, degrees.
-        metres: m compared.
-    """
-
-    velocity_mean_mps: float
+    velocity_mean_mps: float  # over the metres
     velocity_max_mps: float
-    reference_mps: float
-    steering_mean_deg: float
+    reference_mps: float  # mean speed of the reference over the same metres
+    steering_mean_deg: float  # over the metres
     steering_max_deg: float
     steering_limit_deg: float
-    metres: float
-
-    @property
-    def velocity_mean_percent(self) -> float:
-        """Relative to the reference's mean speed, since its speed at a place may be 0."""
-        return 100.0 * self.velocity_mean_mps / self.reference_mps
-
-    @property
-    def velocity_max_percent(self) -> float:
-        """Relative to the reference's mean speed."""
-        return 100.0 * self.velocity_max_mps / self.reference_mps
-
-    @property
-    def steering_mean_percent(self) -> float:
-        """Relative to the steering limit, since the reference's angle is 0 on a straight."""
-        return 100.0 * self.steering_mean_deg / self.steering_limit_deg
-
-    @property
-    def steering_max_percent(self) -> float:
-        """Relative to the steering limit to one side."""
-        return 100.0 * self.steering_max_deg / self.steering_limit_deg
+    metres: float  # m compared
 
     def figures(self) -> dict[str, float]:
-        """The figures by name, for tables and JSON."""
-        names = (
-            "velocity_mean_mps", "velocity_max_mps", "velocity_mean_percent", "velocity_max_percent", "reference_mps",
-            "steering_mean_deg", "steering_max_deg", "steering_mean_percent", "steering_max_percent", "metres",
-        )  # fmt: skip
-        return {name: float(getattr(self, name)) for name in names}
+        """The figures by name, for tables and JSON.
+
+        Velocity in percent is relative to the reference's mean speed, since its speed at a place may be 0; steering to
+        the steering limit to one side, since the reference's angle is 0 on a straight.
+        """
+        return {
+            "velocity_mean_mps": self.velocity_mean_mps,
+            "velocity_max_mps": self.velocity_max_mps,
+            "velocity_mean_percent": 100.0 * self.velocity_mean_mps / self.reference_mps,
+            "velocity_max_percent": 100.0 * self.velocity_max_mps / self.reference_mps,
+            "reference_mps": self.reference_mps,
+            "steering_mean_deg": self.steering_mean_deg,
+            "steering_max_deg": self.steering_max_deg,
+            "steering_mean_percent": 100.0 * self.steering_mean_deg / self.steering_limit_deg,
+            "steering_max_percent": 100.0 * self.steering_max_deg / self.steering_limit_deg,
+            "metres": self.metres,
+        }
 
 
 def combine(parts: Sequence[Errors]) -> Errors:
-    """The errors of several drives together: means weighted by metres, largest maxima.
+    """The errors of several drives of one kind of car together: means weighted by metres, largest maxima.
 
-    Raises: ValueError if there are none, or their steering limits differ.
+    Raises: ValueError if there are none.
     """
     if not parts:
         raise ValueError("nothing was driven that could be compared with a reference")
-    if len({part.steering_limit_deg for part in parts}) > 1:
-        raise ValueError("errors of cars with different steering limits cannot be combined")
-    metres = [part.metres for part in parts]
-
-    def mean(name: str) -> float:
-        return float(np.average([getattr(part, name) for part in parts], weights=metres))
-
-    return Errors(
-        mean("velocity_mean_mps"),
-        max(part.velocity_max_mps for part in parts),
-        mean("reference_mps"),
-        mean("steering_mean_deg"),
-        max(part.steering_max_deg for part in parts),
-        parts[0].steering_limit_deg,
-        float(sum(metres)),
+    table = Errors(*np.array(parts).T)
+    mean = Errors(*np.average(parts, axis=0, weights=table.metres).tolist())
+    return mean._replace(
+        velocity_max_mps=float(np.max(table.velocity_max_mps)),
+        steering_max_deg=float(np.max(table.steering_max_deg)),
+        steering_limit_deg=parts[0].steering_limit_deg,
+        metres=float(np.sum(table.metres)),
     )
 
 
@@ -194,9 +156,7 @@ def driven(poses: np.ndarray, road_map: Map) -> Driven:
     return Driven(arc, points, poses[rows, 2], poses[rows, 3], poses[rows, 4], rows)
 
 
-def error_series(
-    path: Driven, road_map: Map, config: ReferenceConfig | None = None, sim: SimConfig | None = None
-) -> Series:
+def error_series(path: Driven, road_map: Map, sim: SimConfig | None = None) -> Series:
     """A drive beside the reference driver's profile along its path.
 
     The reference begins with the agent's speed and ignores traffic, so the error in traffic includes the delay by other
@@ -206,12 +166,11 @@ def error_series(
     Left out are the first 5 m, where the curvature is not known, and the end, from where the reference could not have
     stopped any more, because what it would have had to brake for is not known.
     """
-    config = config or ReferenceConfig()
     interval = float(road_map.road.speed_low), float(road_map.road.speed_high)
-    found = profile(path.points, interval, float(path.speed[0]), config, sim)
-    speed, steering = found.speed_at(path.arc), found.steering_at(path.arc)
-    unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * config.braking) > path.arc[-1])
-    part = slice(int(np.searchsorted(path.arc, config.driven_window / 2)), int(unknown[0]))
+    found = profile(path.points, interval, float(path.speed[0]), sim)
+    speed, steering = (np.interp(path.arc, found.arc, each) for each in (found.speed, found.steering))
+    unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * BRAKING) > path.arc[-1])
+    part = slice(int(np.searchsorted(path.arc, DRIVEN_WINDOW / 2)), int(unknown[0]))
     return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
 
 
@@ -249,16 +208,7 @@ def error_series_beside(path: Driven, recorded: Driven, road_map: Map, row: int 
         reached = max(reached, float(recorded.arc[k]) + along)
         at.append(reached)
     count = len(at)
-    if parted:
-        count = int(np.searchsorted(path.arc[:count], path.arc[count - 1] - TURN, side="right")) if count else 0
-    places = np.array(at[:count], dtype=np.float64)
-    return (
-        Series(
-            path.arc[:count],
-            path.speed[:count],
-            np.interp(places, recorded.arc, recorded.speed),
-            path.steering[:count],
-            np.interp(places, recorded.arc, recorded.steering),
-        ),
-        reached,
-    )
+    if parted and count:
+        count = int(np.searchsorted(path.arc[:count], path.arc[count - 1] - TURN, side="right"))
+    speed, steering = (np.interp(at[:count], recorded.arc, each) for each in (recorded.speed, recorded.steering))
+    return Series(path.arc[:count], path.speed[:count], speed, path.steering[:count], steering), reached
