@@ -10,10 +10,8 @@ import csv
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -27,16 +25,24 @@ from gridsim.maps.scenarios import check_name
 from gridsim.traffic.world import LANE
 from gridsim.view.render import Renderer, Window, interpolate
 
-COLUMNS = (
-    "time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action", "episode", "traffic",
-    "scenario", "map_seed",
-)  # fmt: skip
-"""Time since the episode's start, pose, speed, steering and action (`vehicle.Action`); then which episode of the file
-(a restart begins the next one), the number of other cars, and the map."""
+#: The columns of a recorded drive, and what their numbers are within; whole numbers are from 0.
+_LIMITS: dict[str, float] = {
+    "time_s": 1e7,  # since the episode's start
+    "x_m": 1e5,
+    "y_m": 1e5,
+    "heading_rad": 100.0,
+    "speed_mps": 200.0,
+    "steering_rad": 3.2,
+    "action": len(Action) - 1,
+    "episode": 1 << 31,  # which one of the file: a restart begins the next one
+    "traffic": 1000,  # other cars
+    "scenario": math.nan,  # a name
+    "map_seed": (1 << 63) - 1,
+}
+COLUMNS = tuple(_LIMITS)
 MAX_BYTES = 1 << 28  # of a file that is read
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
-_LIMITS = (1e7, 1e5, 1e5, 100.0, 200.0, 3.2)  # of time and pose, beyond which a number cannot be right
 _ENDLESS = 10_000_000  # control steps
 
 HELP = "arrows drive   space brakes   R restarts   Esc ends"
@@ -50,23 +56,15 @@ class DriveError(GridSimError):
 class Drive:
     """A recorded drive; n control steps of one or more episodes on one map.
 
-    Attributes:
-        scenario: the map's name in the registry.
-        map_seed: the seed it is built from.
-        traffic: number of other cars; map and episode determine where they begin.
-        episodes: int64 [n], counted from 0; each begins at the pose of its first row.
-        times: float64 [n], s since the episode's start.
-        poses: float32 [n, 5]: x, y (m), heading (rad), speed (m/s), steering (rad) before each step.
-        actions: int64 [n], taken in each step.
+    Map and episode determine where the other cars begin.
     """
 
     scenario: str
     map_seed: int
-    traffic: int
-    episodes: np.ndarray
-    times: np.ndarray
-    poses: np.ndarray
-    actions: np.ndarray
+    traffic: int  # number of other cars
+    episodes: np.ndarray  # int64 [n], counted from 0; each begins at the pose of its first row
+    poses: np.ndarray  # float32 [n, 5]: x, y (m), heading (rad), speed (m/s), steering (rad) before each step
+    actions: np.ndarray  # int64 [n]
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -108,9 +106,6 @@ def action_for(keys: set[str], speed: float) -> Action:
     return (Action.NONE, Action.LEFT, Action.RIGHT)[turn]
 
 
-# ------------------------------------------------------------------------------------------------------------ files
-
-
 class Recorder:
     """Writes a drive to a new file row by row, so that an interrupted drive is kept too."""
 
@@ -145,7 +140,7 @@ class Recorder:
     def __enter__(self) -> Recorder:
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -167,53 +162,43 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
         raise DriveError(f"{path}: not a recorded drive: its first line must be {','.join(COLUMNS)}")
     if len(rows) < 2:
         raise DriveError(f"{path}: nothing was driven: it has no rows")
-    numbers, actions, episodes = [], [], []
-    line = 1
-    try:
-        cars, name, map_seed = rows[1][-3:] if len(rows[1]) == len(COLUMNS) else ("0", "", "0")
-        for row in rows[1:]:
-            line += 1
-            numbers.append(_numbers(row))
-            actions.append(_whole(row, 6, len(Action) - 1))
-            episodes.append(_whole(row, 7, 1 << 31))
-            follows = episodes[-1] - (episodes[-2] if len(episodes) > 1 else -1)
-            if follows not in (0, 1):
-                raise ValueError(f"episode {episodes[-1]} does not follow the one before")
-            if (numbers[-1][0] <= numbers[-2][0]) if follows == 0 else (numbers[-1][0] != 0.0):
-                raise ValueError(f"time_s {row[0]} does not follow the time before")
-            if row[-3:] != [cars, name, map_seed]:
-                raise ValueError("traffic, scenario and map_seed must be the same in all rows")
-        check_name(name[:1000])
-        traffic, seed = _whole(rows[1], 8, 1000), _whole(rows[1], 10, (1 << 63) - 1)
-    except ValueError as error:
-        raise DriveError(f"{path}, line {line}: {error}") from error
-    table = np.array(numbers, dtype=np.float64)
-    poses = table[:, 1:].astype(np.float32)
-    return Drive(name, seed, traffic, np.array(episodes), table[:, 0].copy(), poses, np.array(actions))
-
-
-def _numbers(row: Sequence[str]) -> list[float]:
-    """Time and pose of a row. Raises ValueError."""
-    if len(row) != len(COLUMNS):
-        raise ValueError(f"it has {len(row)} columns, not {len(COLUMNS)}; was the file cut off?")
-    values = []
-    for text, column, limit in zip(row, COLUMNS, _LIMITS, strict=False):
+    table: list[list[float]] = []
+    for line, row in enumerate(rows[1:], start=2):
         try:
-            value = float(text)
-        except ValueError:
-            raise ValueError(f"{column} is {text[:40]!r}, which is not a number") from None
-        if not abs(value) <= limit:
-            raise ValueError(f"{column} is {value:g}, which is outside the possible range")
-        values.append(value)
-    return values
+            if len(row) != len(COLUMNS):
+                raise ValueError(f"it has {len(row)} columns, not {len(COLUMNS)}; was the file cut off?")
+            table.append([_number(*pair) for pair in zip(COLUMNS, row, strict=True) if pair[0] != "scenario"])
+            check_name(row[9][:1000])
+            time, episode = table[-1][0], table[-1][7]
+            before, last = (table[-2][0], table[-2][7]) if line > 2 else (0.0, -1)
+            if episode not in (last, last + 1):
+                raise ValueError(f"episode {episode} does not follow the one before")
+            if (time <= before) if episode == last else (time != 0.0):
+                raise ValueError(f"time_s {row[0]} does not follow the time before")
+            if row[8:] != rows[1][8:]:
+                raise ValueError("traffic, scenario and map_seed must be the same in all rows")
+        except ValueError as error:
+            raise DriveError(f"{path}, line {line}: {error}") from error
+    traffic, seed = table[0][8:]
+    poses = np.array([numbers[1:6] for numbers in table], dtype=np.float32)
+    actions, episodes = np.array([numbers[6:8] for numbers in table], dtype=np.int64).T
+    return Drive(rows[1][9], int(seed), int(traffic), episodes, poses, actions)
 
 
-def _whole(row: Sequence[str], column: int, most: int) -> int:
-    """A column's whole number from 0 to `most`. Raises ValueError."""
-    text = row[column]
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
-        raise ValueError(f"{COLUMNS[column]} is {text[:40]!r}, not a whole number from 0 to {most}")
-    return int(text)
+def _number(column: str, text: str) -> float:
+    """The number in a column. Raises ValueError."""
+    limit = _LIMITS[column]
+    if isinstance(limit, int):
+        if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= limit):
+            raise ValueError(f"{column} is {text[:40]!r}, not a whole number from 0 to {limit}")
+        return int(text)
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(f"{column} is {text[:40]!r}, which is not a number") from None
+    if not abs(value) <= limit:
+        raise ValueError(f"{column} is {value:g}, which is outside the possible range")
+    return value
 
 
 def replay(drive: Drive, road_map: Map, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
@@ -239,9 +224,6 @@ def replay(drive: Drive, road_map: Map, config: SimConfig | None = None) -> tupl
                 raise DriveError(f"replayed, the drive ends at row {k} of {n}: it was driven on another map")
         cars[k], views[k], worlds[k] = simulator.state.cars[0], ranges[0], simulator.state.worlds[0]
     return poses, cars, views, worlds
-
-
-# ---------------------------------------------------------------------------------------------------------- driving
 
 
 def drive(

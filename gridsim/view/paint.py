@@ -125,7 +125,7 @@ def draw_shapes(shapes, image):
     half, zero, one = _F(0.5), _F(0.0), _F(1.0)
     for k in range(shapes.shape[0]):
         x0, y0, dx, dy, length, across, radius = shapes[k, :7]
-        red, green, blue, opacity = shapes[k, 7:]
+        opacity = shapes[k, 10]
         tall = abs(dy) * length + abs(dx) * across + one
         wide = abs(dx) * length + abs(dy) * across + one
         if not (tall < 32768.0 and wide < 32768.0 and abs(x0) < 32768.0 and abs(y0) < 32768.0):
@@ -144,9 +144,9 @@ def draw_shapes(shapes, image):
                 outside = math.sqrt(max(u, zero) ** 2 + max(v, zero) ** 2) + min(max(u, v), zero) - radius
                 cover = min(max(half - outside, zero), one) * opacity
                 if cover > zero:
-                    image[j, i, 0] = np.uint8(_F(image[j, i, 0]) + cover * (red - _F(image[j, i, 0])) + half)
-                    image[j, i, 1] = np.uint8(_F(image[j, i, 1]) + cover * (green - _F(image[j, i, 1])) + half)
-                    image[j, i, 2] = np.uint8(_F(image[j, i, 2]) + cover * (blue - _F(image[j, i, 2])) + half)
+                    for c in range(3):
+                        under = _F(image[j, i, c])
+                        image[j, i, c] = np.uint8(under + cover * (shapes[k, 7 + c] - under) + half)
 
 
 def car_parts(

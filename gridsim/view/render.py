@@ -8,12 +8,11 @@ window.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -73,8 +72,7 @@ class Renderer:
         self._anchor = np.array([width / 2, height * (CAR_AT if follow else 0.5)])
         self._centre, self._up = self._world / 2, np.array([0.0, 1.0])
         self._marks = lane_marks(road_map)
-        # The map's blocks are parked cars.
-        blocks = getattr(road_map.strips, "blocks", None)
+        blocks = getattr(road_map.strips, "blocks", None)  # parked cars
         self._blocks = np.zeros((0, 5)) if blocks is None else np.asarray(blocks, dtype=np.float64)
         self._colours = freeze(
             np.array([paint.GROUND, paint.GROUND_OTHER, paint.VERGE, paint.ASPHALT, paint.EDGE_LINE], dtype=np.float32)
@@ -82,8 +80,6 @@ class Renderer:
         vehicle, k = self.config.vehicle, self._constants
         self._outline = (vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle))
         self._other = paint.car_parts(*self._outline, 0.0, paint.OTHER)
-
-    # ------------------------------------------------------------------------------------------------- the view
 
     def pixel(self, points: np.ndarray) -> np.ndarray:
         """Pixels float64 [n, 2] (x right, y down) of points [n, 2] (m) in the last picture drawn.
@@ -103,8 +99,6 @@ class Renderer:
     def _near(self, pixels: np.ndarray, margin: float) -> np.ndarray:
         """Which of pixels [n, 2] are in the picture, or within `margin` pixels of it."""
         return np.all((pixels > -margin) & (pixels < np.array(self.size) + margin), axis=1)
-
-    # ------------------------------------------------------------------------------------------------- drawing
 
     def draw(
         self,
@@ -172,7 +166,7 @@ class Renderer:
         opacity: float,
         least: float = 0.5,
     ) -> np.ndarray:
-        """Shapes [n, 11]: pixels [n, 2], directions [n, 2] in the picture, half length, half width and radius in m.
+        """Shapes [n, 11] at pixels `centre` [n, 2] with directions [n, 2] in the picture; half length and width in m.
 
         Shapes with a half width below `least` pixels are drawn that wide, and fainter.
         """
@@ -196,19 +190,11 @@ class Renderer:
 
     def _block_shapes(self) -> np.ndarray:
         """Parked cars, with the length and width of their blocks."""
-        blocks = self._blocks
-        if not len(blocks):
-            return np.zeros((0, paint.SHAPE), dtype=np.float32)
-        blocks = blocks[self._near(self.pixel(blocks[:, :2]), 8.0 * self.pixels_per_m)]
-        shapes = [
-            self._placed(
-                paint.car_parts(2 * a, 2 * b, 0.62 * a, 0.62 * a, 0.0, paint.PARKED),
-                np.array([[x, y]]),
-                np.array([[math.cos(turn), math.sin(turn)]]),
-            )
-            for x, y, turn, a, b in blocks
-        ]
-        return np.concatenate(shapes) if shapes else np.zeros((0, paint.SHAPE), dtype=np.float32)
+        shapes = [np.zeros((0, paint.SHAPE), dtype=np.float32)]
+        for x, y, turn, a, b in self._blocks[self._near(self.pixel(self._blocks[:, :2]), 8.0 * self.pixels_per_m)]:
+            parts = paint.car_parts(2 * a, 2 * b, 0.62 * a, 0.62 * a, 0.0, paint.PARKED)
+            shapes.append(self._placed(parts, np.array([[x, y]]), np.array([[math.cos(turn), math.sin(turn)]])))
+        return np.concatenate(shapes)
 
     def _placed(self, parts: np.ndarray, positions: np.ndarray, headings: np.ndarray) -> np.ndarray:
         """Shapes [n * k, 11] in pixels of a car's parts [k, 11] (m) at positions [n, 2] with headings [n, 2]."""
@@ -217,62 +203,50 @@ class Renderer:
         seen = self._near(at, 8.0 * scale)
         at, along = at[seen], along[seen]
         left = np.stack([along[:, 1], -along[:, 0]], axis=1)  # y is down
+        turned = np.stack([along, left], axis=1)
         shapes = np.repeat(parts[None], len(at), axis=0)
-        for to, offset in ((slice(0, 2), at[:, None] - 0.5), (slice(2, 4), 0.0)):
-            factor = scale if to.start == 0 else 1.0
-            shapes[:, :, to] = offset + factor * (
-                parts[None, :, to.start, None] * along[:, None] + parts[None, :, to.start + 1, None] * left[:, None]
-            )
+        shapes[:, :, 0:2] = at[:, None] - 0.5 + scale * (parts[:, 0:2] @ turned)
+        shapes[:, :, 2:4] = parts[:, 2:4] @ turned
         # At small scales, a car is still a visible dot.
         shapes[:, :, 4:7] *= max(scale, 2.0)
         return shapes.reshape(-1, paint.SHAPE)
 
     def _path_shapes(self, path: np.ndarray) -> np.ndarray:
-        if len(path) < 2:
-            return np.zeros((0, paint.SHAPE), dtype=np.float32)
         at = self.pixel(path)
-        step = at[1:] - at[:-1]
-        length = np.hypot(step[:, 0], step[:, 1])
-        middle = (at[1:] + at[:-1]) / 2
-        # A long step crosses the torus's edge.
-        seen = (length > 0.01) & (length < 20.0 * self.pixels_per_m)
-        seen &= self._near(middle, 20.0 * self.pixels_per_m)
-        middle, length = middle[seen], length[seen]
+        step, middle = at[1:] - at[:-1], (at[1:] + at[:-1]) / 2
+        length = np.hypot(*step.T)
+        far = 20.0 * self.pixels_per_m  # a longer step crosses the torus's edge
+        seen = (length > 0.01) & (length < far) & self._near(middle, far)
+        step, middle, length = step[seen], middle[seen], length[seen]
         half = length / 2 / self.pixels_per_m + 0.12
-        return self._shapes(middle, step[seen] / length[:, None], half, 0.12, 0.12, paint.PATH, 1.0, 0.7)
+        return self._shapes(middle, step / length[:, None], half, 0.12, 0.12, paint.PATH, 1.0, 0.7)
 
     def _ray_shapes(self, position: np.ndarray, heading: np.ndarray, ranges: np.ndarray) -> np.ndarray:
         k = self._constants
         angle = k.ray_first + k.ray_step * np.arange(len(ranges))
         c, s = np.cos(angle), np.sin(angle)
         direction = np.stack([heading[0] * c - heading[1] * s, heading[1] * c + heading[0] * s], axis=1)
-        origin = position + k.front_axle * heading
-        half = ranges / 2
-        at = self.pixel(origin[None]) + self._turn(direction * half[:, None]) * self.pixels_per_m
-        rays = self._shapes(at, self._turn(direction), half, 0.04, 0.0, paint.RAY, 0.5, 0.5)
+        origin, along = self.pixel(position + k.front_axle * heading), self._turn(direction)
+        reach = along * ranges[:, None] * self.pixels_per_m
+        rays = self._shapes(origin + reach / 2, along, ranges / 2, 0.04, 0.0, paint.RAY, 0.5)
         rays[:, 10] = np.maximum(rays[:, 10], 0.3)
         hit = ranges < float(k.ray_range) - 1e-3
-        ends = self.pixel(origin[None]) + self._turn(direction * ranges[:, None])[hit] * self.pixels_per_m
-        dots = self._shapes(ends, self._turn(direction[hit]), 0.22, 0.22, 0.22, paint.RAY, 1.0, 1.5)
+        dots = self._shapes((origin + reach)[hit], along[hit], 0.22, 0.22, 0.22, paint.RAY, 1.0, 1.5)
         return np.concatenate([rays, dots])
 
     def _grid_shapes(self, position: np.ndarray, heading: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        cells = grid.shape[0]
         row, column = np.divmod(np.arange(grid.size), grid.shape[1])
-        ahead = (cells - row - 0.5) * GRID_CELL + float(self._constants.front_axle)
+        ahead = (grid.shape[0] - row - 0.5) * GRID_CELL + float(self._constants.front_axle)
         left = (grid.shape[1] / 2 - column - 0.5) * GRID_CELL
         side = np.array([-heading[1], heading[0]])
-        at = (
-            self.pixel(position[None]) + self._turn(ahead[:, None] * heading + left[:, None] * side) * self.pixels_per_m
+        away = self._turn(ahead[:, None] * heading + left[:, None] * side)
+        kind = np.searchsorted([0, 127, 255], grid.ravel())
+        colour = np.array([paint.UNKNOWN, paint.FREE, paint.OCCUPIED])[kind]
+        shapes = self._shapes(
+            self.pixel(position) + away * self.pixels_per_m, self._turn(heading[None]), 0.23, 0.23, 0.0, colour, 1.0
         )
-        value = grid.ravel()[:, None]
-        colour = np.where(
-            value == 0, np.array(paint.UNKNOWN), np.where(value == 255, np.array(paint.OCCUPIED), np.array(paint.FREE))
-        )
-        shapes = self._shapes(at, self._turn(heading[None]), 0.23, 0.23, 0.0, colour, 0.34, 0.5)
-        shapes[value[:, 0] == 0, 10] = 0.16
-        shapes[value[:, 0] == 255, 10] = 0.75
-        return shapes[self._near(at, self.pixels_per_m)]
+        shapes[:, 10] = np.array([0.16, 0.34, 0.75])[kind]
+        return shapes[self._near(shapes[:, :2], self.pixels_per_m)]
 
     def _write(self, image: np.ndarray, text: str, corner: str) -> None:
         """Write a line of text on a dark pill into a corner."""
@@ -332,33 +306,20 @@ def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Ma
     return state.astype(np.float32)
 
 
-@contextlib.contextmanager
-def _driver_for_display(chosen: str | None) -> Iterator[None]:
-    """On Linux, keep SDL from trying drivers without a display, some of which print errors to stderr."""
-    x11, wayland = os.environ.get("DISPLAY"), os.environ.get("WAYLAND_DISPLAY")
-    if chosen or wayland or not sys.platform.startswith("linux"):
-        yield
-    elif not x11:
-        raise _pygame().error("no display")
-    else:
-        os.environ["SDL_VIDEODRIVER"] = "x11"
-        try:
-            yield
-        finally:
-            del os.environ["SDL_VIDEODRIVER"]
-
-
 class Window:
     """A window on a display, with its keys."""
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
         """Open it. Raises: NoDisplayError with one line that says what to do."""
         pygame = self._pygame = _pygame()
-        chosen = os.environ.get("SDL_VIDEODRIVER")
+        chosen, wayland = os.environ.get("SDL_VIDEODRIVER"), os.environ.get("WAYLAND_DISPLAY")
         try:
-            with _driver_for_display(chosen):
-                pygame.display.init()
-            # SDL falls back to drivers that show nothing; that is right only if one was chosen.
+            # SDL would also try drivers that need no display: they show nothing, and some print errors to stderr.
+            if sys.platform.startswith("linux") and not (chosen or wayland):
+                if not os.environ.get("DISPLAY"):
+                    raise pygame.error("no display")
+                os.environ["SDL_VIDEODRIVER"] = "x11"
+            pygame.display.init()
             if not chosen and pygame.display.get_driver() in ("dummy", "offscreen", "evdev"):
                 raise pygame.error("no display")
             self._screen = pygame.display.set_mode(size)

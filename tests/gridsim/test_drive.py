@@ -11,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
@@ -21,7 +19,6 @@ from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, without_idle_limit
 
-KEYS = ("up", "down", "left", "right", "space")
 COMMAND = [sys.executable, "-c", "from cluster.commands.entry import drive_main; drive_main()"]
 
 
@@ -55,7 +52,7 @@ def recorded(scenario, tmp_path_factory):
 @pytest.mark.parametrize(
     ("keys", "speed", "action"),
     [
-        ("", 5.0, Action.NONE),
+        ("a f1", 5.0, Action.NONE),
         ("up", 5.0, Action.ACCELERATE),
         ("left", 5.0, Action.LEFT),
         ("right", 5.0, Action.RIGHT),
@@ -74,31 +71,20 @@ def test_keys_are_the_eight_actions(keys, speed, action):
     assert action_for(set(keys.split()), speed) == action
 
 
-@given(st.sets(st.sampled_from([*KEYS, "a", "f1"])), st.floats(-3, 30))
-def test_any_keys_are_an_action(keys, speed):
-    assert action_for(keys, speed) in Action
-
-
 def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
     path, poses = recorded
     drive = read_drive(path)
-    assert (drive.scenario, drive.map_seed, len(drive)) == ("seamless", 11, len(poses))
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert COLUMNS[:7] == ("time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action")
+    assert [row["time_s"] for row in rows[:12]] == [f"{k / 10:g}" for k in range(12)]
+    assert (drive.scenario, drive.map_seed, len(drive), len(rows)) == ("seamless", 11, len(poses), len(poses))
     assert set(drive.episodes.tolist()) == {0, 1}
     assert drive.poses.tobytes() == poses.tobytes()  # nine digits lose nothing
     again, cars, ranges, _ = replay(drive, build(drive.scenario, drive.map_seed))
     assert again.tobytes() == poses.tobytes()
     assert np.ptp(again[:, 0]) > 1.0
     assert (len(cars), len(ranges)) == (len(poses), len(poses))
-
-
-def test_file_is_plain_csv_with_a_row_a_step(recorded):
-    path, poses = recorded
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert list(rows[0]) == list(COLUMNS)
-    assert COLUMNS[:7] == ("time_s", "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action")
-    assert len(rows) == len(poses)
-    assert [row["time_s"] for row in rows[:12]] == [f"{k / 10:g}" for k in range(12)]
 
 
 def test_drive_of_another_map_is_refused(recorded):
@@ -148,6 +134,12 @@ def _edit(text, row, column, value):
     return "\n".join(lines) + "\n"
 
 
+def test_a_missing_file_is_one_clear_line(tmp_path):
+    for path in (tmp_path / "nothing.csv", tmp_path):
+        with pytest.raises(DriveError, match="cannot be read"):
+            read_drive(path)
+
+
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_file_is_one_clear_line(recorded, tmp_path, name):
     change, expected = DAMAGES[name]
@@ -159,16 +151,6 @@ def test_damaged_file_is_one_clear_line(recorded, tmp_path, name):
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 400
-
-
-def test_missing_file_and_folder(tmp_path):
-    with pytest.raises(DriveError, match="cannot be read"):
-        read_drive(tmp_path / "nothing.csv")
-    with pytest.raises(DriveError, match="cannot be read"):
-        read_drive(tmp_path)
-
-
-# ------------------------------------------------------------------------------------------------------ real windows
 
 
 @pytest.fixture
