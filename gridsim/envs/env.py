@@ -5,8 +5,8 @@
 Observation:
 
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; with `motion`
-  between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s, and with `steering`
-  at the end the steering angle as a share of 27 degrees.
+  between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s; with `steering` at
+  the end the steering angle as a share of 27 degrees.
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
   and `speed`, float32 [1], as a share of 30 m/s.
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as policies of convolutions take pictures.
@@ -95,24 +95,18 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         config: SimConfig | None = None,
     ):
-        """Maps are built when an episode first needs them.
+        """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
 
         Args:
             num_envs: cars.
             scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
-            maps: how many maps the episodes are drawn from, or the maps themselves. All environments of a process share
-                a scenario's maps.
+            maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first of them; the others' follow.
             traffic: other cars in each car's world; None is as many as the scenario has by default.
-            observation: `rays`, `grid` or `image`.
             frames: grids that make an observation, 1 to 8.
-            motion: whether rays also tell the motion of what they meet.
-            steering: whether the steering angle is told beside them.
-            actions: `discrete` or `continuous`.
             render_mode: `rgb_array`, or `human`, a window that follows the first car.
             max_episode_steps: time limit in control steps; None is the configuration's.
             autoreset_mode: of `gymnasium.vector`, or its value, as in `SameStep`.
-            config: vehicle, sensors and episode.
         Raises: ValueError with one line where an argument makes no sense.
         """
         check_name(scenario)
@@ -130,13 +124,14 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 raise ValueError(f"{name} is seen beside rays; leave it out with observation={observation!r}")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
-        if autoreset_mode not in [known for mode in AutoresetMode for known in (mode, mode.value)]:
-            values = ", ".join(mode.value for mode in AutoresetMode)
-            raise ValueError(f"autoreset_mode must be one of {values}, not {autoreset_mode!r}")
         if map_seed < 0:
             raise ValueError(f"map_seed must be 0 or more, not {map_seed}")
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            values = ", ".join(mode.value for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode must be one of {values}, not {autoreset_mode!r}") from None
         self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.config = config or SimConfig()
         self.scenario = scenario
@@ -183,12 +178,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"unknown option {next(iter(options))!r}; there are: map_seed, start, reset_mask")
         if mask is None:
             mask = np.ones(self.num_envs, dtype=np.bool_)
-        elif (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-            or not mask.any()
-        ):
+        elif not (isinstance(mask, np.ndarray) and (mask.dtype, mask.shape) == (bool, (self.num_envs,)) and mask.any()):
             raise ValueError(f"reset_mask must be an array of {self.num_envs} bools, at least one of them true")
         elif not self._started:
             raise ResetNeeded("reset_mask was given before the first reset of all cars")
@@ -201,9 +191,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.ranges[which], _ = self._begin(which, map_seed, start)
         self._started = True
         self._note(which, mask)
-        speeds = self.simulator.state.cars[:, SPEED].copy()
-        info = self._info(speeds, self.simulator.state.ends.copy())
-        return self._observer.look(self.ranges, speeds), {name: value * mask for name, value in info.items()}
+        info = self._info()
+        return self._observer.look(self.ranges, info["speed_mps"]), {name: part * mask for name, part in info.items()}
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
@@ -232,8 +221,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.ranges = ranges
         rewards = self._observer.rewards(ranges, speeds, progress, ends, begun, self._fastest)
         self._note(slice(None), begun)
-        observations = self._observer.look(ranges, speeds)
-        info = self._info(speeds, ends)
+        observations, info = self._observer.look(ranges, speeds), self._info()
         terminations, truncations = TERMINATES[ends], TRUNCATES[ends]
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ends.any():
             info = self._begin_anew(observations, info, ends != 0)
@@ -242,11 +230,12 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _seed(self, seed: int | Sequence[int | None] | None, which: np.ndarray) -> None:
         """Seed cars `which`, or let them go on to their next episodes."""
         n, episodes = self.num_envs, self._episodes
+        seeds: Sequence[int | None]
         if seed is None or isinstance(seed, int):
             super().reset(seed=seed)
             seeds = [None if seed is None else seed + i for i in range(n)]
         else:
-            seeds = list(seed)
+            seeds = seed
             if len(seeds) != n or not all(s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in seeds):
                 raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
         if self._seeded:
@@ -283,17 +272,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         else:
             observations[which] = seen
         final = {name: value * over for name, value in info.items()}
-        state = self.simulator.state
-        info = self._info(state.cars[:, SPEED].copy(), state.ends.copy())
-        return info | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
+        return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
         """Take in what cars `which` sense now; `begun` [n] says where an episode has begun."""
         self._observer.take(self.ranges[which], begun[which], which)
         if self.render_mode is not None:
             self._remember(begun)
-
-    # ---------------------------------------------------------------------------------------------------- pictures
 
     def _remember(self, begun: np.ndarray) -> None:
         """Keep where cars are; where an episode has begun, where it was is forgotten. Shows the window."""
@@ -352,19 +337,17 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._window.close()
             self._window = None
 
-    def _info(self, speeds: np.ndarray, ends: np.ndarray) -> dict[str, Any]:
+    def _info(self) -> dict[str, Any]:
         """Distance, speed, success and end of every car, in Gymnasium's form: each with a mask of whose it is."""
-        all_of_them = np.ones(self.num_envs, dtype=np.bool_)
-        return {
-            "distance_m": self.simulator.state.cars[:, DISTANCE].copy(),
-            "speed_mps": speeds,
+        cars, ends = self.simulator.state.cars, self.simulator.state.ends.copy()
+        info = {
+            "distance_m": cars[:, DISTANCE].copy(),
+            "speed_mps": cars[:, SPEED].copy(),
             "is_success": ends == _SUCCESS,
             "end": ends,
-            "_distance_m": all_of_them,
-            "_speed_mps": all_of_them,
-            "_is_success": all_of_them,
-            "_end": all_of_them,
         }
+        everyone = np.ones(self.num_envs, dtype=np.bool_)
+        return info | {f"_{name}": everyone for name in info}
 
 
 class GridSimEnv(gymnasium.Env[Any, Any]):

@@ -1,87 +1,36 @@
-"""The Gymnasium environments: exact seeding, how episodes end, wrappers, and errors that can be read."""
+"""The Gymnasium environments: spaces, exact seeding, observations, rewards, ends, options, and readable errors."""
 
+import math
 import re
 import subprocess
 import sys
+import warnings
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from driving import SENSING, drive
 from gymnasium.error import ResetNeeded
-from gymnasium.wrappers import FlattenObservation, FrameStackObservation, TimeAwareObservation
-from gymnasium.wrappers import RecordEpisodeStatistics as RecordOne
-from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
-from gymnasium.wrappers.vector import FlattenObservation as FlattenAll
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TimeAwareObservation
 
-from evolution.episodes.rollout import EPISODE, Limits, evaluate
-from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size
 from gridsim import ENVIRONMENTS
-from gridsim.car.ego import End
+from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
-from gridsim.envs.simulator import Simulator
-from gridsim.maps.map import Map, sample_starts, starts_at
-from gridsim.maps.roads import clearance, freeze
-from gridsim.maps.scenarios import REGISTRY, build
+from gridsim.envs.simulator import Simulator, views
+from gridsim.maps.map import Map, starts_at
+from gridsim.maps.scenarios import REGISTRY
+from gridsim.sensing.grid import CELLS, grid_table, grids
+from gridsim.traffic.world import LANE
 
-SPEC = PolicySpec.parse("mlp:6,7")
 IDS = list(ENVIRONMENTS)
+Maps = dict[str, list[Map]]
 
 
-@pytest.fixture(scope="module")
-def maps() -> list[Map]:
-    """Three maps that several tests share."""
-    return [build("seamless", seed) for seed in range(3)]
-
-
-class Driver:
-    """A network at the wheel of every car of a vector environment."""
-
-    def __init__(self, genome: np.ndarray):
-        self.layers = SPEC.layers
-        self.packed = np.empty(packed_size(self.layers), dtype=np.float32)
-        pack(freeze(genome), self.layers, self.packed)
-        self.scratch = np.zeros(64, dtype=np.float32)
-
-    def __call__(self, ranges: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-        actions = []
-        for row, speed in zip(ranges, speeds, strict=True):
-            encode(row, None, speed, np.float32(0.0), self.scratch)
-            actions.append(decide(self.packed, self.layers, self.scratch))
-        return np.array(actions)
-
-
-def genomes(count: int) -> np.ndarray:
-    """Random networks, most of which speed up: float32 [count, genes]."""
-    drawn = np.random.default_rng(5).normal(0.0, 0.7, (count, SPEC.size)).astype(np.float32)
-    drawn[:, -8] += 1.0
-    return drawn
-
-
-def drive(env: GridSimVectorEnv, actions: np.ndarray) -> list[tuple[np.ndarray, ...]]:
-    """What a vector environment returns for actions [steps, n]."""
-    return [env.step(row)[:4] for row in actions]
-
-
-# --- the registry
-
-
-@pytest.mark.parametrize("name", IDS)
-def test_make_vec_gives_the_native_environment(name: str) -> None:
-    env = gymnasium.make_vec(name, num_envs=3, vectorization_mode="vector_entry_point", maps=1)
-    assert isinstance(env.unwrapped, GridSimVectorEnv)
-    assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
-    observations, _ = env.reset(seed=1)
-    assert observations in env.observation_space
-    observations, rewards, *_ = env.step(env.action_space.sample())
-    assert observations in env.observation_space
-    assert rewards.shape == (3,)
-
-
-def test_every_scenario_has_an_id() -> None:
-    assert list(ENVIRONMENTS.values()) == list(REGISTRY)
+# --- spaces
 
 
 def test_importing_gridsim_registers_and_loads_no_numba() -> None:
@@ -90,107 +39,211 @@ def test_importing_gridsim_registers_and_loads_no_numba() -> None:
     assert done.stdout.split() == ["True", "False"]
 
 
-def test_observations_are_ranges_and_speed(maps: list[Map]) -> None:
-    env = GridSimVectorEnv(5, maps=maps)
-    env.reset(seed=3)
-    observations, _, _, _, info = env.step(np.full(5, Action.ACCELERATE))
-    assert observations.dtype == np.float32
-    np.testing.assert_allclose(observations[:, :-1] * 50.0, env.ranges, rtol=1e-6)
-    np.testing.assert_allclose(observations[:, -1] * 30.0, info["speed_mps"], rtol=1e-6)
+@pytest.mark.usefixtures("dummy")
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+@pytest.mark.parametrize(
+    ("name", "sees"),
+    [
+        ("highway", {}),
+        ("curved", {"motion": True}),
+        ("seamless", {"motion": True, "steering": True}),
+        ("roundabout", {"observation": "grid", "frames": 4}),
+        ("city", {"observation": "image"}),
+    ],
+)
+def test_gymnasiums_checker_passes(maps: Maps, name: str, sees: dict[str, Any], actions: str) -> None:
+    """It makes the environment in both of its render modes, too."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(f"GridSim/{name.capitalize()}-v0", maps=maps[name][:1], actions=actions, **sees)
+        check_env(env.unwrapped)
+
+
+@pytest.mark.parametrize(("observation", "frames"), SENSING)
+@pytest.mark.parametrize("name", IDS)
+def test_spaces_and_traffic_are_those_of_the_options(name: str, observation: str, frames: int) -> None:
+    options: Any = {"observation": observation, "frames": frames, "actions": "continuous", "maps": 1}
+    env: Any = gymnasium.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point", **options)
+    assert isinstance(env.unwrapped, GridSimVectorEnv)
+    assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
+    space: Any = env.single_observation_space
+    if observation == "grid":
+        assert set(space.spaces) == {"grid", "speed"}
+        assert (space["speed"].shape, space["speed"].dtype) == ((1,), np.float32)
+        space = space["grid"]
+    assert space.shape == ((32,) if observation == "rays" else (frames, CELLS, CELLS))
+    assert space.dtype == (np.float32 if observation == "rays" else np.uint8)
+    assert env.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+    seen, _ = env.reset(seed=1)
+    assert seen in env.observation_space
+    seen, rewards, *_ = env.step(env.action_space.sample())
+    assert seen in env.observation_space
+    assert rewards.shape == (2,)
+    assert env.unwrapped.simulator.state.worlds.shape[1] == REGISTRY[ENVIRONMENTS[name]].traffic
+    assert GridSimVectorEnv(1, scenario="city", maps=1, traffic=2).simulator.state.worlds.shape[1] == 2
 
 
 # --- seeds
 
 
-def test_the_same_seed_gives_the_same_episodes_alone_and_in_a_batch_of_64(maps: list[Map]) -> None:
-    actions = np.random.default_rng(0).integers(len(Action), size=(150, 64))
-    batch = GridSimVectorEnv(64, maps=maps)
-    first_seen, _ = batch.reset(seed=100)
-    first = drive(batch, actions)
-    seen_again, _ = batch.reset(seed=100)
-    again = drive(batch, actions)
-    np.testing.assert_array_equal(first_seen, seen_again)
-    for a, b in zip(first, again, strict=True):
-        for x, y in zip(a, b, strict=True):
-            np.testing.assert_array_equal(x, y)
-    assert sum(term.sum() for _, _, term, _ in first) > 64  # some cars are in their second episode or later
-    for car in (0, 7, 63):
-        env = GridSimEnv(maps=maps)
-        observation, _ = env.reset(seed=100 + car)
-        np.testing.assert_array_equal(observation, first_seen[car])
-        over = False
-        for step, row in enumerate(actions):
-            if over:
-                observation, _ = env.reset()
-                reward, term, trunc = 0.0, False, False
-            else:
-                observation, reward, term, trunc, _ = env.step(row[car])
-            over = term or trunc
-            np.testing.assert_array_equal(observation, first[step][0][car])
-            assert (reward, term, trunc) == tuple(x[car] for x in first[step][1:])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("highway", {}),
+        ("seamless", {"traffic": 6, "actions": "continuous"}),
+        ("roundabout", {"observation": "image", "frames": 4}),
+        ("city", {"observation": "image", "actions": "continuous"}),
+    ],
+)
+def test_an_episode_follows_from_seed_and_number_alone(maps: Maps, name: str, options: dict[str, Any]) -> None:
+    """Traffic included: the same again, and among other cars that do other things."""
+    n, steps = 12, 110
+    options = {"scenario": name, "maps": maps[name], "max_episode_steps": 40, **options}
+    env = GridSimVectorEnv(n, **options)
+    actions = drive(env, steps, seed=1)
+
+    def run(env: GridSimVectorEnv, seed: int, actions: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+        observations, _ = env.reset(seed=seed)
+        seen: list[tuple[np.ndarray, ...]] = [(observations, env.simulator.state.worlds.copy())]
+        for row in actions:
+            observations, rewards, terminations, truncations, info = env.step(row)
+            worlds = env.simulator.state.worlds.copy()
+            seen.append((observations, worlds, rewards, terminations, truncations, info["distance_m"], info["end"]))
+        return seen
+
+    first = run(env, 50, actions)
+    assert sum((row[3] | row[4]).sum() for row in first[1:]) >= 2 * n  # all are in their third episode
+    assert (first[0][1][:, :, LANE] >= 0).all()
+    assert not np.array_equal(first[0][1][0], first[0][1][1])
+    for ours, theirs in zip(first, run(env, 50, actions), strict=True):
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+    car = 7
+    among = drive(GridSimVectorEnv(3, **options), steps, seed=2)
+    among[:, 1] = actions[:, car]
+    for ours, theirs in zip(first, run(GridSimVectorEnv(3, **options), 50 + car - 1, among), strict=True):
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(a[car], b[1])
 
 
-def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: list[Map]) -> None:
-    env = GridSimEnv(maps=maps)
+def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: Maps) -> None:
+    env = GridSimEnv(maps=maps["seamless"])
     first, _ = env.reset(seed=8)
     second, _ = env.reset()
     other, _ = env.reset(seed=9)
     assert not np.array_equal(first, second)
     assert not np.array_equal(first, other)
     np.testing.assert_array_equal(env.reset(seed=8)[0], first)
-    assert not np.array_equal(GridSimEnv(maps=maps).reset()[0], GridSimEnv(maps=maps).reset()[0])
+    assert not np.array_equal(
+        GridSimEnv(maps=maps["seamless"]).reset()[0], GridSimEnv(maps=maps["seamless"]).reset()[0]
+    )
 
 
-def test_environments_drive_as_rollout_does_bit_for_bit(maps: list[Map]) -> None:
-    limits = Limits(30.0, 40)
-    config = SimConfig(episode=EpisodeConfig(target=limits.target, time_limit=limits.steps / 10))
-    episodes = np.zeros(24, dtype=EPISODE)
-    episodes["map"] = np.arange(24) % 3
-    for m in range(3):
-        episodes["start"][m::3] = sample_starts(maps[m], 8, np.random.default_rng(m))
-    episodes["start"][:, 3] = 5.0
-    ends = set()
-    for genome in genomes(40):
-        results, _, _ = evaluate(SPEC, genome[None], maps, episodes, limits, config)
-        env, driver = GridSimVectorEnv(24, maps=maps, config=config), Driver(genome)
-        options = {"map_seed": [maps[m].seed for m in episodes["map"]], "start": episodes["start"]}
-        _, info = env.reset(seed=0, options=options)
-        running = np.ones(24, dtype=bool)
-        for step in range(1, limits.steps + 1):
-            *_, terminations, truncations, info = env.step(driver(env.ranges, info["speed_mps"]))
-            for k in np.flatnonzero(running & (terminations | truncations)):
-                row = results[0, k]
-                assert (row["distance"], row["steps"]) == (np.float32(info["distance_m"][k]), step)
-                assert row["end"] == info["end"][k]
-                assert info["is_success"][k] == (row["end"] == End.SUCCESS)
-                assert truncations[k] == (row["end"] in (End.SUCCESS, End.TIME))
-            ends |= set(info["end"][running])
-            running &= ~(terminations | truncations)
-        assert not running.any()
-    assert ends == set(End)
+# --- observations and rewards
 
 
-def test_starts_lie_on_lanes_and_spread_over_their_length(maps: list[Map]) -> None:
-    scenario = maps[0]
-    starts = sample_starts(scenario, 500, np.random.default_rng(1))
-    assert starts.shape == (500, 5)
-    assert starts.dtype == np.float32
-    assert min(clearance(scenario.road, x, y) for x, y in starts[:, :2]) > 1.0
-    np.testing.assert_array_equal(starts[:, 3:], np.tile([0.0, 0.0], (500, 1)))
-    # The first share is the first lane's beginning, and equal shares are equal lengths along a lane.
-    first = starts_at(scenario, np.array([0.0]))[0]
-    np.testing.assert_allclose(first[:2], scenario.lanes.points[0], atol=1e-5)
-    metres = np.arange(5.0)
-    near = starts_at(scenario, metres / scenario.mileage[-1])
-    np.testing.assert_allclose(np.hypot(*(near[1:, :2] - near[:-1, :2]).T), 1.0, atol=0.02)
-    np.testing.assert_array_equal(starts, sample_starts(scenario, 500, np.random.default_rng(1)))
+def test_the_reward_among_traffic_is_the_papers(maps: Maps) -> None:
+    """Recomputed from the states, in float64."""
+    env = GridSimVectorEnv(8, scenario="highway", maps=maps["highway"])
+    env.reset(seed=0)
+    nearer = collisions = 0
+    over = np.zeros(8, dtype=bool)
+    for _ in range(300):
+        before = env.simulator.state.cars.astype(np.float64)
+        _, rewards, terminations, truncations, info = env.step(np.full(8, Action.ACCELERATE))
+        state = env.simulator.state
+        for i in range(8):
+            cars, road = state.cars[i : i + 1], maps["highway"][state.maps[i]]
+            ranges = views(road, cars, state.worlds[i : i + 1], env.config)[0]
+            nearer += ranges.min() < views(road, cars, state.worlds[i : i + 1, :0], env.config)[0].min()
+            expected = (
+                0.15 * min((cars[0, DISTANCE] - before[i, DISTANCE]) / (25.0 * 0.1), 1.0)
+                + 0.15 * min(max(cars[0, SPEED] / 25.0, 0.0), 1.0)
+                + 0.7 * ranges.min() / 50.0
+            )
+            if over[i]:
+                expected = 0.0
+            elif info["end"][i] == End.COLLISION:
+                expected = -1.0
+                collisions += 1
+            assert rewards[i] == pytest.approx(expected, abs=2e-5)
+        over = terminations | truncations
+    assert nearer > 20  # a car, not the road's edge, was what counted
+    assert collisions > 5
 
 
-# --- ends, rewards, automatic resets
+@pytest.mark.parametrize("name", ["city", "highway"])
+def test_a_grid_is_what_the_rays_say(maps: Maps, name: str) -> None:
+    options: dict[str, Any] = {"scenario": name, "maps": maps[name]}
+    env, rays = GridSimVectorEnv(6, observation="grid", **options), GridSimVectorEnv(6, **options)
+    alone = GridSimVectorEnv(6, observation="image", **options)
+    (seen, _), (beside, _) = env.reset(seed=4), rays.reset(seed=4)
+    alone.reset(seed=4)
+    table = grid_table(env.config)
+    for row in drive(env, 60, seed=5):
+        np.testing.assert_array_equal(env.ranges, rays.ranges)
+        np.testing.assert_array_equal(seen["grid"], grids(table, env.ranges)[:, None])
+        np.testing.assert_allclose(seen["speed"], beside[:, -1:], rtol=1e-6)
+        seen, *ours, info = env.step(row)
+        beside, *theirs, _ = rays.step(row)
+        np.testing.assert_array_equal(alone.step(row)[0], seen["grid"])
+        for a, b in zip(ours, theirs, strict=True):  # what an observation is made of changes nothing else
+            np.testing.assert_array_equal(a, b)
+    assert len(np.unique(seen["grid"])) == 3
+    named = {"distance_m", "speed_mps", "is_success", "end"}
+    assert set(info) == named | {f"_{name}" for name in named}
 
 
-def test_success_and_time_truncate_and_everything_else_terminates(maps: list[Map]) -> None:
-    timed = GridSimEnv(maps=maps, max_episode_steps=3)
+def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: Maps) -> None:
+    n = 5
+    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="image", frames=4, max_episode_steps=9)
+    table = grid_table(env.config)
+    for seed in (3, None):
+        seen, _ = env.reset(seed=seed)
+        now = grids(table, env.ranges)
+        past = [[now[i]] * 4 for i in range(n)]
+        over = np.zeros(n, dtype=bool)
+        for row in drive(env, 28, seed=6):  # in the middle of an episode
+            np.testing.assert_array_equal(seen, np.array(past))
+            kept, before = seen, seen.copy()
+            seen, _, terminations, truncations, _ = env.step(row)
+            now = grids(table, env.ranges)
+            past = [[now[i]] * 4 if over[i] else [*past[i][1:], now[i]] for i in range(n)]
+            over = terminations | truncations
+            np.testing.assert_array_equal(kept, before)  # what was returned is the caller's own
+        assert any((stack[0] != stack[3]).any() for stack in past)
+
+
+def test_rays_motion_speed_and_steering_are_shares(maps: Maps) -> None:
+    env = GridSimVectorEnv(5, scenario="highway", maps=maps["highway"], motion=True, steering=True)
+    env.reset(seed=3)
+    for action in (Action.ACCELERATE, Action.ACCELERATE_LEFT):
+        seen, *_, info = env.step(np.full(5, action))
+        cars = env.simulator.state.cars
+        np.testing.assert_allclose(seen[:, :31] * 50.0, env.ranges, rtol=1e-6)
+        np.testing.assert_allclose(seen[:, 31:62] * 30.0, np.clip(env.simulator.closing, -30.0, 30.0), atol=1e-5)
+        np.testing.assert_allclose(seen[:, 62] * 30.0, info["speed_mps"], rtol=1e-6)
+        np.testing.assert_allclose(seen[:, 63] * 27.0, np.degrees(cars[:, STEERING]), rtol=1e-5)
+    assert np.abs(env.simulator.closing).max() > 1.0
+
+
+def test_pedal_and_wheel_are_clipped_and_do_what_they_say(maps: Maps) -> None:
+    env = GridSimVectorEnv(3, maps=maps["seamless"], actions="continuous")
+    env.reset(seed=0, options={"map_seed": 0})
+    *_, info = env.step(np.array([[1e300, 0.0], [0.5, 0.0], [0.0, 0.0]]))
+    np.testing.assert_allclose(info["speed_mps"], [0.3, 0.15, 0.0], atol=1e-6)  # 3 m/s2 for 0.1 s
+    assert env.simulator.state.cars[:, STEERING] == pytest.approx(0.0)
+    env.step(np.array([[0.0, 1.01], [0.0, -math.inf], [0.0, 0.1]]))
+    steering = np.degrees(env.simulator.state.cars[:, STEERING])
+    np.testing.assert_allclose(steering, [6.0, -6.0, 2.7], atol=1e-3)  # 60 degrees/s; 27 at the lock
+
+
+# --- ends and options
+
+
+def test_success_and_time_truncate_and_everything_else_terminates(maps: Maps) -> None:
+    timed = GridSimEnv(maps=maps["seamless"], max_episode_steps=3)
     timed.reset(seed=0)
     outcomes = [timed.step(Action.NONE) for _ in range(3)]
     assert [(o[2], o[3], o[4]["end"]) for o in outcomes] == [(False, False, End.RUNNING)] * 2 + [
@@ -198,7 +251,7 @@ def test_success_and_time_truncate_and_everything_else_terminates(maps: list[Map
     ]
     assert not any(o[4]["is_success"] for o in outcomes)
 
-    crashing = GridSimEnv(maps=maps)
+    crashing = GridSimEnv(maps=maps["seamless"])
     crashing.reset(seed=0)
     while True:
         _, reward, term, trunc, info = crashing.step(Action.ACCELERATE_LEFT)
@@ -207,7 +260,7 @@ def test_success_and_time_truncate_and_everything_else_terminates(maps: list[Map
         assert 0.0 < reward <= 1.0
     assert (term, trunc, info["end"], reward) == (True, False, End.COLLISION, -1.0)
 
-    parked = GridSimEnv(maps=maps)
+    parked = GridSimEnv(maps=maps["seamless"])
     parked.reset(seed=0)
     for _ in range(100):
         _, reward, term, trunc, info = parked.step(Action.BRAKE)
@@ -216,7 +269,7 @@ def test_success_and_time_truncate_and_everything_else_terminates(maps: list[Map
     assert (term, trunc, info["end"], info["speed_mps"]) == (True, False, End.IDLE, 0.0)
     assert reward == pytest.approx(0.7 * parked.cars.ranges.min() / 50.0)  # of a step at a stand: no penalty
 
-    short = GridSimEnv(maps=maps, config=SimConfig(episode=EpisodeConfig(target=1.0)))
+    short = GridSimEnv(maps=maps["seamless"], config=SimConfig(episode=EpisodeConfig(target=1.0)))
     short.reset(seed=0)
     for _ in range(10):
         _, reward, term, trunc, info = short.step(Action.ACCELERATE)
@@ -227,39 +280,8 @@ def test_success_and_time_truncate_and_everything_else_terminates(maps: list[Map
     assert info["distance_m"] >= 1.0
 
 
-def test_the_reward_is_the_papers(maps: list[Map]) -> None:
-    env = GridSimVectorEnv(16, maps=maps)
-    env.reset(seed=2)
-    before = np.zeros(16)
-    for _ in range(5):
-        observations, rewards, terminations, _, info = env.step(np.full(16, Action.ACCELERATE))
-        assert not terminations.any()
-        progress, before = info["distance_m"] - before, info["distance_m"].astype(float)
-        expected = (
-            0.15 * np.clip(progress / 1.2, 0, 1)
-            + 0.15 * np.clip(info["speed_mps"] / 12.0, 0, 1)
-            + 0.7 * observations[:, :-1].min(axis=1)
-        )
-        np.testing.assert_allclose(rewards, expected, atol=1e-4)
-
-
-def test_the_step_after_an_end_begins_the_next_episode_and_does_not_drive(maps: list[Map]) -> None:
-    env = GridSimVectorEnv(8, maps=maps, max_episode_steps=4)
-    env.reset(seed=0)
-    for _ in range(4):
-        *_, truncations, info = env.step(np.full(8, Action.ACCELERATE))
-    assert truncations.all()
-    assert (info["distance_m"] > 0.0).all()
-    _, rewards, terminations, truncations, info = env.step(np.full(8, Action.ACCELERATE))
-    assert not (terminations | truncations | (rewards != 0.0) | (info["distance_m"] != 0.0)).any()
-    np.testing.assert_array_equal(info["speed_mps"], 0.0)
-    assert set(info["end"]) == {End.RUNNING}
-    *_, info = env.step(np.full(8, Action.ACCELERATE))
-    assert (info["distance_m"] > 0.0).all()
-
-
-def test_what_was_returned_is_the_callers_own(maps: list[Map]) -> None:
-    env = GridSimVectorEnv(4, maps=maps)
+def test_what_was_returned_is_the_callers_own(maps: Maps) -> None:
+    env = GridSimVectorEnv(4, maps=maps["seamless"])
     first, first_info = env.reset(seed=0)
     kept = [first, *first_info.values()]
     for _ in range(40):
@@ -270,32 +292,17 @@ def test_what_was_returned_is_the_callers_own(maps: list[Map]) -> None:
         kept = [*outcome, *info.values()]
 
 
-def test_options_set_map_and_start(maps: list[Map]) -> None:
-    env = GridSimVectorEnv(2, maps=1, map_seed=0)
-    start = starts_at(maps[2], np.array([0.3]))[0]
-    observations, info = env.reset(seed=0, options={"map_seed": 2, "start": start})
+def test_options_set_map_and_start(maps: Maps) -> None:
+    env = GridSimVectorEnv(2, maps=1, map_seed=5)
+    start = starts_at(maps["seamless"][1], np.array([0.3]))[0]
+    observations, info = env.reset(seed=0, options={"map_seed": 1, "start": start})
     np.testing.assert_array_equal(observations[0], observations[1])
     np.testing.assert_array_equal(info["speed_mps"], start[3])
-    simulator = Simulator([maps[2]], 1)
+    simulator = Simulator([maps["seamless"][1]], 1)
     np.testing.assert_array_equal(simulator.reset(start[None])[0][0], env.ranges[0])
     plain, _ = env.reset(seed=0)
-    env.reset(options={"map_seed": [1, 2]})
+    env.reset(options={"map_seed": [1, 0]})
     np.testing.assert_array_equal(env.reset(seed=0)[0], plain)
-
-
-# --- wrappers
-
-
-def test_wrappers_of_a_single_environment_work() -> None:
-    env = RecordOne(FrameStackObservation(FlattenObservation(gymnasium.make(IDS[0], maps=1)), 4))
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (4, 32)
-    total, over = 0.0, False
-    while not over:
-        observation, reward, term, trunc, info = env.step(int(Action.ACCELERATE))
-        total, over = total + float(reward), term or trunc
-    assert observation in env.observation_space
-    assert info["episode"]["r"] == pytest.approx(total, abs=1e-5)
 
 
 @pytest.mark.parametrize("mode", ["single", "sync", "vector_entry_point"])
@@ -320,72 +327,51 @@ def test_the_time_limit_of_make_is_the_environments_own(mode: str, steps: int) -
         assert (terminated, truncated, info["end"]) == (False, True, End.TIME)
 
 
-def test_wrappers_of_vector_environments_work(maps: list[Map]) -> None:
-    n = 6
-    env = DictInfoToList(RecordEpisodeStatistics(FlattenAll(GridSimVectorEnv(n, maps=maps, max_episode_steps=30))))
-    env.reset(seed=0)
-    returns, counted = np.zeros(n), 0
-    over = np.zeros(n, dtype=bool)
-    for _ in range(100):
-        _, rewards, term, trunc, infos = env.step(np.full(n, Action.ACCELERATE))
-        returns = np.where(over, 0.0, returns + rewards)
-        over = term | trunc
-        assert len(infos) == n
-        for k in np.flatnonzero(over):
-            assert infos[k]["episode"]["r"] == pytest.approx(returns[k], abs=1e-4)
-            assert infos[k]["end"] in {End.COLLISION, End.TIME}
-            counted += 1
-    assert counted > n
-
-
-def test_the_native_environment_equals_gymnasiums_own_vector_of_singles(maps: list[Map]) -> None:
-    native = GridSimVectorEnv(4, maps=maps)
-    synced = gymnasium.vector.SyncVectorEnv([lambda: GridSimEnv(maps=maps)] * 4)
-    np.testing.assert_array_equal(native.reset(seed=40)[0], synced.reset(seed=40)[0])
-    for row in np.random.default_rng(3).integers(len(Action), size=(120, 4)):
-        ours, theirs = native.step(row), synced.step(row)
-        for a, b in zip(ours[:4], theirs[:4], strict=True):
-            np.testing.assert_array_equal(a, b)
-        assert ours[4].keys() == theirs[4].keys()
-        np.testing.assert_array_equal(ours[4]["distance_m"], theirs[4]["distance_m"])
-        np.testing.assert_array_equal(ours[4]["end"], theirs[4]["end"])
-        np.testing.assert_array_equal(ours[4]["is_success"], theirs[4]["is_success"])
-
-
 # --- wrong use
 
 
 @pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize(
-    ("action", "text"),
-    [(8, "not 8"), (-1, "not -1"), (np.nan, "nan"), (1.0, "whole numbers"), (None, "whole numbers")],
+    ("actions", "action", "text"),
+    [
+        ("discrete", 8, "not 8"),
+        ("discrete", -1, "not -1"),
+        ("discrete", math.nan, "nan"),
+        ("discrete", 1.0, "whole numbers"),
+        ("discrete", None, "whole numbers"),
+        ("discrete", [0], "cars"),
+        ("continuous", [math.nan, 0.0], "not nan"),
+        ("continuous", [None, 0.0], "numbers"),
+        ("continuous", [True, False], "numbers"),
+        ("continuous", [0.0, 0.0, 0.0], "cars"),
+        ("continuous", 0.0, "cars"),
+    ],
 )
-def test_an_action_that_is_none_is_refused(maps: list[Map], n: int, action: object, text: str) -> None:
-    env = GridSimVectorEnv(n, maps=maps)
+def test_a_wrong_action_is_refused(maps: Maps, n: int, actions: Any, action: object, text: str) -> None:
+    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"][:1], actions=actions)
     env.reset(seed=0)
-    before = env.simulator.state.cars.copy()
+    before, traffic = env.simulator.state.cars.copy(), env.simulator.state.worlds.copy()
     with pytest.raises(ValueError, match=text) as error:
         env.step(np.array([action] * n))
     assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match="cars"):
+        env.step(np.zeros((n + 1, 2)))
     np.testing.assert_array_equal(env.simulator.state.cars, before)
-
-
-def test_a_wrong_number_of_actions_is_refused(maps: list[Map]) -> None:
-    env = GridSimVectorEnv(3, maps=maps)
-    env.reset(seed=0)
-    for actions in (np.zeros(2, dtype=int), np.array(1), np.zeros((3, 1), dtype=int)):
-        with pytest.raises(ValueError, match="3 cars"):
-            env.step(actions)
-    single = GridSimEnv(maps=maps)
+    np.testing.assert_array_equal(env.simulator.state.worlds, traffic)
+    single = GridSimEnv("city", maps=maps["city"][:1], actions=actions)
     single.reset(seed=0)
-    with pytest.raises(ValueError, match="not 9"):
-        single.step(9)
+    with pytest.raises(ValueError, match=text):
+        single.step(action)
 
 
-def test_a_step_before_reset_or_after_an_end_says_so(maps: list[Map]) -> None:
+def test_steps_and_pictures_need_a_reset(maps: Maps) -> None:
+    options: Any = {"maps": maps["seamless"], "max_episode_steps": 1, "render_mode": "rgb_array"}
+    single = GridSimEnv(**options)
+    for env in (GridSimVectorEnv(2, **options), single):
+        with pytest.raises(ResetNeeded, match="before reset"):
+            env.render()
     with pytest.raises(ResetNeeded, match="before reset"):
-        GridSimVectorEnv(2, maps=maps).step(np.zeros(2, dtype=int))
-    single = GridSimEnv(maps=maps, max_episode_steps=1)
+        GridSimVectorEnv(2, **options).step(np.zeros(2, dtype=int))
     with pytest.raises(ResetNeeded, match="before reset"):
         single.step(0)
     single.reset(seed=0)
@@ -393,7 +379,7 @@ def test_a_step_before_reset_or_after_an_end_says_so(maps: list[Map]) -> None:
     with pytest.raises(ResetNeeded, match="after the episode's end"):
         single.step(0)
     with pytest.raises(RuntimeError, match="before every car was reset"):
-        Simulator(maps, 2).step(np.zeros(2, dtype=int))
+        Simulator(maps["seamless"], 2).step(np.zeros(2, dtype=int))
 
 
 @pytest.mark.parametrize(
@@ -428,8 +414,20 @@ def test_a_wrong_option_is_refused(options: dict[str, object], text: str) -> Non
         ({"map_seed": -1}, "map_seed"),
         ({"max_episode_steps": 0}, "1 step"),
         ({"config": SimConfig(episode=EpisodeConfig(target=-1.0))}, "target"),
+        ({"observation": "film"}, "observation must be rays or grid or image, not 'film'"),
+        ({"actions": "both"}, "actions must be discrete or continuous, not 'both'"),
+        ({"render_mode": "ansi"}, "render_mode must be None or rgb_array or human, not 'ansi'"),
+        ({"frames": 0}, "frames must be 1 to 8"),
+        ({"frames": 9, "observation": "grid"}, "frames must be 1 to 8"),
+        ({"frames": 4}, "only for grids"),
+        ({"motion": True, "observation": "image"}, "leave it out with observation='image'"),
+        ({"traffic": -1}, "not -1"),
+        ({"traffic": 3, "scenario": "no/map.yaml"}, "no lanes for traffic"),
+        ({"scenario": "no/map.yaml"}, "no/map.yaml"),
+        ({"autoreset_mode": "never"}, "must be one of NextStep, SameStep, Disabled, not 'never'"),
     ],
 )
 def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(text)):
+    with pytest.raises(ValueError, match=re.escape(text)) as error:
         GridSimVectorEnv(**arguments)
+    assert "\n" not in str(error.value)

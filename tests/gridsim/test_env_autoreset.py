@@ -8,7 +8,6 @@ import pytest
 from driving import SENSING, drive
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import iterate
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from gridsim.car.ego import End
@@ -16,7 +15,6 @@ from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.maps.map import Map
 
 N, STEPS = 4, 70
-Outcome = tuple[Any, float, bool, bool, int, float]  # observation, reward, terminated, truncated, end, metres
 
 
 def made(maps: dict[str, list[Map]], mode: AutoresetMode, **options: Any) -> GridSimVectorEnv:
@@ -34,59 +32,6 @@ def same(ours: Any, theirs: Any) -> None:
             same(a, b)
     else:
         np.testing.assert_array_equal(ours, theirs)
-
-
-def rows(env: GridSimVectorEnv, observations: Any) -> list[Any]:
-    return list(iterate(env.observation_space, observations))
-
-
-def episodes(env: GridSimVectorEnv, mode: AutoresetMode, actions: np.ndarray) -> list[list[tuple[Any, list[Outcome]]]]:
-    """Each car's episodes: first observation and what its steps returned; car i takes actions[k, i] at its step k."""
-    seen, _ = env.reset(seed=9)
-    found: list[list[tuple[Any, list[Outcome]]]] = [[(row, [])] for row in rows(env, seen)]
-    driven: Any = np.zeros(N, dtype=int)
-    over = np.zeros(N, dtype=bool)
-    while np.min(driven) < STEPS:
-        if mode is AutoresetMode.DISABLED and over.any():
-            seen, info = env.reset(options={"reset_mask": over})
-            assert (info["_end"] == over).all()
-            for k in np.flatnonzero(over):
-                found[k].append((rows(env, seen)[k], []))
-            over = np.zeros(N, dtype=bool)
-        seen, rewards, terminations, truncations, info = env.step(actions[np.minimum(driven, STEPS - 1), range(N)])
-        for i, row in enumerate(rows(env, seen)):
-            if mode is AutoresetMode.NEXT_STEP and over[i]:
-                found[i].append((row, []))
-                continue
-            told, last = info, row
-            if mode is AutoresetMode.SAME_STEP and "final_info" in info and info["_final_info"][i]:
-                told, last = info["final_info"], info["final_obs"][i]
-            outcome = (rewards[i], terminations[i], truncations[i], told["end"][i], told["distance_m"][i])
-            found[i][-1][1].append((last, *outcome))
-            driven[i] += 1
-            if last is not row:
-                found[i].append((row, []))
-        over = terminations | truncations
-    return found
-
-
-@pytest.mark.parametrize(("observation", "frames"), SENSING)
-def test_all_modes_drive_the_same_episodes(maps: dict[str, list[Map]], observation: str, frames: int) -> None:
-    options: dict[str, Any] = {"observation": observation, "frames": frames}
-    actions = drive(made(maps, AutoresetMode.NEXT_STEP), STEPS, seed=8)
-    first, *others = (episodes(made(maps, mode, **options), mode, actions) for mode in AutoresetMode)
-    for i in range(N):
-        assert len(first[i]) > 2
-        for other in others:
-            left = STEPS
-            for ours, theirs in zip(first[i], other[i], strict=False):
-                same(ours[0], theirs[0])
-                steps = min(len(ours[1]), len(theirs[1]), left)  # a mode may have gone on after STEPS
-                for a, b in zip(ours[1][:steps], theirs[1][:steps], strict=True):
-                    same(a[0], b[0])
-                    assert a[1:] == b[1:]
-                left -= steps
-            assert left == 0
 
 
 @pytest.mark.parametrize(("observation", "frames"), SENSING)
@@ -159,8 +104,3 @@ def test_a_wrong_mask_is_refused(maps: dict[str, list[Map]], mask: Any) -> None:
 def test_wrong_seeds_are_refused(maps: dict[str, list[Map]], seed: Any) -> None:
     with pytest.raises(ValueError, match="seed must be a whole number from 0, or 4 of them"):
         made(maps, AutoresetMode.NEXT_STEP).reset(seed=seed)
-
-
-def test_a_wrong_mode_is_refused() -> None:
-    with pytest.raises(ValueError, match="autoreset_mode must be one of NextStep, SameStep, Disabled, not 'never'"):
-        GridSimVectorEnv(1, autoreset_mode="never")
