@@ -23,6 +23,7 @@ from evolution.networks.policy import (
     STRIDE_2,
     UNIT_MULTIPLE,
     CnnSpec,
+    greatest,
 )
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
@@ -82,46 +83,45 @@ def forward(genome, layers, speed, scratch):
     for y in range(SIDE_1):
         for x in (0, SIDE_1 - _HALF_ROW):
             at, to = STRIDE_1 * (y * CELLS + x), (y * SIDE_1 + x) * one
-            if one % _WIDE == 0:
-                for c in range(0, one, _WIDE):
-                    _convolve_1_wide(
-                        scratch.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
-                        genome, c, one, bias + c, scratch.first, to + c, one,
-                    )  # fmt: skip
-            else:
-                for c in range(0, one, UNIT_MULTIPLE):
-                    _convolve_1(
-                        scratch.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
-                        genome, c, one, bias + c, scratch.first, to + c, one,
-                    )  # fmt: skip
+            c = 0
+            while one - c >= _WIDE:
+                _convolve_1_wide(
+                    scratch.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
+                    genome, c, one, bias + c, scratch.first, to + c, one,
+                )  # fmt: skip
+                c += _WIDE
+            if c < one:
+                _convolve_1(
+                    scratch.frames, at, STRIDE_1, frames, _AREA, KERNEL_1, CELLS, KERNEL_1,
+                    genome, c, one, bias + c, scratch.first, to + c, one,
+                )  # fmt: skip
     start = bias + one
     bias = start + KERNEL_2 * KERNEL_2 * one * two
     for y in range(SIDE_2):
         at, to = STRIDE_2 * y * SIDE_1 * one, y * SIDE_2 * two
-        if two % _WIDE == 0:
-            for c in range(0, two, _WIDE):
-                _convolve_2_wide(
-                    scratch.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
-                    genome, start + c, two, bias + c, scratch.second, to + c, two,
-                )  # fmt: skip
-        else:
-            for c in range(0, two, UNIT_MULTIPLE):
-                _convolve_2(
-                    scratch.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
-                    genome, start + c, two, bias + c, scratch.second, to + c, two,
-                )  # fmt: skip
+        c = 0
+        while two - c >= _WIDE:
+            _convolve_2_wide(
+                scratch.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
+                genome, start + c, two, bias + c, scratch.second, to + c, two,
+            )  # fmt: skip
+            c += _WIDE
+        if c < two:
+            _convolve_2(
+                scratch.first, at, STRIDE_2 * one, 1, 0, KERNEL_2, SIDE_1 * one, KERNEL_2 * one,
+                genome, start + c, two, bias + c, scratch.second, to + c, two,
+            )  # fmt: skip
     start = bias + two
     inputs = SIDE_2 * SIDE_2 * two + 1
     scratch.second[inputs - 1] = speed / SPEED_SCALE - _F(1.0)
     bias = start + inputs * units
-    if units % _WIDEST == 0:
-        for c in range(0, units, _WIDEST):
-            _dense_wide(
-                scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0
-            )
-    else:
-        for c in range(0, units, UNIT_MULTIPLE):
-            _dense(scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0)
+    c = 0
+    while units - c >= _WIDEST:
+        _dense_wide(scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0)
+        c += _WIDEST
+    while c < units:
+        _dense(scratch.second, 0, 0, 1, 0, 1, 0, inputs, genome, start + c, units, bias + c, scratch.dense, c, 0)
+        c += UNIT_MULTIPLE
     start = bias + units
     _linear(
         scratch.dense, 0, 0, 1, 0, 1, 0, units,
@@ -131,17 +131,9 @@ def forward(genome, layers, speed, scratch):
 
 @leaf
 def decide(genome, layers, speed, scratch):
-    """Index of the largest output, the first one of ties; -1 if an output is NaN."""
+    """Index of the largest output; -1 if an output is NaN."""
     forward(genome, layers, speed, scratch)
-    outputs = scratch.outputs
-    best, action = outputs[0], 0
-    number = best == best
-    for k in range(1, outputs.shape[0]):
-        value = outputs[k]
-        number &= value == value
-        if value > best:
-            best, action = value, k
-    return action if number else -1
+    return greatest(scratch.outputs, 0, scratch.outputs.shape[0])
 
 
 @njit
@@ -152,9 +144,7 @@ def _act_on(genome, layers, frames, speeds, scratch, actions):
         actions[n] = decide(genome, layers, speeds[n], scratch)
 
 
-def act_on(
-    spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: float | np.ndarray
-) -> int | np.ndarray:  # fmt: skip
+def act_on(spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: float | np.ndarray) -> int | np.ndarray:
     """Actions of a genome for grids.
 
     Args: observation uint8 [80, 80] for a network of one frame, [frames, 80, 80] for one of several, newest last, or

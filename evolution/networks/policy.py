@@ -15,7 +15,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from evolution.networks.dense import dense
+from evolution.networks.dense import tile
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
@@ -123,8 +123,7 @@ class MlpSpec(PolicySpec):
         return freeze(np.array([self.inputs, *self.hidden, self.outputs], dtype=np.int32))
 
     def shapes(self) -> tuple[tuple[int, int], ...]:
-        units = (self.inputs, *self.hidden, self.outputs)
-        return tuple(itertools.pairwise(units))
+        return tuple(itertools.pairwise(self.layers.tolist()))
 
 
 # Kernels and strides of the convolutions of Mnih et al. (2015), which the paper's authors use for their grid.
@@ -229,7 +228,7 @@ def squash(x):
 
 
 BLOCK = 8  # a layer's outputs are padded to whole blocks
-_dense_64, _dense_16, _dense_8 = dense(64, 1), dense(16, 2), dense(8, 4)
+_dense_64, _dense_16, _dense_8 = tile(1, 64, False), tile(1, 16, False, 2), tile(1, 8, False, 4)
 
 
 @njit
@@ -286,13 +285,16 @@ def forward(packed, layers, scratch):
         target = half - source
         unit = 0
         while width - unit >= 64:
-            _dense_64(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            bias = at + unit
+            _dense_64(scratch, source, 0, 1, 0, 1, 0, n, packed, bias + width, width, bias, scratch, target + unit, 0)
             unit += 64
         while width - unit >= 16:
-            _dense_16(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            bias = at + unit
+            _dense_16(scratch, source, 0, 1, 0, 1, 0, n, packed, bias + width, width, bias, scratch, target + unit, 0)
             unit += 16
         if width - unit >= 8:
-            _dense_8(scratch, source, n, packed, at + width + unit, width, at + unit, scratch, target + unit)
+            bias = at + unit
+            _dense_8(scratch, source, 0, 1, 0, 1, 0, n, packed, bias + width, width, bias, scratch, target + unit, 0)
         if k < last:
             for j in range(width):
                 scratch[target + j] = squash(scratch[target + j])
@@ -302,37 +304,29 @@ def forward(packed, layers, scratch):
 
 
 @leaf
-def decide(packed, layers, scratch):
-    """Index of the largest output, the first one of ties; -1 if an output is NaN."""
-    at = forward(packed, layers, scratch)
-    best, action = scratch[at], 0
+def greatest(values, first, n):
+    """Index of the greatest of n values from `first` on, the first one of ties; -1 if one is NaN."""
+    best, index = values[first], 0
     number = best == best
-    for k in range(1, layers[layers.shape[0] - 1]):
-        value = scratch[at + k]
+    for k in range(1, n):
+        value = values[first + k]
         number &= value == value
         if value > best:
-            best, action = value, k
-    return action if number else -1
+            best, index = value, k
+    return index if number else -1
+
+
+@leaf
+def decide(packed, layers, scratch):
+    """The action of a perceptron: index of its largest output; -1 if an output is NaN."""
+    return greatest(scratch, forward(packed, layers, scratch), layers[layers.shape[0] - 1])
 
 
 @njit
-def _act_on(packed, layers, observations, motion, steers, reach, speed_limit, steering_limit, actions):
+def _act_on(packed, layers, ranges, closing, speeds, angles, actions):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
-    rays = layers[0] - 2 if steers else layers[0] - 1
-    rays = rays // 2 if motion else rays
-    last = 2 * rays if motion else rays
-    ranges, closing = np.empty(rays, dtype=np.float32), np.empty(rays, dtype=np.float32)
-    for n in range(observations.shape[0]):
-        for i in range(rays):
-            ranges[i] = observations[n, i] * reach
-        speed = observations[n, last] * speed_limit
-        steering = observations[n, last + 1] * steering_limit if steers else _F(0.0)
-        if motion:
-            for i in range(rays):
-                closing[i] = observations[n, rays + i] * speed_limit
-            encode(ranges, closing, speed, steering, scratch)
-        else:
-            encode(ranges, None, speed, steering, scratch)
+    for n in range(ranges.shape[0]):
+        encode(ranges[n], None if closing is None else closing[n], speeds[n], angles[n], scratch)
         actions[n] = decide(packed, layers, scratch)
 
 
@@ -352,14 +346,13 @@ def act_on(
     Returns: an action, or int64 [n]; -1 if an output is NaN.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
-    if many.ndim != 2 or many.shape[1] != spec.inputs:
+    if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
     packed = np.empty(packed_size(spec.layers), dtype=np.float32)
     pack(np.ascontiguousarray(genome), spec.layers, packed)
+    closing = many[:, RAYS : 2 * RAYS] * _F(speed_limit) if spec.motion else None
+    speeds = many[:, 2 * RAYS if spec.motion else RAYS] * _F(speed_limit)
+    angles = many[:, -1] * _F(steering_limit)
     actions = np.empty(len(many), dtype=np.int64)
-    motion, steers = (spec.motion, spec.steering) if isinstance(spec, MlpSpec) else (False, False)
-    _act_on(
-        packed, spec.layers, np.ascontiguousarray(many), motion, steers,
-        _F(reach), _F(speed_limit), _F(steering_limit), actions,
-    )  # fmt: skip
+    _act_on(packed, spec.layers, many[:, :RAYS] * _F(reach), closing, speeds, angles, actions)
     return int(actions[0]) if np.ndim(observation) == 1 else actions
