@@ -1,7 +1,6 @@
-"""Drives the episodes of whole populations in one fused kernel: sense, network, act, advance until the end.
+"""Drives episodes in one fused kernel: sense, network, act, advance until the end.
 
-`collecting` has the same loop with a recorder and shares its parts. These two are the only users of the simulator in
-`evolution`. Results depend only on the arguments.
+`evaluate` drives whole populations, `collecting` one policy with a recorder. Results depend only on the arguments.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evolution.dqn.experience import NO_ACTION, Experience, store_grid, store_rays
 from evolution.networks import convnet
 from evolution.networks.policy import (
     RAYS,
@@ -25,22 +25,10 @@ from evolution.networks.policy import (
     packed_size,
     scratch_size,
 )
-from gridsim.car.ego import (
-    COS,
-    DISTANCE,
-    FIELDS,
-    PACED,
-    SIN,
-    SPEED,
-    STEERING,
-    STEPS,
-    X,
-    Y,
-    drive,
-    look,
-    place,
-)
+from gridsim.car.ego import COS, DISTANCE, FIELDS, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y, drive, look, place
+from gridsim.car.reward import reward
 from gridsim.config import Constants, SimConfig, constants
+from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.jit import leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
@@ -50,7 +38,8 @@ from gridsim.sensing.rays import SIMD_RAYS, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
-_F = np.float32
+_F, _U = np.float32, np.uint64
+_IDLE = int(End.IDLE)
 
 #: An episode: index of its map in the task; x, y (m), heading (rad), speed (m/s), steering (rad) at its start; its
 #: target (m) and time limit (control steps), or 0 for those of `Limits`; rewind: return the state so many control steps
@@ -59,7 +48,6 @@ EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("st
 
 #: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
-
 
 MAX_STEPS = 65_535
 
@@ -80,19 +68,16 @@ class GridBuffers(NamedTuple):
     grid: np.ndarray  # uint8 [cells]
 
 
-def make_grid_buffers(spec: PolicySpec, config: SimConfig) -> GridBuffers | None:
-    """GridBuffers, or None for a policy on rays. Raises: ValueError if the sensor has a wrong number of rays."""
+def policy_buffers(spec: PolicySpec, config: SimConfig) -> tuple[np.ndarray | None, GridBuffers | None]:
+    """Buffers for closing speeds, float32 [rays], and for grids; None for what the policy does not see.
+
+    Raises: ValueError if the sensor has a wrong number of rays.
+    """
     if isinstance(spec, CnnSpec):
-        return GridBuffers(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
+        return None, GridBuffers(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
     if config.sensors.rays != RAYS:
         raise ValueError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
-    return None
-
-
-def make_closing(spec: PolicySpec, config: SimConfig) -> np.ndarray | None:
-    """A buffer for closing speeds, float32 [rays], or None if the policy does not see them."""
-    sees = isinstance(spec, MlpSpec) and spec.motion
-    return np.zeros(config.sensors.rays, dtype=np.float32) if sees else None
+    return np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None, None
 
 
 class Simulation(NamedTuple):
@@ -173,8 +158,16 @@ def packed_genome(genome, layers, grid_buffers):
     return packed
 
 
+class Recorder(NamedTuple):
+    """Where an episode's experience is written, and its exploration."""
+
+    experience: Experience  # of at least as many rows as the episode has steps, and one more
+    epsilon: np.float32  # share of random actions, which are uniform over all actions
+    key: np.uint64  # seed of the episode's random numbers
+
+
 @leaf
-def observe(simulation, car, world, workspace, closing, grid_buffers):
+def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
     look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.beams, workspace.ranges, closing)
     if grid_buffers is None:
@@ -184,7 +177,23 @@ def observe(simulation, car, world, workspace, closing, grid_buffers):
 
 
 @leaf
-def choose_action(packed, layers, car, workspace, grid_buffers, begun):
+def _record(simulation, car, workspace, grid_buffers, experience, row, gained, end):
+    """Record a row's observation, and the reward of the step that led to it, in which the car gained ground (m)."""
+    observations, actions, rewards, ends = experience
+    if grid_buffers is None:
+        store_rays(workspace.scratch, observations[row])
+    else:
+        store_grid(grid_buffers.grid, car[SPEED], observations[row])
+    actions[row], rewards[row], ends[row] = NO_ACTION, _F(0.0), 0
+    if row > 0:
+        k, ranges = simulation.constants, workspace.ranges
+        fastest = simulation.road.speed_high
+        rewards[row - 1] = reward(ranges, k.ray_range, car[SPEED], gained, end, fastest, k.dt)
+        ends[row - 1] = end
+
+
+@leaf
+def _choose_action(packed, layers, car, workspace, grid_buffers, begun):
     """Index of the action for the observation, which is overwritten; -1 if an output is NaN."""
     if grid_buffers is None:
         return decide(packed, layers, workspace.scratch)
@@ -193,54 +202,68 @@ def choose_action(packed, layers, car, workspace, grid_buffers, begun):
 
 
 @leaf
-def control_step(simulation, setup, car, visits, world, action, steps):
-    """One control step of the car and its world, after `steps` steps of the episode. Returns: End as a number."""
+def _explore(recorder, step, action, actions):
+    """A random action with probability epsilon, else the given one. Uses one random number a step."""
+    bits = mix(mix(recorder.key) + _U(step) * GOLDEN)
+    if uniform(bits) < recorder.epsilon:
+        return int((bits & _U(0xFFFFFFFF)) * _U(actions) >> _U(32))
+    return action
+
+
+@leaf
+def _control_step(simulation, setup, car, visits, world, action):
+    """One control step of the car and its world. Returns: End as a number."""
     if world is not None:
         flow(simulation.network, simulation.drivers, world, car)
     end = drive(simulation.road, simulation.constants, car, visits, world, action)
     if end == 0:
         if car[DISTANCE] >= setup.target:
             return 3
-        if steps + 1 >= setup.steps:
+        if car[STEPS] >= setup.steps:
             return 4
     return end
 
 
-@njit
-def _run(simulation, packed, layers, setup, workspace, world, closing, grid_buffers):
-    """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers.
+@njit(nogil=True)
+def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, result):
+    """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
 
-    What may be None is a separate argument, because Numba removes dead branches only for arguments.
-
-    Returns: End as a number.
+    What may be None is a separate argument, because Numba removes dead branches only for arguments. If an output is
+    NaN, the episode ends as IDLE; so does the last recorded step, if any.
     """
     car = workspace.car
     place(simulation.road, setup.start, car, workspace.visits)
     keep = workspace.ring.shape[0]
     end = 0
     steps = 0
-    while end == 0:
-        observe(simulation, car, world, workspace, closing, grid_buffers)
-        action = choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
-        if action < 0:  # NaN: the episode ends
-            end = 2
+    before = _F(0.0)
+    while True:
+        if recorder is None and end != 0:
             break
+        _observe(simulation, car, world, workspace, closing, grid_buffers)
+        if recorder is not None:
+            gained = car[DISTANCE] - before
+            _record(simulation, car, workspace, grid_buffers, recorder.experience, steps, gained, end)
+            if end != 0:
+                break
+        action = _choose_action(packed, layers, car, workspace, grid_buffers, steps == 0)
+        if action < 0:
+            end = _IDLE
+            if recorder is not None and steps > 0:
+                recorder.experience.ends[steps - 1] = end
+            break
+        if recorder is not None:
+            action = _explore(recorder, steps, action, layers[layers.shape[0] - 1])
+            recorder.experience.actions[steps] = action
         if keep > 0:
             _copy(car, workspace.ring[steps % keep])
             if world is not None:
                 _copy_world(world, workspace.world_ring[steps % keep])
-        end = control_step(simulation, setup, car, workspace.visits, world, action, steps)
+        before = car[DISTANCE]
+        end = _control_step(simulation, setup, car, workspace.visits, world, action)
         steps += 1
-    return end
-
-
-@leaf
-def write_result(car, end, row):
-    """Fill a RESULT."""
-    row["distance"] = car[DISTANCE]
-    row["paced"] = car[PACED]
-    row["steps"] = car[STEPS]
-    row["end"] = end
+    result["distance"], result["paced"] = car[DISTANCE], car[PACED]
+    result["steps"], result["end"] = steps, end
 
 
 @njit(nogil=True)
@@ -252,14 +275,12 @@ def _rollout(
     If rewind > 0, also fills rewound [n, 5] and rewound_worlds [n, cars, fields].
     """
     workspace = make_workspace(simulation, layers, rewind, 0 if traffic is None else traffic.shape[0])
-    car = workspace.car
     for i in range(genomes.shape[0]):
         packed = packed_genome(genomes[i], layers, grid_buffers)
         world = None if traffic is None else traffic.copy()
-        end = _run(simulation, packed, layers, setup, workspace, world, closing, grid_buffers)
-        write_result(car, end, results[i])
+        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, None, results[i])
         if rewind > 0:
-            row_back = max(int(car[STEPS]) - rewind, 0) % rewind
+            row_back = max(int(workspace.car[STEPS]) - rewind, 0) % rewind
             back = workspace.ring[row_back]
             if traffic is not None:
                 _copy_world(workspace.world_ring[row_back], rewound_worlds[i])
@@ -295,11 +316,6 @@ def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | No
     return worlds
 
 
-def kernel_world(worlds: np.ndarray, k: int) -> np.ndarray | None:
-    """Worlds[k] for kernels: read-only, or None without cars."""
-    return freeze(worlds[k].copy()) if worlds.shape[1] else None
-
-
 def evaluate(
     spec: PolicySpec,
     genomes: np.ndarray,
@@ -323,7 +339,7 @@ def evaluate(
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
-    grid_buffers, worlds = make_grid_buffers(spec, config), checked_worlds(episodes, limits, worlds)
+    buffers, worlds = policy_buffers(spec, config), checked_worlds(episodes, limits, worlds)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     # Transposed, because the kernel fills one episode at a time.
     results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
@@ -338,9 +354,8 @@ def evaluate(
             genomes,
             spec.layers,
             episode_setup(episode, limits),
-            kernel_world(worlds, column),
-            make_closing(spec, config),
-            grid_buffers,
+            freeze(worlds[column].copy()) if worlds.shape[1] else None,
+            *buffers,
             int(episode["rewind"]),
             results[column],
             rewound[kept[column]],
@@ -369,29 +384,25 @@ def trajectory(
     Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
     `gridsim.car.ego`, and the traffic at these times, float32 [steps + 1, cars, world.FIELDS]).
     """
-    result, states, worlds = _trajectory(
-        simulations_on([road_map], config)[0],
-        freeze(genome),
+    simulation, cars = simulations_on([road_map], config)[0], 0 if world is None else len(world)
+    workspace = make_workspace(simulation, spec.layers, limits.steps + 1, cars)
+    closing, grid_buffers = policy_buffers(spec, config)
+    world = world.copy() if world is not None and cars else None
+    result = np.zeros(1, dtype=RESULT)
+    run_episode(
+        simulation,
+        packed_genome(freeze(genome), spec.layers, grid_buffers),
         spec.layers,
         EpisodeSetup(freeze(start), _F(limits.target), limits.steps),
-        None if world is None or not len(world) else freeze(world.copy()),
-        make_closing(spec, config),
-        make_grid_buffers(spec, config),
+        workspace,
+        world,
+        closing,
+        grid_buffers,
+        None,
+        result[0],
     )
-    row = np.zeros((), dtype=RESULT)
-    row["distance"], row["paced"], row["steps"], row["end"] = result
-    return row, states[: int(row["steps"]) + 1], worlds[: int(row["steps"]) + 1]
-
-
-@njit(nogil=True)
-def _trajectory(simulation, genome, layers, setup, traffic, closing, grid_buffers):
-    workspace = make_workspace(simulation, layers, setup.steps + 1, 0 if traffic is None else traffic.shape[0])
-    car = workspace.car
-    world = None if traffic is None else traffic.copy()
-    end = _run(
-        simulation, packed_genome(genome, layers, grid_buffers), layers, setup, workspace, world, closing, grid_buffers
-    )
-    _copy(car, workspace.ring[int(car[STEPS])])
-    if traffic is not None:
-        _copy_world(world, workspace.world_ring[int(car[STEPS])])
-    return (car[DISTANCE], car[PACED], car[STEPS], end), workspace.ring, workspace.world_ring
+    last = int(result[0]["steps"])
+    workspace.ring[last] = workspace.car
+    if world is not None:
+        workspace.world_ring[last] = world
+    return result[0], workspace.ring[: last + 1], workspace.world_ring[: last + 1]

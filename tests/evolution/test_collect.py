@@ -1,4 +1,4 @@
-"""Collecting: the fused loop against `Simulator` and the environment, step by step; nothing lost, nothing mixed up."""
+"""Collecting: the fused loop against a slow one around `Simulator`, step by step; nothing lost, nothing mixed up."""
 
 import math
 from collections.abc import Iterator
@@ -10,8 +10,6 @@ import pytest
 from driving import to_bytes
 
 from cluster.runs.champion import load_champion
-from cluster.workers.pool import SerialPool
-from cluster.workers.worker import CollectTask, Worker
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.collecting import collect
 from evolution.episodes.rollout import Limits, evaluate, no_traffic
@@ -19,8 +17,7 @@ from evolution.episodes.starts import lane_starts
 from evolution.networks import convnet
 from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
 from gridsim.car.ego import STEERING, End
-from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.envs.env import GridSimVectorEnv
+from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.map import Map
@@ -196,53 +193,6 @@ def test_every_row_is_what_a_slow_loop_sees_does_and_gains(
         assert np.abs(inputs[:, 31:62]).max() > 0.1, "nobody was met"
 
 
-@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
-def test_the_environment_pays_and_shows_the_same(scenarios: list[Map], driver: np.ndarray, policy: str) -> None:
-    """Bit for bit, stepped with the same actions: rewards, ends, the frames, and the ranges' fixed point."""
-    of = asked(policy, scenarios, driver, 12, 0.0, 0)
-    of.epsilons[:] = np.linspace(0.1, 0.9, 12)
-    config = SimConfig(episode=EpisodeConfig(target=LIMITS.target))
-    frames = of.spec.frames if isinstance(of.spec, CnnSpec) else 1
-    grid = isinstance(of.spec, CnnSpec)
-    experience, results = collect(*of)
-    inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
-    row = 0
-    for k, episode in enumerate(of.episodes):
-        scenario = scenarios[episode["map"]]
-        env = GridSimVectorEnv(
-            1,
-            scenario=scenario.name,
-            maps=[scenario],
-            traffic=0,
-            observation="grid" if grid else "rays",
-            frames=frames,
-            max_episode_steps=LIMITS.steps,
-            config=config,
-        )
-        observation, info = env.reset(seed=0, options={"start": episode["start"]})
-        for step in range(int(results[k]["steps"]) + 1):
-            if grid:
-                assert (np.rint(inputs[row, :-1] * 255) == observation["grid"][0].reshape(-1)).all()
-                assert inputs[row, -1] == math.floor((info["speed_mps"][0] / F(10) - F(1)) * F(4096) + F(0.5)) / 4096
-            else:
-                ranges = env.ranges[0]
-                near = F(2.0) * ranges / (ranges + F(8.0)) - F(1.0)
-                assert (experience.observations[row, :31] - np.floor(near * F(4096) + F(0.5)) <= 1).all()
-            if step == int(results[k]["steps"]):
-                assert experience.actions[row] == NO_ACTION
-                row += 1
-                break
-            observation, rewards, terminations, truncations, info = env.step(experience.actions[row : row + 1])
-            assert rewards.tobytes() == experience.rewards[row : row + 1].tobytes()
-            # The environment truncates at success; to the DQN that is an end.
-            assert (int(experience.ends[row]) in (End.SUCCESS, End.TIME)) == truncations[0]
-            assert (int(experience.ends[row]) in (End.COLLISION, End.IDLE)) == terminations[0]
-            row += 1
-    assert row == len(experience.actions)
-    assert End.COLLISION in results["end"]
-    assert len(set(results["end"])) > 1
-
-
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", POLICIES)
 def test_without_exploring_it_is_evaluate(scenarios: list[Map], driver: np.ndarray, policy: str, cars: int) -> None:
@@ -264,41 +214,26 @@ def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(
     of.episodes["steps"][::3] = 40
     of.episodes["target"][::5] = 25.0
     experience, results = collect(*of)
-    seen = set()
     for episode, row, result in zip(cut_up(experience), of.episodes, results, strict=True):
-        steps = len(episode.actions) - 1
-        assert steps == result["steps"] <= (row["steps"] or LIMITS.steps)
+        steps, most = len(episode.actions) - 1, row["steps"] or LIMITS.steps
+        assert steps == result["steps"] <= most
         assert episode.ends.tolist() == [0] * (steps - 1) + [int(result["end"]), 0]
         assert (episode.actions[:-1] < 8).all()
-        assert episode.rewards[-1] == 0.0
-        assert (episode.rewards[:-1] >= -1.0).all()
-        assert (episode.rewards <= 1.0).all()
         assert (episode.rewards[:-1] == -1.0).tolist() == [False] * (steps - 1) + [result["end"] == End.COLLISION]
-        if result["end"] == End.TIME:
-            assert steps == (row["steps"] or LIMITS.steps)
-        if result["end"] == End.SUCCESS:
-            assert result["distance"] >= (row["target"] or LIMITS.target)
-        seen.add(End(int(result["end"])))
-    assert seen == {End.COLLISION, End.IDLE, End.SUCCESS, End.TIME}
+        assert (result["end"] == End.TIME) <= (steps == most)
+        assert (result["end"] == End.SUCCESS) == (result["distance"] >= (row["target"] or LIMITS.target))
+    assert set(results["end"]) == {End.COLLISION, End.IDLE, End.SUCCESS, End.TIME}
 
 
-@pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
-def test_a_network_without_numbers_leaves_whole_rows(
-    scenarios: list[Map], driver: np.ndarray, policy: str, poison: float
-) -> None:
+def test_a_network_without_numbers_leaves_whole_rows(scenarios: list[Map], driver: np.ndarray, policy: str) -> None:
     of = asked(policy, scenarios, driver, 6, 0.5, 0)
-    weights = of.weights.copy()
-    weights[-1] = poison
-    for spoilt in (weights, np.full_like(weights, math.nan)):
-        experience, results = collect(*of._replace(weights=spoilt))
-        assert len(list(cut_up(experience))) == 6
-        assert len(experience.actions) == results["steps"].sum() + 6
-        assert np.isfinite(experience.rewards).all()
-    assert (results["end"] == End.IDLE).all()
-    assert (results["distance"] == 0.0).all()
+    experience, results = collect(*of._replace(weights=np.full_like(of.weights, math.nan)))
     assert experience.actions.tolist() == [NO_ACTION] * 6
     assert not experience.ends.any()
+    assert not experience.rewards.any()
+    assert (results["end"] == End.IDLE).all()
+    assert (results["distance"] == 0.0).all()
 
 
 def test_a_network_that_loses_its_numbers_on_the_way(scenarios: list[Map], driver: np.ndarray) -> None:
@@ -354,42 +289,13 @@ def test_an_episode_depends_on_itself_alone(scenarios: list[Map], driver: np.nda
     assert all(changed[3:])
 
 
-# --- Pools -----------------------------------------------------------------------------------------------------------
-
-
-def as_task(of: Asked) -> CollectTask:
-    names = tuple((scenario.name, scenario.seed) for scenario in of.scenarios)
-    arrays = (of.episodes.copy(), of.worlds.copy(), names, of.epsilons.copy(), of.keys.copy())
-    return CollectTask(str(of.spec), of.weights.copy(), *arrays, of.limits, of.config)
-
-
-@pytest.mark.parametrize("policy", POLICIES)
-def test_the_serial_pool_keeps_the_order_whatever_the_cut(
-    scenarios: list[Map], driver: np.ndarray, policy: str
-) -> None:
-    of = asked(policy, scenarios, driver, 40, 0.2, CARS)
-    whole, results = collect(*of)
-    known = {(s.name, s.seed): s for s in scenarios}
-    told: list[tuple[int, int]] = []
-    collected = SerialPool(lambda *name: known[name]).collect(as_task(of), lambda *done: told.append(done))
-    assert to_bytes(collected.experience) == to_bytes(whole)
-    assert collected.results.tobytes() == results.tobytes()
-    assert told == sorted(told)
-    assert told[-1] == (40, 40)
-    assert len(told) > 3
-    assert 0 < sum(collected.busy_s.values()) <= collected.wall_s
-    parts = [Worker().collect(as_task(of), scenarios, a, b) for a, b in ((0, 1), (1, 17), (17, 17), (17, 40))]
-    assert to_bytes(join(of.spec, [x for x, _, _ in parts])) == to_bytes(whole)
-    assert np.concatenate([r for _, r, _ in parts]).tobytes() == results.tobytes()
+# --- What is refused -------------------------------------------------------------------------------------------------
 
 
 def test_what_does_not_fit_is_refused(scenarios: list[Map], driver: np.ndarray) -> None:
     of = asked("mlp:6,7", scenarios, driver, 4, 0.5, 0)
     for change, text in (
         ({"weights": driver[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
-        ({"epsilons": of.epsilons[:2]}, r"epsilons are one for each of 4 episodes, not \(2,\)"),
-        ({"keys": of.keys[None]}, r"keys are one for each of 4 episodes"),
-        ({"epsilons": np.full(4, math.nan, F)}, "epsilons are shares, from 0 to 1"),
         ({"worlds": no_traffic(3)}, "traffic of 4 episodes is"),
         ({"limits": Limits(100.0, 0)}, "1 to 65535 steps, not 0"),
     ):

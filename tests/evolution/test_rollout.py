@@ -11,15 +11,7 @@ from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, trajec
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.car.ego import (
-    COS,
-    SIN,
-    SPEED,
-    STEERING,
-    End,
-    X,
-    Y,
-)
+from gridsim.car.ego import COS, SIN, SPEED, STEERING, End, X, Y
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
@@ -54,7 +46,7 @@ def task(scenarios):
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])
 def test_a_bad_genome_loses_and_spoils_nothing(scenarios, task, poison):
     spec, genomes, starts = task
-    limits = Limits(500.0, 800)
+    limits, others = Limits(500.0, 800), [0, 2, 3, 5]
     clean, _, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
     assert (clean["distance"] > 1.0).any()
     for gene in (0, spec.size // 2, spec.size - 1):
@@ -62,23 +54,22 @@ def test_a_bad_genome_loses_and_spoils_nothing(scenarios, task, poison):
         spoilt[1, gene] = poison
         spoilt[4] = math.nan
         results, _, _ = evaluate(spec, spoilt, scenarios, starts, limits, CONFIG)
-        others = [0, 2, 3, 5]
         assert results[others].tobytes() == clean[others].tobytes()
-        assert (results["distance"][4] == 0.0).all()
         assert (results["end"][4] == End.IDLE).all()
         assert np.isfinite(results["distance"]).all()
-        if math.isnan(poison):
-            assert (results["distance"][1] == 0.0).all()
+        assert not results["distance"][[1, 4] if math.isnan(poison) else [4]].any()
 
 
-def test_results_do_not_depend_on_the_company(scenarios, task):
-    spec, genomes, starts = task
-    limits = Limits(500.0, 800)
-    together, _, _ = evaluate(spec, genomes, scenarios, starts, limits, CONFIG)
-    for i in range(len(genomes)):
-        for e in range(len(starts)):
-            alone, _, _ = evaluate(spec, genomes[i : i + 1], scenarios, starts[e : e + 1], limits, CONFIG)
-            assert alone[0, 0].tobytes() == together[i, e].tobytes()
+@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,8@2"])
+def test_results_do_not_depend_on_the_company(scenarios, task, policy):
+    spec, episodes, limits = PolicySpec.parse(policy), task[2].copy(), Limits(80.0, 100)
+    genomes = np.random.default_rng(8).normal(size=(6, spec.size)).astype(F) * F(0.2)
+    episodes["rewind"] = 8
+    together, rewound, _ = evaluate(spec, genomes, scenarios, episodes, limits, CONFIG)
+    for i, e in np.ndindex(together.shape):
+        alone, back, _ = evaluate(spec, genomes[i : i + 1], scenarios, episodes[e : e + 1], limits, CONFIG)
+        assert alone[0, 0].tobytes() == together[i, e].tobytes()
+        assert back[0, 0].tobytes() == rewound[i, e].tobytes()
 
 
 # --- Among traffic ---------------------------------------------------------------------------------------------------
@@ -119,14 +110,10 @@ def among(root):
         trajectory(spec, champion.genome, maps[e["map"]], e["start"].copy(), AMONG, CONFIG, w)
         for e, w in zip(episodes, worlds, strict=True)
     ]
-    return spec, champion.genome, maps, episodes, worlds, paths
-
-
-def test_the_episodes_among_traffic_are_worth_comparing(among):
-    *_, paths = among
+    # Worth comparing: crashes, successes, a lane change.
     assert {int(row["end"]) for row, _, _ in paths} >= {End.COLLISION, End.SUCCESS}
-    assert sum(int(row["steps"]) for row, _, _ in paths) > 2000
-    assert any((worlds[..., SHIFT] != 0).any() for _, _, worlds in paths)  # somebody changed lanes
+    assert any((traffic[..., SHIFT] != 0).any() for _, _, traffic in paths)
+    return spec, champion.genome, maps, episodes, worlds, paths
 
 
 def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
@@ -185,20 +172,20 @@ def test_what_is_rewound_goes_on_as_it_did(among):
             continue
         compared += 1
         wheel = Wheel(spec, genome)
-        original = Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
+        original, again = (
+            Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2)
+        )
         ranges, speeds = original.reset(episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
-        actions = []
-        for _ in range(last):
-            actions.append(wheel(ranges, speeds))
-            ranges, speeds, *_ = original.step(actions[-1])
-        again = Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
         again.reset(starts[0, k : k + 1], worlds=then[0, k : k + 1])
-        for step in range(first, last):
-            assert not again.state.ends[0]
-            again.step(actions[step])
-            # A start has an angle where the state has its cosine and sine: what differs is rounding.
-            assert (again.state.worlds[0, :, LANE] == traffic[step + 1][:, LANE]).all()
-            assert again.state.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
+        for step in range(last):
+            action = wheel(ranges, speeds)
+            ranges, speeds, *_ = original.step(action)
+            if step >= first:
+                assert not again.state.ends[0]
+                again.step(action)
+                # A start has an angle where the state has its cosine and sine: what differs is rounding.
+                assert (again.state.worlds[0, :, LANE] == traffic[step + 1][:, LANE]).all()
+                assert again.state.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
         assert again.state.ends[0] == End.COLLISION
     assert compared
 
@@ -208,25 +195,17 @@ def test_only_episodes_that_ask_for_it_are_rewound_and_no_result_depends_on_it(a
     spec, genome, maps, episodes, worlds, paths = among
     both = np.stack([genome, np.zeros_like(genome)])
     plain, starts, then = evaluate(spec, both, maps, episodes, AMONG, CONFIG, worlds)
-    assert starts.shape == (2, 0, 5)
-    assert then.shape == (2, 0, *worlds.shape[1:])
+    assert (starts.shape, then.shape) == ((2, 0, 5), (2, 0, *worlds.shape[1:]))
     some = episodes.copy()
     some["rewind"][[1, 4, 6]] = 1, 64, 5000
     results, starts, then = evaluate(spec, both, maps, some, AMONG, CONFIG, worlds)
     assert results.tobytes() == plain.tobytes()
-    assert starts.shape == (2, 3, 5)
-    assert then.shape == (2, 3, *worlds.shape[1:])
+    assert (starts.shape, then.shape) == ((2, 3, 5), (2, 3, *worlds.shape[1:]))
     for k, (column, back) in enumerate([(1, 1), (4, 64), (6, 5000)]):
         row, states, traffic = paths[column]
         first = max(int(row["steps"]) - back, 0)
         assert then[0, k].tobytes() == traffic[first].tobytes()
         assert starts[0, k, :2] == pytest.approx(states[first][[X, Y]])
-        alone, start, world = evaluate(
-            spec, both[:1], maps, some[column : column + 1], AMONG, CONFIG, worlds[column : column + 1]
-        )
-        assert start[0, 0].tobytes() == starts[0, k].tobytes()
-        assert world[0, 0].tobytes() == then[0, k].tobytes()
-        assert alone[0, 0] == results[0, column]
     assert starts[0, 2] == pytest.approx(episodes["start"][6], abs=1e-5)
 
 
