@@ -53,6 +53,13 @@ REMOVED = {
     "ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
 }
 """Flags of gridsim-evolve that version 0.1 had, and what takes their place."""
+REMOVED_FROM_DQN = {
+    "prioritised": "transitions are drawn uniformly; drawing them by their errors gained nothing",
+    "double": "the DQN is always a double DQN",
+    "n-step": "targets have one step of rewards; more gained nothing",
+}
+REMOVED_FROM_DQN |= {f"no-{flag}": REMOVED_FROM_DQN[flag] for flag in ("prioritised", "double")}
+"""Flags of gridsim-dqn that version 0.2 had, and why they went."""
 
 
 @dataclass(frozen=True)
@@ -173,11 +180,11 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     from evolution.networks.policy import PolicySpec
 
     prog = kind.command
-    if kind is EvolveFlags:
-        for argument in arguments:
-            flag = argument.partition("=")[0].removeprefix("--").replace("_", "-")
-            if argument.startswith("--") and flag in REMOVED:
-                raise UsageError(f"--{flag} was removed: {REMOVED[flag]}")
+    removed = REMOVED if kind is EvolveFlags else REMOVED_FROM_DQN
+    for argument in arguments:
+        flag = argument.partition("=")[0].removeprefix("--").replace("_", "-")
+        if argument.startswith("--") and flag in removed:
+            raise UsageError(f"--{flag} was removed: {removed[flag]}")
     resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
     if {"-h", "--help"} & set(arguments) or not (resume or config):
         flags = parse(kind, prog, arguments)

@@ -11,7 +11,6 @@ from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hin
 
 from cluster.runs.checkpoint import MAX_BYTES
 from evolution.dqn.experience import observation_dtype_and_width
-from evolution.dqn.replay import MAX_N_STEP
 from evolution.episodes.curriculum import CurriculumConfig
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
@@ -274,12 +273,6 @@ class DqnSettings(RunSettings):
     """Updates for each thousand car-steps collected; 0: 4, on the grid 16."""
     replay: int = 0
     """Observations that the replay buffer holds; 0: a million, of grids a hundred thousand."""
-    prioritised: bool = False
-    """Draw transitions by their errors (Schaul et al. 2016) in place of uniformly."""
-    double: bool = True
-    """Double DQN (van Hasselt et al. 2016)."""
-    n_step: int = 1
-    """Steps of rewards in a target."""
     discount: float = 0.99
     """Discount factor of a step."""
     learning_rate: float = 0.0
@@ -310,12 +303,10 @@ class DqnSettings(RunSettings):
 
     def check(self) -> None:
         super().check()
-        for name in ("evaluate_every", "batch", "replay", "n_step", "anneal", "target_period"):
+        for name in ("evaluate_every", "batch", "replay", "anneal", "target_period"):
             if getattr(self, name) < 1:
                 raise SettingsError(f"--{name.replace('_', '-')} must be 1 or more, not {getattr(self, name)}")
-        for name, most in (
-            ("n_step", MAX_N_STEP), ("anneal", MAX_STEPS), ("episodes", MAX_STEPS), ("updates", MAX_UPDATES),
-        ):  # fmt: skip
+        for name, most in (("anneal", MAX_STEPS), ("episodes", MAX_STEPS), ("updates", MAX_UPDATES)):
             if getattr(self, name) > most:
                 raise SettingsError(f"--{name.replace('_', '-')} must be {most:,} or less, not {getattr(self, name):,}")
         for name in ("discount", "epsilon", "converged"):

@@ -1,9 +1,9 @@
-"""The learning loop of the DQN: the workers collect experience while the learner trains on what they brought before.
+"""The DQN's loop: workers collect a batch of experience while the learner trains on the batches before.
 
-Batch k is collected with the weights after update block k - 2, which is the newest there is when it is sent out: block
-k - 1 is trained meanwhile, on the batches up to k - 1. So nobody waits for the other's turn, and the network is the
-same for any number of workers. A step of the run is an evaluation: the network of that moment drives validation's
-first episodes beside whoever did well there the last time, exactly as champions of the genetic algorithm are found.
+Batch k is collected with the weights after update block k - 2, the newest ones when it is sent out: block k - 1 is
+trained meanwhile, on the batches up to k - 1. So workers and learner do not wait for each other, and the network is the
+same for any number of workers. A step of the run is an evaluation: the current network drives validation's first
+episodes, beside the candidate that did well there the last time, as evolution's champions are found.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cluster.runs.settings import DqnSettings
 from cluster.training.trainer import Learning, made_good, some_left, unmodified
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
-from evolution.dqn.replay import PriorityConfig, Replay
+from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import Limits
 from gridsim.maps.scenarios import seed_of_map
@@ -32,16 +32,16 @@ COLUMNS = (
 `mean` is of the training episodes since the evaluation before, `best` of the network on validation's first episodes.
 """
 
-EPISODE_STEPS = 256  # of a training episode, at most: it is truncated then
+EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there
 BATCH_STEPS = 32_768  # car-steps of a batch, about
 EPISODES = (64, 2048)  # of a batch, at least and at most
 WARM_UP = 20_000  # rows of replay before the first update
 SLICE = 8  # updates between two looks at the workers
-RANDOM_SHARE = 0.02  # of --anneal, in which exploration falls from random driving
+RANDOM_SHARE = 0.02  # share of --anneal over which exploration falls from random driving
 SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
-LAST_SHARE = 0.05  # of the learning rate that is left after --anneal
-PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are watched
-CALM = 3  # evaluations in a row in which they have to stand still
+LAST_SHARE = 0.05  # share of the learning rate that is left after --anneal
+PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
+CALM = 3  # evaluations in a row without much change of these, after which the run has converged
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Dqn(Learning):
     settings: DqnSettings
     batches: int = 0
     episodes: int = 0
-    calm: int = 0  # evaluations in a row in which the Q values stood still
+    calm: int = 0  # evaluations in a row without much change of the Q values
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,54 +63,51 @@ class Dqn(Learning):
         config = DqnConfig(
             batch=s.batch, learning_rate=s.learning_rate, final_learning_rate=LAST_SHARE,
             learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1), target_period=s.target_period,
-            double=s.double, priorities=PriorityConfig() if s.prioritised else None,
         )  # fmt: skip
         self.learner = DqnLearner(self.spec, config, s.seed, s.device)
-        self.replay = Replay(self.spec, s.replay, s.n_step, s.discount, config.priorities)
+        self.replay = Replay(self.spec, s.replay, s.discount)
         if self.initial is not None:
             self.learner.load_weights(self.initial)
         self.probe = np.zeros((0, self.spec.inputs), dtype=np.float32)
         self.probe_q = np.zeros((0, self.spec.outputs), dtype=np.float32)
-        self._owed = 0.0  # updates that the last batch asks for and that are not made yet
+        self._owed = 0.0  # updates that the last batch still requires
         self._mean_steps = 32.0  # of the last batch's episodes
-
-    # ------------------------------------------------------------------------------------------------------ the loop
 
     def step(self) -> dict[str, float]:
         """Train until the next evaluation is due, and evaluate. Returns its row of the history (COLUMNS)."""
         self.outcomes.clear()
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
-        steps, distance, episodes, reward, speeds = 0, 0.0, 0, 0.0, 0.0
+        steps, rewards = 0, 0.0
+        results: list[np.ndarray] = []
         while steps < self.settings.evaluate_every and not (steps and (self.out_of_time() or self.done())):
-            results, rewards = self._collect()
-            n = int(results["steps"].sum())
-            steps += n
-            episodes += len(results)
-            distance += float(results["distance"].sum())
-            reward += rewards
-            speeds += made_good(results, self.sim.episode.control_period) * len(results)
-        row = {
-            "distance_m/mean": distance / episodes,
-            "speed_mps/mean": speeds / episodes,
-            "reward/mean": reward / steps,
-        }
-        row |= self._evaluate_network()
+            batch, reward = self._collect()
+            results.append(batch)
+            steps += int(batch["steps"].sum())
+            rewards += reward
+        driven = np.concatenate(results)
+        row = self._evaluate_network()
         updates = sum(n for n, _, _ in self._losses)
-        row["loss"] = sum(n * loss for n, loss, _ in self._losses) / max(updates, 1)
-        row["q/mean"] = sum(n * q for n, _, q in self._losses) / max(updates, 1)
-        row["q/change"] = self._watch(updates)
-        row["exploration"] = float(self._epsilons(EPISODES[0]).mean())
-        row["learning_rate"] = self.learner.config.learning_rate_at(self.learner.updates)
-        row |= {"episodes": float(self.episodes), "updates": float(self.learner.updates)}
-        row["car_steps"] = float(self.car_steps)
+        row |= {
+            "distance_m/mean": float(driven["distance"].mean(dtype=np.float64)),
+            "speed_mps/mean": made_good(driven, self.sim.episode.control_period),
+            "reward/mean": rewards / steps,
+            "loss": sum(n * loss for n, loss, _ in self._losses) / max(updates, 1),
+            "q/mean": sum(n * q for n, _, q in self._losses) / max(updates, 1),
+            "q/change": self._change_of_values(updates),
+            "exploration": float(self._epsilons(EPISODES[0]).mean()),
+            "learning_rate": self.learner.config.learning_rate_at(self.learner.updates),
+            "episodes": float(self.episodes),
+            "updates": float(self.learner.updates),
+            "car_steps": float(self.car_steps),
+        }
         self.history.append(row)
         row["validation/success_rate"] = self.champion.success_rate if self.champion else 0.0
         return row
 
     def _collect(self) -> tuple[np.ndarray, float]:
-        """Have one batch collected, train meanwhile, and remember what was brought.
+        """Have one batch collected into the replay, and train meanwhile.
 
-        Returns: RESULT [episodes] and the sum of their rewards. An episode that kills its workers is left out of all.
+        Returns: RESULT [episodes] and the sum of their rewards, without episodes that killed their workers.
         """
         s, k = self.settings, self.batches
         n = int(np.clip(BATCH_STEPS / self._mean_steps, *EPISODES))
@@ -146,25 +143,21 @@ class Dqn(Learning):
     def _epsilons(self, n: int) -> np.ndarray:
         """Shares of random actions of a batch's episodes: float32 [n]."""
         s = self.settings
-        come = min(self.car_steps / s.anneal, 1.0)
         usual = s.epsilon ** (1.0 + SPREAD * np.arange(n) / max(n - 1, 1))
-        first = max(1.0 - come / RANDOM_SHARE, 0.0)
-        return (usual + (1.0 - usual) * first).astype(np.float32)
+        random = max(1.0 - min(self.car_steps / s.anneal, 1.0) / RANDOM_SHARE, 0.0)
+        return (usual + (1.0 - usual) * random).astype(np.float32)
 
     def _train(self) -> bool:
-        """Make some of the updates that are owed. Returns whether some are left."""
+        """Make some of the updates that the batches before require. Returns whether some are left."""
         if self.meanwhile:
             self.meanwhile()
         if len(self.replay) < min(WARM_UP, self.replay.capacity):
             self._owed = 0.0
         n = min(int(self._owed), SLICE)
         if n:
-            made = self.learner.train(self.replay, n)
-            self._losses.append((n, made.loss, made.q))
+            self._losses.append((n, *self.learner.train(self.replay, n)))
             self._owed -= n
         return self._owed >= 1.0
-
-    # ------------------------------------------------------------------------------------------------- the evaluation
 
     def candidate(self) -> np.ndarray | None:
         return self.elites[-1] if self.elites else None
@@ -186,19 +179,18 @@ class Dqn(Learning):
             "network/success_rate": float(success_rate(results[None])[0]),
         }
 
-    def _watch(self, updates: int) -> float:
-        """How far the Q values of fixed observations moved since the last evaluation, as a share of their spread.
+    def _change_of_values(self, updates: int) -> float:
+        """Change of the Q values of fixed observations since the last evaluation, as a share of their spread.
 
-        Without updates in between they stand still and tell nothing. Raises: FloatingPointError as `_finite`: what
-        is not finite could not be taken up again.
+        Values that change little count towards convergence if there were updates.
+        Raises: FloatingPointError with one line if weights or values are not finite.
         """
         if not len(self.probe):
             key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
             self.probe = self.replay.sample(key, PROBE[self.spec.observation]).observations
         before, self.probe_q = self.probe_q, self.learner.q_values(self.probe)
         _finite(self.learner.weights, self.learner.updates)
-        if not np.isfinite(self.probe_q).all():
-            raise diverged(self.learner.updates)
+        _finite(self.probe_q, self.learner.updates)
         change = 1.0
         if len(before):
             q = self.probe_q.astype(np.float64)  # squares of large values are beyond float32
@@ -206,11 +198,9 @@ class Dqn(Learning):
         self.calm = self.calm + 1 if updates and change < self.settings.converged else 0
         return change
 
-    # ------------------------------------------------------------------------------------------------------- state
-
     @property
     def converged(self) -> bool:
-        """Whether the Q function stands still."""
+        """Whether the Q values have stopped changing."""
         return self.settings.converged > 0.0 and self.calm >= CALM
 
     def counts(self) -> dict[str, int]:
@@ -261,40 +251,20 @@ class Dqn(Learning):
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super().restore(arrays, meta)
         self.learner.restore(_named(arrays, "learner_"), meta["learner"])
-        if "replay" in meta:  # a run that has ended kept none; extended, it fills a new one before it learns on
+        if "replay" in meta:  # an ended run saves none; if it is extended, it fills a new one before it learns on
             self.replay.restore(_named(arrays, "replay_"), meta["replay"])
-        probe, probe_q = arrays["probe"], arrays["probe_q"]
-        if (
-            probe.ndim != 2
-            or probe.shape[1] != self.spec.inputs
-            or probe_q.shape != (len(probe), self.spec.outputs)
-            or any(array.dtype != np.float32 or not np.isfinite(array).all() for array in (probe, probe_q))
-        ):
-            raise ValueError("its parts do not fit each other")
-        self.probe, self.probe_q = probe, probe_q
-        self.batches, self.episodes, self.calm = (_count(meta, name) for name in ("batches", "episodes", "calm"))
-        self._owed, self._mean_steps = float(meta["owed"]), float(meta["mean_steps"])
-        if not 0.0 <= self._owed < 1e9 or not 0.0 < self._mean_steps <= EPISODE_STEPS:
-            raise ValueError("its numbers are out of range")
-        if (meta["evaluation"], meta["updates"]) != (self.steps, self.learner.updates):
-            raise ValueError("its parts do not fit each other")
+        self.probe, self.probe_q = arrays["probe"], arrays["probe_q"]
+        self.batches, self.episodes, self.calm = meta["batches"], meta["episodes"], meta["calm"]
+        self._owed, self._mean_steps = meta["owed"], meta["mean_steps"]
 
 
-def _finite(weights: np.ndarray, updates: int) -> np.ndarray:
-    """Weights as they are. Raises: FloatingPointError with one line once they have diverged."""
-    if not np.isfinite(weights).all():
+def _finite(numbers: np.ndarray, updates: int) -> np.ndarray:
+    """Weights or values as they are. Raises: FloatingPointError with one line once they have diverged."""
+    if not np.isfinite(numbers).all():
         raise diverged(updates)
-    return weights
+    return numbers
 
 
 def _named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin so, without it."""
-    return {name[len(prefix) :]: array for name, array in arrays.items() if name.startswith(prefix)}
-
-
-def _count(meta: dict[str, Any], name: str) -> int:
-    """A number of something. Raises: ValueError."""
-    value = meta[name]
-    if type(value) is not int or value < 0:
-        raise ValueError(f"{name} is no number of things")
-    return value
+    """The arrays whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

@@ -130,37 +130,18 @@ def _unpack_grids(observations, rows, ages, cells, frames, inputs):
         inputs[n, frames * _AREA] = _F((bits ^ 0x8000) - 0x8000) / UNITS
 
 
-def unpack(
-    spec: PolicySpec,
-    observations: np.ndarray,
-    rows: np.ndarray,
-    ages: np.ndarray | None = None,
-    out: np.ndarray | None = None,
-) -> np.ndarray:
+def unpack(spec: PolicySpec, observations: np.ndarray, rows: np.ndarray, ages: np.ndarray) -> np.ndarray:
     """A network's inputs at some rows: float32 [n, spec.inputs]; for grids the frames, newest last, then the speed.
 
     Args:
         observations: as in `Experience`, or a ring buffer of them, in which row 0 follows the last one.
-        rows: int64 [n].
-        ages: [n], `ages` of these rows; needed for grids. If a ring has lost the beginning of an episode, the age is
-            the number of its remaining rows before this one.
-        out: float32 [n, spec.inputs] to write to; None creates a new array.
-    Raises: ValueError with one line if shapes or types do not fit. Rows are not checked.
+        rows: int64 [n], not checked.
+        ages: [n], `ages` of these rows. If a ring has lost the beginning of an episode, the age is the number of its
+            remaining rows before this one.
     """
-    dtype, width = observation_dtype_and_width(spec)
-    if observations.dtype != dtype or observations.ndim != 2 or observations.shape[1] != width:
-        kept = f"{observations.dtype} {observations.shape}"
-        raise ValueError(f"observations of {spec} are kept as {dtype} [rows, {width}], not {kept}")
-    rows = np.ascontiguousarray(rows, dtype=np.int64)
-    if out is None:
-        out = np.empty((len(rows), spec.inputs), dtype=np.float32)
-    if out.shape != (len(rows), spec.inputs) or out.dtype != np.float32:
-        wanted = f"float32 [{len(rows)}, {spec.inputs}]"
-        raise ValueError(f"the inputs of {spec} are written to {wanted}, not {out.dtype} {out.shape}")
+    inputs = np.empty((len(rows), spec.inputs), dtype=np.float32)
     if isinstance(spec, CnnSpec):
-        if ages is None or len(ages) != len(rows):
-            raise ValueError("frames are stacked by the rows' ages; give as many as rows")
-        _unpack_grids(observations, rows, np.ascontiguousarray(ages, dtype=np.int64), _CELLS_OF, spec.frames, out)
+        _unpack_grids(observations, rows, ages.astype(np.int64), _CELLS_OF, spec.frames, inputs)
     else:
-        _unpack_rays(observations, rows, out)
-    return out
+        _unpack_rays(observations, rows, inputs)
+    return inputs

@@ -87,7 +87,7 @@ def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, te
 
 
 def test_the_other_form_of_a_switch_is_known(capsys):
-    assert not parse(DqnFlags, "gridsim-dqn", ["--no-double"]).double
+    assert not parse(EvaluateFlags, "gridsim-evaluate", ["runs/x", "--json", "--no-json"]).json
 
 
 def test_a_command_is_called_as_this_one_was(tmp_path, monkeypatch):

@@ -1,10 +1,12 @@
-"""The DQN's loop in this process: what it does where nothing is learned, where learning diverges, where time is up."""
+"""The DQN's loop in this process: when it learns, converges, diverges and ends, and what it refuses."""
 
+import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cluster.commands.cli import REMOVED_FROM_DQN, dqn_main
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.settings import DqnSettings, SettingsError
 from cluster.training import dqn as dqn_loop
@@ -31,14 +33,8 @@ def loop(maps, monkeypatch):
     monkeypatch.setattr(dqn_loop, "WARM_UP", 3000)
 
     def make(**changes):
-        settings: dict[str, Any] = {
-            "scenario": "curved",
-            "policy": "mlp:4",
-            "replay": 4000,
-            "evaluate_every": 1000,
-            "batch": 32,
-        }
-        return Dqn(DqnSettings(**settings | changes), SerialPool(maps.build), maps)
+        small: dict[str, Any] = {"policy": "mlp:4", "replay": 4000, "evaluate_every": 1000, "batch": 32}
+        return Dqn(DqnSettings("curved", **small | changes), SerialPool(maps.build), maps)
 
     return make
 
@@ -81,16 +77,9 @@ def test_large_values_can_be_saved_and_taken_up_again(loop):
     again = loop(learning_rate=1e30)
     again.restore(*learning.state())
     assert again.counts() == learning.counts()
-
-
-@pytest.mark.parametrize("change", [lambda a: a[:-1], lambda a: a.astype(np.int32)])
-@pytest.mark.parametrize("name", ["replay_actions", "replay_observations"])
-def test_a_replay_of_another_run_is_refused(loop, name, change):
-    learning = loop()
-    learning.timed(learning.step(), 1.0, None)
-    arrays, meta = learning.state()
-    with pytest.raises(CheckpointError, match="the checkpoint does not belong to this run"):
-        loop().restore(arrays | {name: change(arrays[name])}, meta)
+    for other in (loop(policy="mlp:5"), loop(replay=3999)):
+        with pytest.raises(CheckpointError, match="the checkpoint does not belong to this run"):
+            other.restore(*learning.state())
 
 
 @pytest.mark.parametrize("gene", [np.nan, np.inf])
@@ -131,9 +120,13 @@ def test_no_batch_is_begun_beyond_a_bound(loop, bound):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"n_step": 256}, "--n-step must be 255 or less, not 256"),
+        ({"discount": 1.5}, "--discount must be 0 to 1, not 1.5"),
+        ({"batch": -1}, "--batch must be 1 or more, not -1"),
+        ({"replay": 10}, r"--replay must be 256 \(the batch\) to 10,000,000, not 10"),
+        ({"learning_rate": float("nan")}, "--learning-rate must be above 0, not nan"),
+        ({"policy": "cnn"}, "policy cnn sees the grid"),
+        ({"device": "abacus"}, "--device must be auto, cpu or cuda, not abacus"),
         ({"updates": 1e308}, "--updates must be 1,000,000 or less"),
-        ({"updates": float("nan")}, "--updates must be above 0, not nan"),
         ({"anneal": 10**400}, "--anneal must be 1,000,000,000,000,000 or less"),
         ({"car_steps": 10**400}, "--car-steps must be 0 to 1,000,000,000,000,000"),
         ({"observation": "grid", "replay": 3_000_000}, r"--replay must be 1,9\d\d,\d\d\d or less for cnn:16,32,256@4"),
@@ -144,9 +137,17 @@ def test_settings_that_no_run_can_have(changes, words):
         DqnSettings(**changes).check()
 
 
-def test_the_default_replay_fits_a_checkpoint():
-    for observation in ("rays", "grid"):
-        DqnSettings(observation=observation).check()
+@pytest.mark.parametrize("observation", ["rays", "grid"])
+def test_the_default_replay_fits_a_checkpoint(observation):
+    DqnSettings(observation=observation).check()
+
+
+@pytest.mark.parametrize("flag", REMOVED_FROM_DQN)
+def test_a_removed_flag_is_refused_with_the_reason(flag, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["gridsim-dqn", f"--{flag}"])
+    with pytest.raises(SystemExit, match="2"):
+        dqn_main()
+    assert capsys.readouterr().err.startswith(f"gridsim-dqn: error: --{flag} was removed: {REMOVED_FROM_DQN[flag]}\n")
 
 
 class Losing(SerialPool):

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from commands import BIN, finish, ray_workers, rows, start, summary, wait_until
 
 from cluster.runs.checkpoint import load, save
@@ -46,11 +47,9 @@ def same(run, reference):
     return True
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_network_is_the_same_for_any_number_of_workers(reference, tmp_path, workers):
-    done = dqn("--workers", str(workers), "--name", "w", *SMALL, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+def test_network_is_the_same_on_workers(reference, tmp_path):
+    done = dqn("--workers", "2", "--name", "w", *SMALL, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
     assert same(tmp_path / "runs/w", reference)
 
 
@@ -130,42 +129,25 @@ def test_the_champion_is_one_like_any_other(reference):
     assert json.loads(done.stdout) == summary(reference)["held_out"]
 
 
-@pytest.mark.parametrize("change", [["--car-steps", "1000"], ["--episodes", "5"], ["--discount", "0.9"]])
-def test_resume_refuses_contradictions(reference, tmp_path, change):
-    done = dqn("--resume", str(reference), "--workers", "0", *change, cwd=tmp_path)
-    assert done.returncode == 2
-    assert f"{change[0]} {change[1]} contradicts the run's" in done.stderr
-
-
-def test_a_run_of_the_other_learner_is_refused(reference, tmp_path):
-    for flag, value in (("--resume", str(reference)), ("--config", str(reference / "config.json"))):
-        done = finish("gridsim-evolve", flag, value, cwd=tmp_path)
-        assert done.returncode == 2
-        assert "is a run of gridsim-dqn; give it to that command" in done.stderr
-
-
 @pytest.mark.parametrize(
-    ("flags", "words"),
+    ("command", "flags", "words"),
     [
-        (["--device", "cuda"], "--device cuda"),
-        (["--device", "abacus"], "--device"),
-        (["--discount", "1.5"], "--discount must be 0 to 1, not 1.5"),
-        (["--batch", "-1"], "--batch must be 1 or more, not -1"),
-        (["--replay", "10"], "--replay must be 256"),
-        (["--learning-rate", "nan"], "--learning-rate must be above 0, not nan"),
-        (["--policy", "cnn"], "policy cnn sees the grid"),
-        (["--n-step", "300"], "--n-step must be 255 or less, not 300"),
-        (["--observation", "grid", "--replay", "9000000"], "--replay must be 1,9"),
-        (["--generations", "3"], "--generations"),
+        ("gridsim-dqn", ["--resume", "ref", "--car-steps", "1000"], "--car-steps 1000 contradicts the run's"),
+        ("gridsim-dqn", ["--resume", "ref", "--discount", "0.9"], "--discount 0.9 contradicts the run's"),
+        ("gridsim-evolve", ["--resume", "ref"], "is a run of gridsim-dqn; give it to that command"),
+        ("gridsim-dqn", ["--device", "cuda"], "--device cuda"),
+        ("gridsim-dqn", ["--generations", "3"], "--generations"),
     ],
 )
-def test_wrong_use_is_one_clear_line(flags, words, tmp_path):
-    done = dqn(*flags, "--name", "x", cwd=tmp_path)
+def test_wrong_use_is_one_clear_line(reference, command, flags, words):
+    if flags == ["--device", "cuda"] and torch.cuda.is_available():
+        pytest.skip("there is such a device")
+    done = finish(command, "--workers", "0", *flags, cwd=reference.parent)
     assert done.returncode == 2
-    assert done.stderr.startswith("gridsim-dqn: error: ")
+    assert done.stderr.startswith(f"{command}: error: ")
     assert words in done.stderr
     assert len(done.stderr.splitlines()) <= 3
-    assert not (tmp_path / "runs").exists()
+    assert [path.name for path in reference.parent.iterdir()] == ["ref"]
 
 
 def test_a_run_that_diverges_says_so(tmp_path):
@@ -184,23 +166,13 @@ def test_a_champion_without_numbers_is_no_start(reference, tmp_path):
     assert done.stderr.startswith("gridsim-dqn: error: --init c.npz: some of its genes are no numbers")
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("learner_weights", lambda a: a * np.nan),
-        ("probe", lambda a: a[:, :-1]),
-        ("elites", lambda a: a[1:]),
-    ],
-)
-def test_resume_refuses_hostile_checkpoints(reference, tmp_path, name, change):
+def test_resume_refuses_another_runs_checkpoint(reference, tmp_path):
     run = tmp_path / "runs/h"
     run.mkdir(parents=True)
-    (run / "config.json").write_bytes((reference / "config.json").read_bytes())
+    shutil.copy(reference / "config.json", run)
     arrays, meta = load(reference / "checkpoint.npz")
-    assert name in arrays
     meta["car_steps"] = 100_000  # not done
-    arrays[name] = change(arrays[name])
-    save(run / "checkpoint.npz", arrays, meta)
+    save(run / "checkpoint.npz", arrays | {"elites": arrays["elites"][1:]}, meta)
     done = dqn("--resume", str(run), "--workers", "0", cwd=tmp_path)
     assert done.returncode == 1
     assert "the checkpoint does not belong to this run" in done.stderr

@@ -53,7 +53,7 @@ def test_seeds_are_one_group_and_nothing_else_is():
     assert of() == of(seed=1) == of(generations=5) == "curved evolution mlp:64+steering"
     others = [
         of(population=64), of(policy="mlp:8"), of(traffic=3), of(search="random"), of(observation="grid"),
-        of(sigma=0.1), of(recombination="two"), of(DqnSettings), of(DqnSettings, double=False),
+        of(sigma=0.1), of(recombination="two"), of(DqnSettings), of(DqnSettings, discount=0.9),
         of(DqnSettings, observation="grid"),
     ]  # fmt: skip
     assert len({of(), *others}) == 1 + len(others)
