@@ -315,7 +315,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
             closing.callback(warming.stop)
             pool: WorkerPool = SerialPool(maps.build)
             if flags.workers:
-                pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience, run=run.name)
+                pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience)
             closing.callback(pool.close)
             message = _run(console, run, pool, maps, tracker, flags, started, warming)
         status, code = "FINISHED", 0

@@ -121,7 +121,7 @@ class Cells:
             from cluster.workers.ray_pool import RayPool
 
             address = self.address or os.environ.get("RAY_ADDRESS") or None
-            self._pool = RayPool(self.workers, self._build, address, patience_s=self.patience, run=comparison)
+            self._pool = RayPool(self.workers, self._build, address, patience_s=self.patience)
         elif self._pool is None:
             self._pool = SerialPool(self._build)
         return self._pool

@@ -1,6 +1,6 @@
-"""What an actor is told and what it does: tasks and maps are put into an object store once, chunks are sent. No Ray.
+"""Both ends of what travels to an actor: tasks and maps are put into an object store once, chunks are sent. No Ray.
 
-An actor gets the values of references that it is given as arguments of their own, read-only and without a copy.
+An actor gets the values of references that are arguments of their own, read-only and without a copy.
 """
 
 from __future__ import annotations
@@ -11,25 +11,17 @@ import pickle
 import signal
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from cluster.workers.pool import BuildMap, answer
+from cluster.workers.pool import BuildMap
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
 Name = tuple[str, int]
 """Of a map: scenario and seed."""
-
-
-class News(NamedTuple):
-    """What a worker needs to take up a task."""
-
-    maps: list[Name]  # that it lacks
-    gone: list[Name]  # that it need not keep
-    refs: list[Any]  # to the task, and to the maps that it lacks
 
 
 class Actor:
@@ -41,7 +33,7 @@ class Actor:
     """
 
     def __init__(self, factory: Callable[[], Worker], own_process: bool = False):
-        # Ctrl-C goes to every process of the terminal; whether the workers stop is the coordinator's business.
+        # Ctrl-C goes to every process of the terminal, but only the coordinator decides when workers stop.
         if own_process:
             with contextlib.suppress(ValueError):
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -53,18 +45,18 @@ class Actor:
     def hello(self) -> int:
         return os.getpid()
 
-    def prepare(self, serial: int, *news: Any) -> int:
-        """Take up a first task and load its kernels, of nobody: who dies of that has not died of a chunk."""
-        self.run(serial, b"", 0, 0, *news)
+    def prepare(self, serial: int, *update: Any) -> int:
+        """Take up a first task and load its kernels with an empty chunk: no member is to blame if that kills."""
+        self.run(serial, b"", 0, 0, *update)
         return os.getpid()
 
     def run(
         self, serial: int, payload: bytes, first: int, stop: int,
         names: Sequence[Name] = (), gone: Sequence[Name] = (), task: Task | CollectTask | None = None, *maps: Any,
     ) -> bytes:  # fmt: skip
-        """What `pool.answer` says to the recipes `payload`, pickled: Ray is slower with arrays than with bytes.
+        """What `Worker.answer` returns for the recipes `payload`, pickled: Ray is slower with arrays than with bytes.
 
-        `names` and all after it are for a worker that does not have the task yet.
+        `names` and all after it are `Shared.update`, for an actor that does not have the task yet.
         """
         if task is not None:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
@@ -74,12 +66,12 @@ class Actor:
         if self._task is None or serial != self._serial:
             raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
         mine = [self._maps[name] for name in self._task.maps]
-        recipes = np.frombuffer(payload, RECIPE)
-        return pickle.dumps(answer(self._worker, self._task, mine, recipes, first, stop), protocol=5)
+        answer = self._worker.answer(self._task, mine, np.frombuffer(payload, RECIPE), first, stop)
+        return pickle.dumps(answer, protocol=5)
 
 
 class Shared:
-    """The coordinator's side of it: the maps in the object store, the least used of which are let go.
+    """The coordinator's end: the maps in the object store, without those that were least recently used.
 
     Args:
         put: puts something into the store; returns its reference.
@@ -92,10 +84,8 @@ class Shared:
         self._maps: OrderedDict[Name, tuple[Any, int]] = OrderedDict()  # references and bytes
 
     def put(self, task: Task | CollectTask) -> tuple[Any, int]:
-        """Put a task, and those of its maps that are not there yet. Returns its reference, and how many bytes."""
-        buffers: list[pickle.PickleBuffer] = []
-        head = pickle.dumps(task, protocol=5, buffer_callback=buffers.append)
-        sent = len(head) + sum(buffer.raw().nbytes for buffer in buffers)
+        """Put a task, and those of its maps that are not there yet. Returns its reference, and the bytes of arrays."""
+        sent = sum(value.nbytes for value in vars(task).values() if isinstance(value, np.ndarray))
         for name in task.maps:
             if name not in self._maps:
                 arrays = self._build_map(*name).arrays()
@@ -108,11 +98,13 @@ class Shared:
             used -= self._maps.popitem(last=False)[1][1]
         return self._put(task), sent
 
-    def news(self, known: set[Name], task: Task | CollectTask, ref: Any) -> News:
-        """What a worker with the maps `known` needs to take up a task; from then on it has that."""
-        # A map in use stays in the object store: those that are let go here have to be let go there.
-        gone = [name for name in known if name not in self._maps]
+    def update(self, known: set[Name], task: Task | CollectTask, ref: Any) -> list[Any]:
+        """What an actor with the maps `known` needs to take up a task; `known` then is what it has.
+
+        Returns: the names of the maps that it lacks, those to forget, references to the task and to the maps.
+        """
+        gone = [name for name in known if name not in self._maps]  # the store keeps what an actor holds
         lacking = [name for name in dict.fromkeys(task.maps) if name not in known]
         known.difference_update(gone)
         known.update(lacking)
-        return News(lacking, gone, [ref, *(self._maps[name][0] for name in lacking)])
+        return [lacking, gone, ref, *(self._maps[name][0] for name in lacking)]

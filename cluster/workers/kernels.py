@@ -23,7 +23,6 @@ import llvmlite.binding
 import numpy as np
 
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
-from cluster.workers.pool import NOBODY, answer
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import EPISODE, Limits, trajectory
 from evolution.networks.policy import Observation, PolicySpec
@@ -48,7 +47,7 @@ class Warming:
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def wait(self) -> None:
-        """Wait for what a run needs first. What such a process could not do, this one does when it comes to it."""
+        """Wait for what a run needs first. If such a process fails, this one compiles that when it needs it."""
         ready = [process.stdout is not None and process.stdout.readline() for process in self.processes]
         if all(ready):
             with contextlib.suppress(OSError):
@@ -58,36 +57,38 @@ class Warming:
         """End what still runs."""
         for process in self.processes:
             process.kill()
-            process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
+            process.communicate()
         self.processes.clear()
 
 
 def begin(settings: RunSettings) -> Warming:
     """Begin to compile what such a run needs, if it is not in the cache."""
+    warming = Warming(_marker(settings))
+    if not warming.done.exists():
+        what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
+        # Neither the folder it is started from (-P) nor Ctrl-C is its own: it is stopped by `stop`.
+        for part in ("kernels", "roads"):
+            with contextlib.suppress(OSError):
+                warming.processes.append(
+                    subprocess.Popen(
+                        [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],
+                        stdin=subprocess.DEVNULL,
+                        stdout=subprocess.PIPE,
+                        stderr=subprocess.DEVNULL,
+                        start_new_session=True,
+                    )
+                )
+    return warming
+
+
+def _marker(settings: RunSettings) -> Path:
+    """The file that says that everything is compiled that such a run needs."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
     traffic = "traffic" if settings.traffic else "alone"
     # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
     cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()
-    warming = Warming(CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}")
-    if warming.done.exists():
-        return warming
-    what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
-    # Neither the folder it is started from (-P) nor Ctrl-C is its own: it is stopped by `stop`.
-    for part in ("kernels", "roads"):
-        with contextlib.suppress(OSError):
-            warming.processes.append(
-                subprocess.Popen(
-                    [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.DEVNULL,
-                    start_new_session=True,
-                )
-            )
-    return warming
+    return CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}"
 
 
 def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray, Limits]:
@@ -104,11 +105,11 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
     made = recipes(2)
     made["kind"] = Kind.NEW
     task = Task(policy, genome[None], 1, Mutation(), episodes, worlds, (), limits, config)
-    answer(Worker(), task, [road], made, 0, 1)
+    Worker().answer(task, [road], made, 0, 1)
     if command == DqnSettings.command:
         epsilons, keys = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.uint64)
         collecting = CollectTask(policy, genome, episodes, worlds, (), epsilons, keys, limits, config)
-        answer(Worker(), collecting, [road], NOBODY, 0, 1)
+        Worker().answer(collecting, [road], made, 0, 1)
 
 
 def compile_film(policy: str, traffic: int) -> None:
@@ -141,15 +142,13 @@ def everything_by_default() -> list[RunSettings]:
 
 
 def compile_everything() -> None:
-    """Compile all that; a process that fails ends it. Raises: CalledProcessError."""
+    """Compile all that."""
     for settings in everything_by_default():
-        warming = begin(settings)
-        warming.wait()
-        for process in warming.processes:
-            process.communicate()
-            if process.returncode:
-                raise subprocess.CalledProcessError(process.returncode, process.args)
-        print(warming.done.name, flush=True)
+        compile_kernels(settings.policy, settings.traffic, settings.command)
+        compile_roads(settings.scenario, settings.traffic)
+        compile_film(settings.policy, settings.traffic)
+        _marker(settings).touch()
+        print(_marker(settings).name, flush=True)
 
 
 def main(part: str, scenario: str, policy: str, cars: str, command: str) -> None:

@@ -1,40 +1,61 @@
-"""Ray itself: one of our own on this machine, or a cluster that is joined. With `ray_pool` all that imports Ray."""
+"""Ray itself: one of our own on this machine, or a cluster that is joined; its settings and its error messages.
+
+With `ray_pool` all that imports Ray.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib
+import json
 import logging
 import os
+import secrets
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from cluster.workers import shipping
+import cluster
+import evolution
+import gridsim
 from cluster.workers.pool import PoolError
-from cluster.workers.ray_address import (
-    AUTH_ENVIRONMENT,
-    OWN_ENVIRONMENT,
-    TOKEN,
-    environment,
-    has_token,
-    probe,
-)
+from cluster.workers.ray_address import AUTH_ENVIRONMENT, has_token, probe
+
+# Read when Ray is imported and when it connects.
+ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal at SIGTERM
+    "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # a job that was submitted with files of its own keeps them beside ours
+}
+# Read by the processes of a Ray of our own.
+OWN_ENVIRONMENT = {
+    "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it just misses its object store, and then sleeps 1 s
+    "RAY_raylet_client_num_connect_attempts": "500",
+    "RAY_prestart_worker_first_driver": "0",  # with it, init waits for ever where a worker dies as it starts
+    "RAY_enable_metrics_collection": "0",
+    "RAY_task_events_report_interval_ms": "0",
+}
+TOKEN = secrets.token_hex(32)
+STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses /tmp
+PACKAGES = (cluster, evolution, gridsim)  # that travel to a cluster's workers
+ELSEWHERE = ("ActorUnavailableError", "NodeDiedError", "ObjectLostError", "OwnerDiedError", "ObjectFetchTimedOutError")
+HOST_DIED = "its node has died"  # in an error's text
 
 
 def check_address(address: str) -> str:
     """The `host:port` of the Ray cluster meant by `address` (`host:port`, or `auto`: RAY_ADDRESS, else this machine's).
 
-    Raises PoolError, one line, within 3 s where no Ray answers or it would not let us in. (Ray itself would try for
-    20 s to minutes, and print a warning for each second.)
+    Raises PoolError, one line, within seconds where no Ray answers or it would not let us in.
     """
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS") or "auto"
     if address == "auto":
         logging.getLogger("ray").setLevel(logging.CRITICAL)
-        services = _private("services")
         try:
-            address = services.canonicalize_bootstrap_address("auto")
+            address = _private("services").canonicalize_bootstrap_address("auto")
         except ConnectionError:
             raise PoolError(
                 "no Ray cluster runs on this machine; start one with `ray start --head`, or give its host:port"
@@ -43,7 +64,7 @@ def check_address(address: str) -> str:
     return address
 
 
-def start_own(workers: int, store_bytes: int) -> str:
+def start_own(workers: int) -> str:
     """Start Ray on this machine with one CPU for each worker; returns the folder of its logs."""
     import ray
 
@@ -51,12 +72,13 @@ def start_own(workers: int, store_bytes: int) -> str:
         # Ray listens on all interfaces and lets in who has its token. One of our own need not outlive the run in
         # ~/.ray, where it would change what `ray start` does from then on.
         os.environ["RAY_AUTH_TOKEN"] = TOKEN
-    with environment(OWN_ENVIRONMENT), _lean_head():
+    _be_quiet()
+    with _lean_head():
         context: Any = ray.init(
             address="local",  # whatever RAY_ADDRESS says
             num_cpus=workers,
             num_gpus=0,
-            object_store_memory=store_bytes,
+            object_store_memory=STORE_BYTES,
             include_dashboard=False,
             log_to_driver=False,
             logging_level=logging.CRITICAL,
@@ -65,49 +87,33 @@ def start_own(workers: int, store_bytes: int) -> str:
 
 
 def join(address: str) -> None:
-    """Connect to a cluster that was found to let us in."""
+    """Connect to a cluster that `check_address` found to let us in. This project's packages travel to its workers.
+
+    So a worker runs the very sources that the coordinator runs. Its node needs Ray, NumPy, Numba and SciPy (PyTorch
+    where the network is a `cnn`), in the coordinator's versions.
+    """
     import ray
 
     if has_token(address.rpartition(":")[0]):
         with contextlib.suppress(ImportError, AttributeError):  # what Ray does where it is asked to find the cluster
             setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
             setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
-    with environment(shipping.ENVIRONMENT):
-        env = shipping.runtime_env()
-        ray.init(address=address, runtime_env=env, log_to_driver=False, logging_level=logging.CRITICAL)
+    _be_quiet()
+    ray.init(address=address, runtime_env=runtime_env(), log_to_driver=False, logging_level=logging.CRITICAL)
 
 
-def _private(name: str) -> Any:
-    return importlib.import_module(f"ray._private.{name}")
+def runtime_env() -> dict[str, Any]:
+    """Ray's `runtime_env` of a run's workers, some 200 KB, with the modules of the Ray job that the run may be."""
+    submitted = json.loads(os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")).get("runtime_env") or {}
+    ours = [str(Path(package.__path__[0])) for package in PACKAGES]
+    return {"py_modules": [*ours, *submitted.get("py_modules", [])], "excludes": ["__pycache__"]}
 
 
-@contextlib.contextmanager
-def _lean_head() -> Iterator[None]:
-    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
-
-    Ray has no setting for that, so this replaces private names while `ray.init` runs; not in a version without them.
-    """
-    try:
-        node, parameter = map(_private, ("node", "parameter"))
-        before = node.Node.start_api_server, parameter.RayParams
-        lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
-        lean()
-    except (ImportError, AttributeError, TypeError):
-        yield
-        return
-
-    def no_api_server(self: Any, **_: Any) -> None:
-        self._webui_url = ""
-
-    node.Node.start_api_server, parameter.RayParams = no_api_server, lean
-    try:
-        yield
-    finally:
-        node.Node.start_api_server, parameter.RayParams = before
-
-
-def forget_token() -> None:
+def leave() -> None:
     """Leave Ray and the environment as they were: with our token, a cluster that is joined next could not call us."""
+    import ray
+
+    ray.shutdown(wait_for_processes=True)
     if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
         del os.environ["RAY_AUTH_TOKEN"]
         os.environ.pop("RAY_AUTH_MODE", None)  # Ray's own doing
@@ -117,9 +123,76 @@ def forget_token() -> None:
             raylet.AuthenticationTokenLoader.instance().reset_cache()
 
 
+def end_at_once() -> None:
+    """End this process where Python is done with it, with its own exit status, before any C++ destructors run.
+
+    Ray leaves a dozen native threads behind at `shutdown`. They go on while destructors delete what they use, and once
+    in some thousands of times abort a process that has done all of its work.
+    """
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "on_exit"):  # glibc's; the last to be registered comes first
+        libc.on_exit(ctypes.cast(libc._exit, ctypes.c_void_p), None)
+
+
 def capacity() -> str:
     """What the cluster has to offer, in words."""
     import ray
 
     free, total = ray.available_resources().get("CPU", 0), ray.cluster_resources().get("CPU", 0)
     return f"Ray has {total:g} CPUs, {free:g} of them free, and a worker needs 1"
+
+
+def is_to_blame(error: BaseException) -> bool:
+    """Whether a worker may have died of what it did, and not because its host died or is out of reach."""
+    return type(error).__name__ not in ELSEWHERE and HOST_DIED not in str(error)
+
+
+def failed_as_it_began(error: BaseException) -> bool:
+    """Whether a worker could not be created because of an exception: the next one would meet it, too."""
+    return "raised in its creation task" in str(error)
+
+
+def reason(error: BaseException) -> str:
+    """What matters in Ray's long messages."""
+    text = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
+    if HOST_DIED in str(error):
+        text = "its host is gone"
+    elif "Worker exit detail: " in text:
+        text = text.split("Worker exit detail: ")[1].split(". Some common causes")[0]
+        if "connection error" in text:
+            text = "its process was killed, crashed, or ran out of memory"
+    return text[:300]
+
+
+def _private(name: str) -> Any:
+    return importlib.import_module(f"ray._private.{name}")
+
+
+def _be_quiet() -> None:
+    """Print no worker's death, which Ray does even without `log_to_driver`."""
+    logging.getLogger("ray").setLevel(logging.CRITICAL)
+    _private("worker")._worker_logs_enabled = False
+
+
+@contextlib.contextmanager
+def _lean_head() -> Iterator[None]:
+    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
+
+    Ray has no settings for that, so this replaces private names, and sets variables for its processes, meanwhile.
+    """
+    with contextlib.ExitStack() as undo:
+        for name in OWN_ENVIRONMENT.keys() - os.environ.keys():
+            os.environ[name] = OWN_ENVIRONMENT[name]
+            undo.callback(os.environ.pop, name)
+        with contextlib.suppress(ImportError, AttributeError, TypeError):  # a version of Ray without these names
+            node, parameter = _private("node").Node, _private("parameter")
+            lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
+            lean()
+            for owner, name, value in ((node, "start_api_server", _no_api_server), (parameter, "RayParams", lean)):
+                undo.callback(setattr, owner, name, getattr(owner, name))
+                setattr(owner, name, value)
+        yield
+
+
+def _no_api_server(self: Any, **_: Any) -> None:
+    self._webui_url = ""

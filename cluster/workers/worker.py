@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ class Task:
         parents: genomes float32 [parents, genes] that the recipes name.
         key: the generation's number for breeding, 64 bits.
         mutation: how children differ from their parents.
-        episodes: EPISODE [episodes]; who drives which of them is the call's affair.
+        episodes: EPISODE [episodes]; a call says which members drive which of them.
         worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
         maps: (scenario, seed) of each map that `episodes` indexes.
         limits: where an episode ends if nothing happens.
@@ -45,10 +46,7 @@ class Task:
     config: SimConfig
 
     def __post_init__(self) -> None:
-        # What comes out of the object store is read-only. Numba compiles once more for what is not, so no pool has it.
-        freeze(self.parents)
-        freeze(self.episodes)
-        freeze(self.worlds)
+        _freeze_arrays(self)
 
 
 @dataclass(frozen=True)
@@ -56,15 +54,10 @@ class CollectTask:
     """What all chunks of a batch of experience share; broadcast once. Its arrays become read-only.
 
     Attributes:
-        policy: the network, as in `mlp:64,64`.
+        policy, episodes, worlds, maps, limits, config: as a Task's.
         weights: float32 [genes].
-        episodes: EPISODE [episodes].
-        worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
-        maps: (scenario, seed) of each map that `episodes` indexes.
         epsilons: float32 [episodes], the share of random actions in each.
         keys: uint64 [episodes], of the random numbers of each.
-        limits: where an episode ends if nothing happens.
-        config: the simulator's.
     """
 
     policy: str
@@ -78,20 +71,39 @@ class CollectTask:
     config: SimConfig
 
     def __post_init__(self) -> None:
-        for array in (self.weights, self.episodes, self.worlds, self.epsilons, self.keys):
-            freeze(array)  # as a Task's
+        _freeze_arrays(self)
+
+
+def _freeze_arrays(task: Task | CollectTask) -> None:
+    """Make arrays read-only, as those from the object store are: Numba compiles again for writable ones."""
+    for value in vars(task).values():
+        if isinstance(value, np.ndarray):
+            freeze(value)
 
 
 class Worker:
-    """Breeds and drives members, or collects experience. It keeps nothing that a result depends on."""
+    """Breeds and drives members, or collects experience. It keeps nothing that a result depends on.
+
+    The `maps` of its methods are those of `task.maps`, in that order.
+    """
+
+    def answer(
+        self, task: Task | CollectTask, maps: Sequence[Map], recipes: np.ndarray, first: int, stop: int
+    ) -> tuple[Any, ...]:
+        """Do a chunk: recipes RECIPE [n] of a `Task`, and the task's episodes from `first` to before `stop`.
+
+        Returns: what `evaluate` or `collect` does.
+        """
+        if isinstance(task, CollectTask):
+            return self.collect(task, maps, first, stop)
+        if stop - first < len(task.episodes):
+            task = replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
+        return self.evaluate(task, maps, freeze(recipes))
 
     def evaluate(
         self, task: Task, maps: Sequence[Map], recipes: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """What `rollout.evaluate` returns of recipes RECIPE [n], and the seconds it took (for statistics only).
-
-        `maps` are those of `task.maps`, in that order.
-        """
+        """What `rollout.evaluate` returns of recipes RECIPE [n], and the seconds it took (for statistics only)."""
         started = time.perf_counter()
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
@@ -101,10 +113,7 @@ class Worker:
     def collect(
         self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
     ) -> tuple[Experience, np.ndarray, float]:
-        """Experience and RESULT [stop - first] of the task's episodes from `first` on, and the seconds it took.
-
-        `maps` are those of `task.maps`, in that order.
-        """
+        """Experience and RESULT [stop - first] of the task's episodes from `first` on, and the seconds it took."""
         started = time.perf_counter()
         these = slice(first, stop)
         experience, results = collect(

@@ -1,73 +1,64 @@
 """Both ends of what is sent to an actor, joined without Ray: maps are put into the store once, and within bounds."""
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
 from test_pool import MAPS, Answering, drive_task, make_recipes, make_task
 
-from cluster.workers.actor import Actor, News, Shared
-from cluster.workers.pool import Chunk, SerialPool, new_outcome
+from cluster.workers.actor import Actor, Shared
+from cluster.workers.pool import SerialPool
 from cluster.workers.worker import Worker
 
 
 class Map:
     """A megabyte."""
 
-    def __init__(self, seed: int):
-        self.seed = seed
-
     def arrays(self) -> dict[str, np.ndarray]:
         return {"field": np.zeros(1 << 20, dtype=np.uint8)}
 
 
-def test_the_store_keeps_a_bounded_number_of_maps() -> None:
+def test_the_store_keeps_a_bounded_number_of_maps_and_a_worker_gets_each_once() -> None:
     built: list[int] = []
 
     def build(_: str, seed: int) -> Map:
         built.append(seed)
-        return Map(seed)
+        return Map()
 
     shared = Shared(lambda value: value, build, 3 << 20)  # type: ignore[arg-type]
-    for seeds in ([0, 1, 2], [0, 1, 2], [3], [0, 1], [4, 5, 6, 7], [7]):
-        before = len(built)
-        _, sent = shared.put(make_task(tuple(("seamless", seed) for seed in seeds)))
-        assert len(shared._maps) <= max(3, len(seeds))
-        assert sent >> 20 == len(built) - before, "those that are new to it"
-    assert built == [0, 1, 2, 3, 0, 4, 5, 6, 7], "the one that was used longest ago goes first"
-
-
-def test_a_worker_is_told_of_what_it_lacks_and_of_what_has_gone() -> None:
-    shared = Shared(lambda value: value, lambda _, seed: Map(seed), 2 << 20)  # type: ignore[arg-type, return-value]
     known: set[tuple[str, int]] = set()
-
-    def news(*seeds: int) -> News:
+    for seeds, new, gone in (
+        ([0, 1, 2], [0, 1, 2], []),
+        ([2, 1, 0], [], []),
+        ([3], [3], [2]),
+        ([0, 1], [], []),
+        ([4, 5, 6, 7], [4, 5, 6, 7], [0, 1, 3]),
+        ([7], [], [4]),
+    ):
         task = make_task(tuple(("seamless", seed) for seed in seeds))
-        ref, _ = shared.put(task)
-        return shared.news(known, task, ref)
-
-    first = news(0, 1)
-    assert [seed for _, seed in first.maps] == [0, 1]
-    assert (first.gone, len(first.refs)) == ([], 3)
-    assert news(1, 0).maps == []
-    third = news(2, 1)
-    assert ([seed for _, seed in third.maps], third.gone) == ([2], [("seamless", 0)])
-    assert known == {("seamless", 1), ("seamless", 2)}
+        before = len(built)
+        ref, sent = shared.put(task)
+        assert built[before:] == new
+        assert sent >> 20 == len(new)
+        lacking, forgotten, *refs = shared.update(known, task, ref)
+        assert [seed for _, seed in lacking] == new
+        assert sorted(seed for _, seed in forgotten) == gone
+        assert len(refs) == 1 + len(new)
 
 
 def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps() -> None:
-    task, scenarios = drive_task()
+    task, maps = drive_task()
     recipes = make_recipes(20)
-    outcome = SerialPool(lambda *name: scenarios[MAPS.index(name)]).evaluate(task, recipes)
+    wanted = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes).results
     actor = Actor(Worker)
-    arrays = [scenario.arrays() for scenario in scenarios]
-    episodes = len(task.episodes)
-    everything, some, others = (Chunk(slice(*rows), slice(0, episodes)) for rows in ((0, 20), (0, 8), (8, 20)))
-    parts, whole = new_outcome(task, recipes, [everything]), new_outcome(task, recipes, [everything])
-    parts.add(0, some, *pickle.loads(actor.run(1, recipes[:8].tobytes(), 0, episodes, MAPS, (), task, *arrays)))
-    parts.add(0, others, *pickle.loads(actor.run(1, recipes[8:].tobytes(), 0, episodes)))
-    whole.add(0, everything, *pickle.loads(actor.run(2, recipes.tobytes(), 0, episodes, (), (), task)))
-    assert parts.results.tobytes() == whole.results.tobytes() == outcome.results.tobytes()
+
+    def run(serial: int, rows: slice, *update: Any) -> np.ndarray:
+        return pickle.loads(actor.run(serial, recipes[rows].tobytes(), 0, len(task.episodes), *update))[0]
+
+    first = run(1, slice(0, 8), MAPS, (), task, *(each.arrays() for each in maps))
+    assert np.concatenate([first, run(1, slice(8, 20))]).tobytes() == wanted.tobytes()
+    assert run(2, slice(0, 20), (), (), task).tobytes() == wanted.tobytes()
 
 
 def test_a_chunk_of_another_task_is_refused() -> None:

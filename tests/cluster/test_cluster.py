@@ -24,7 +24,7 @@ from packaging.requirements import Requirement
 
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
-from cluster.workers import shipping
+from cluster.workers.ray_session import PACKAGES, runtime_env
 from gridsim.jit import CACHE_FOLDER
 
 CLOUDS = ("aws", "gcp")
@@ -72,7 +72,7 @@ def test_file_gives_each_machine_the_project_and_the_token(root: Path, name: str
     config = read(root, name)
     mounts = config["file_mounts"]
     assert mounts.pop("~/.ray/auth_token") == "~/.ray/auth_token"
-    assert {package.__name__ for package in shipping.PACKAGES} < set(mounts.values())
+    assert {package.__name__ for package in PACKAGES} < set(mounts.values())
     assert [path for path in mounts.values() if not (root / path).exists()] == []
     assert {there.removeprefix("~/gridsim/") for there in mounts} == set(mounts.values())
     for which in ("head", "worker"):
@@ -149,15 +149,15 @@ def test_the_guide_and_the_files_name_what_there_is(root: Path) -> None:
 
 def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RAY_JOB_CONFIG_JSON_ENV_VAR", raising=False)
-    alone = shipping.runtime_env()
+    alone = runtime_env()
     assert [Path(folder).name for folder in alone["py_modules"]] == ["cluster", "evolution", "gridsim"]
     assert all(Path(folder, "__init__.py").exists() for folder in alone["py_modules"])
     for submitted in (None, {}, {"working_dir": "gcs://w.zip"}):
         monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps({"runtime_env": submitted, "metadata": {}}))
-        assert shipping.runtime_env() == alone
+        assert runtime_env() == alone
     brought = {"runtime_env": {"py_modules": ["gcs://mine.zip"]}}
     monkeypatch.setenv("RAY_JOB_CONFIG_JSON_ENV_VAR", json.dumps(brought))
-    assert shipping.runtime_env()["py_modules"] == [*alone["py_modules"], "gcs://mine.zip"]
+    assert runtime_env()["py_modules"] == [*alone["py_modules"], "gcs://mine.zip"]
 
 
 # --- Two hosts -------------------------------------------------------------------------------------------------------

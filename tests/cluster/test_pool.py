@@ -1,10 +1,9 @@
 """SerialPool and what all pools share: chunks, one-line errors, the same result from any number of workers."""
 
-import os
-import subprocess
-import sys
+import re
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,20 +13,17 @@ from hypothesis import strategies as st
 
 from cluster.workers.pool import (
     CHUNK_S,
-    METRE_S,
-    NOBODY,
     WORTH_SENDING_S,
     Chunk,
     PoolError,
     SerialPool,
-    answer,
     cut,
-    everything,
     identify,
     last_line,
     metres,
     new_collected,
     new_outcome,
+    rectangle,
 )
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.dqn.experience import Experience
@@ -37,6 +33,7 @@ from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
+from gridsim.maps.roads import freeze
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import FIELDS
 
@@ -73,19 +70,12 @@ class Answering(Worker):
 
 
 class Failing(Answering):
-    """Answers until it meets a member that it cannot bear."""
+    """Answers until it meets member or episode 300."""
 
-    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
-        if 300 in recipes["seed"]:
-            raise ValueError("member 300 is\nnot to be had")
-        return super().evaluate(task, maps, recipes)
-
-    def collect(
-        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
-    ) -> tuple[Experience, np.ndarray, float]:
-        if 300 in task.keys[first:stop]:
-            raise ValueError("episode 300 is\nnot to be had")
-        return super().collect(task, maps, first, stop)
+    def answer(self, task, maps, recipes, first, stop):
+        if 300 in (task.keys[first:stop] if isinstance(task, CollectTask) else recipes["seed"]):
+            raise ValueError("300 is\nnot to be had")
+        return super().answer(task, maps, recipes, first, stop)
 
 
 def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | None = None) -> Task:
@@ -93,17 +83,8 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
     if episodes is None:
         episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
         episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
-    return Task(
-        "mlp:6,7",
-        parents,
-        12345,
-        Mutation(),
-        episodes,
-        no_traffic(len(episodes)),
-        maps,
-        Limits(150.0, 300),
-        SimConfig(),
-    )
+    worlds = no_traffic(len(episodes))
+    return Task("mlp:6,7", parents, 12345, Mutation(), episodes, worlds, maps, Limits(150.0, 300), SimConfig())
 
 
 def make_collect_task(n: int) -> CollectTask:
@@ -157,19 +138,17 @@ def goals(*metres: float) -> np.ndarray:
 @given(st.integers(0, 900), st.lists(st.floats(1.0, 2000.0), min_size=1, max_size=60), st.integers(1, 64))
 def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[float], workers: int) -> None:
     """Also where some members drive some episodes and others drive others."""
-    task = make_task(episodes=goals(*targets))
-    half = len(targets) // 2
+    e = len(targets)
     for asked in (
-        everything(task, make_recipes(n)),
-        [Chunk(slice(n // 3, n), slice(half, len(targets))), Chunk(slice(0, n // 3), slice(0, half))],
+        rectangle(n, e),
+        [Chunk(slice(n // 3, n), slice(e // 2, e)), Chunk(slice(0, n // 3), slice(0, e // 2))],
     ):
-        wanted, seen = np.zeros((n, len(targets)), dtype=int), np.zeros((n, len(targets)), dtype=int)
-        for rows, columns in asked:
-            wanted[rows, columns] += 1
-        for rows, columns in cut(task, asked, workers):
-            assert rows.stop > rows.start
-            assert columns.stop > columns.start
-            seen[rows, columns] += 1
+        wanted, seen = np.zeros((n, e), dtype=int), np.zeros((n, e), dtype=int)
+        for part in asked:
+            wanted[part] += 1
+        for part in cut(make_task(episodes=goals(*targets)), asked, workers):
+            assert seen[part].size
+            seen[part] += 1
         assert np.array_equal(seen, wanted)
 
 
@@ -177,46 +156,50 @@ def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[flo
 @pytest.mark.parametrize(
     ("n", "episodes", "target"), [(512, 12, 400.0), (24, 16, 1000.0), (4, 48, 2000.0), (1, 208, 2000.0)]
 )
-def test_chunks_let_nobody_wait_for_the_slowest(workers: int, n: int, episodes: int, target: float) -> None:
+def test_chunks_let_no_worker_wait_for_the_slowest(workers: int, n: int, episodes: int, target: float) -> None:
     """Simulated with equal metres: from the first worker that runs out to the last, one small chunk passes."""
-    task = make_task(episodes=goals(*[target] * episodes))
-    parts = cut(task, everything(task, make_recipes(n)), workers)
+    task, metre_s = make_task(episodes=goals(*[target] * episodes)), 1e-6
+    parts = cut(task, rectangle(n, episodes), workers, metre_s)
     busy = [0.0] * workers
     for part in parts:
         busy[busy.index(min(busy))] += metres(task, part)
-    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / METRE_S, CHUNK_S * workers / METRE_S, target) + 1e-6
+    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / metre_s, CHUNK_S * workers / metre_s, target) + 1e-6
     assert len(parts) <= 16 * workers, "as few as that needs"
 
 
-def test_no_members_no_results() -> None:
-    outcome = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(0))
-    assert outcome.results.shape == (0, 2)
+def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
+    """Of a large network, 1 ms a metre, before any of it is measured."""
+    task = make_task(episodes=goals(100.0, 100.0))
+    assert max(metres(task, part) for part in cut(task, rectangle(10_000, 2), 2)) * 1e-3 < 20
+    assert len(cut(task, rectangle(512, 2), 2)) < 40, "as few as a small network needs"
 
 
-def test_results_are_in_the_recipes_order_and_progress_is_told() -> None:
-    told: list[tuple[int, int]] = []
+def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
+    progress: list[tuple[int, int]] = []
     pool = SerialPool(never_built, Answering)
     recipes = make_recipes(512)
-    outcome = pool.evaluate(make_task(), recipes, lambda done, of: told.append((done, of)))
+    outcome = pool.evaluate(make_task(), recipes, lambda done, of: progress.append((done, of)))
     assert np.array_equal(outcome.results["distance"][:, 1], recipes["seed"] * 16.0 + 1)
-    assert told == sorted(told)
-    assert told[-1] == (512, 512)
-    assert len(told) > 5
+    assert progress == sorted(progress)
+    assert progress[-1] == (512, 512)
+    assert len(progress) > 5
     assert (outcome.retries, outcome.bytes_down, outcome.bytes_up, outcome.broadcast_bytes) == (0, 0, 0, 0)
     assert 0 < sum(outcome.busy_s.values()) <= outcome.wall_s
+    assert pool.evaluate(make_task(), make_recipes(0)).results.shape == (0, 2)
+    for _ in range(2):
+        pool.close()
 
 
-def test_only_what_is_asked_for_is_driven_while_something_else_is_done() -> None:
-    recipes, done = make_recipes(20), []
+def test_only_what_is_asked_for_is_driven() -> None:
+    recipes, progress = make_recipes(20), [(0, 0)]
     asked = [Chunk(slice(15, 20), slice(1, 2)), Chunk(slice(0, 10), slice(0, 1))]
     pool = SerialPool(never_built, Answering)
-    outcome = pool.evaluate(make_task(), recipes, asked=asked, meanwhile=lambda: done.append(1))
+    outcome = pool.evaluate(make_task(), recipes, lambda *done: progress.append(done), asked)
     wanted = np.zeros((20, 2))
     wanted[15:, 1], wanted[:10, 0] = recipes["seed"][15:] * 16.0 + 1, recipes["seed"][:10] * 16.0
     assert np.array_equal(outcome.results["distance"], wanted)
     assert outcome.whole()
-    assert outcome.members() == 20
-    assert done == [1]
+    assert progress[-1] == (20, 20)
 
 
 def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
@@ -238,30 +221,14 @@ def interrupted() -> None:
     raise KeyboardInterrupt
 
 
-def test_experience_is_in_the_episodes_order() -> None:
-    collected = SerialPool(never_built, Answering).collect(make_collect_task(100))
-    wanted = np.repeat(np.arange(100), np.arange(100) % 5 + 1)
-    assert (collected.experience.rewards == wanted).all()
-    assert (collected.experience.observations == wanted[:, None]).all()
-    assert (collected.results["steps"] == np.arange(100) % 5).all()
-    assert len(SerialPool(never_built, Answering).collect(make_collect_task(0)).experience.actions) == 0
-
-
-def test_a_worker_that_fails_to_collect_ends_in_one_line_that_names_the_episodes() -> None:
-    with pytest.raises(
-        PoolError, match=r"^a worker failed on chunk \d+ \(episodes \d+ to \d+\): ValueError: not to be"
-    ):
-        SerialPool(never_built, Failing).collect(make_collect_task(512))
-
-
 def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
     """And what a task holds is read-only."""
-    task, scenarios = collect_drive_task(9)
-    whole = SerialPool(lambda *name: scenarios[name[1]]).collect(task)
+    task, maps = collect_drive_task(9)
+    whole = SerialPool(lambda *name: maps[name[1]]).collect(task)
     collected = new_collected(task)
     for first, stop in ((5, 9), (0, 2), (2, 5)):
-        brought = answer(Worker(), task, scenarios, NOBODY, first, stop)
-        collected.add(first, Chunk(slice(0, 1), slice(first, stop)), *brought)
+        answer = Worker().answer(task, maps, make_recipes(0), first, stop)
+        collected.add(first, Chunk(slice(0, 1), slice(first, stop)), *answer)
     assert collected.whole()
     assert to_bytes(collected.experience) == to_bytes(whole.experience)
     assert collected.results.tobytes() == whole.results.tobytes()
@@ -269,13 +236,13 @@ def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
     assert all(not array.flags.writeable for array in (task.weights, task.episodes, task.worlds, task.keys))
 
 
-def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
+def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
     """A member whose first episode came back and whose second kills; and an episode of a batch."""
     task, recipes = make_task(), make_recipes(3)
-    outcome = new_outcome(task, recipes, everything(task, recipes))
-    none, nobody = np.zeros((2, 0, 5), dtype=np.float32), np.zeros((2, 0, 0, FIELDS), dtype=np.float32)
-    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), none, nobody, 0.1)
-    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), none[:1], nobody[:1], 0.1)
+    outcome = new_outcome(task, recipes, rectangle(3, 2))
+    none, no_cars = np.zeros((2, 0, 5), dtype=np.float32), np.zeros((2, 0, 0, FIELDS), dtype=np.float32)
+    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), none, no_cars, 0.1)
+    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), none[:1], no_cars[:1], 0.1)
     assert not outcome.whole()
     outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
     assert outcome.whole()
@@ -285,94 +252,71 @@ def test_who_is_lost_has_nothing_not_even_what_was_there() -> None:
     task_of_10 = make_collect_task(10)
     collected = new_collected(task_of_10)
     for first, stop in ((4, 10), (0, 3)):
-        part = Answering().collect(task_of_10, [], first, stop)
-        collected.add(0, Chunk(slice(0, 1), slice(first, stop)), *part)
+        collected.add(0, Chunk(slice(0, 1), slice(first, stop)), *Answering().collect(task_of_10, [], first, stop))
     collected.lose(Chunk(slice(0, 1), slice(3, 4)))
     assert collected.whole()
     assert np.flatnonzero(collected.lost).tolist() == [3]
     assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
-def rewound_task() -> tuple[Task, list[Map]]:
-    """A small real task; of its last two episodes the states before their ends are wanted back."""
-    scenarios = [build(*name) for name in MAPS]
-    episodes, worlds = lane_starts(scenarios, np.array([0, 1, 1, 0]), np.random.default_rng(1), 2)
-    episodes["rewind"][2:] = 5, 9
-    parents = np.random.default_rng(0).standard_normal((8, 311)).astype(np.float32)
-    limits = Limits(150.0, 300)
-    return Task("mlp:6,7", parents, 12345, Mutation(), episodes, worlds, MAPS, limits, SimConfig()), scenarios
-
-
-def test_states_before_the_end_are_those_of_the_one_who_drove_there() -> None:
+def test_states_before_the_end_are_those_of_the_member_that_drove_there() -> None:
     """The last member drives the last two episodes, which ask for them; alone and in parts."""
-    task, scenarios = rewound_task()
+    maps = [build(*name) for name in MAPS]
+    episodes, worlds = lane_starts(maps, np.array([0, 1, 1, 0]), np.random.default_rng(1), 2)
+    episodes["rewind"][2:] = 5, 9
+    task = replace(make_task(MAPS, episodes), worlds=freeze(worlds))
     recipes = make_recipes(6)
     asked = [Chunk(slice(5, 6), slice(2, 4)), Chunk(slice(0, 5), slice(0, 2))]
-    outcome = SerialPool(lambda *name: scenarios[name[1]]).evaluate(task, recipes, asked=asked)
-    results, rewound, worlds, _ = Worker().evaluate(task, scenarios, recipes[5:])
-    assert outcome.rewound.shape == (4, 5)
-    assert outcome.worlds.shape == task.worlds.shape
-    assert (outcome.rewound[:2] == 0.0).all()
-    assert (outcome.worlds[:2] == 0.0).all()
+    outcome = SerialPool(lambda *name: maps[name[1]]).evaluate(task, recipes, asked=asked)
+    results, rewound, then, _ = Worker().evaluate(task, maps, recipes[5:])
+    assert not outcome.rewound[:2].any()
+    assert not outcome.worlds[:2].any()
     assert outcome.rewound[2:].tobytes() == rewound[0].tobytes()
-    assert outcome.worlds[2:].tobytes() == worlds[0].tobytes()
+    assert outcome.worlds[2:].tobytes() == then[0].tobytes()
     assert outcome.results[5, 2:].tobytes() == results[0, 2:].tobytes()
     assert (outcome.rewound[2:, :2] != 0.0).all()
 
     taken = new_outcome(task, recipes, asked)
     for rows, columns in ((slice(5, 6), slice(3, 4)), (slice(0, 5), slice(0, 2)), (slice(5, 6), slice(2, 3))):
-        brought = answer(Worker(), task, scenarios, recipes[rows], columns.start, columns.stop)
-        taken.add(0, Chunk(rows, columns), *brought)
+        taken.add(0, Chunk(rows, columns), *Worker().answer(task, maps, recipes[rows], columns.start, columns.stop))
     assert taken.whole()
     for name in ("results", "rewound", "worlds"):
         assert getattr(taken, name).tobytes() == getattr(outcome, name).tobytes()
 
 
-def test_a_member_is_told_by_its_recipe() -> None:
+def test_a_member_is_identified_by_its_recipe() -> None:
     recipes = make_recipes(9)
     recipes["kind"][8] = Kind.MIRRORED
-    told = [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes) for k in (1, 7, 8)]
-    assert told == [
+    assert [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes) for k in (1, 7, 8)] == [
         "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
         "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",
         "member 8 (mirrored of rows 0 and 0, seed 8, key 0x3039)",
     ]
 
 
-def test_a_failing_worker_ends_in_one_line_that_names_the_chunk() -> None:
+@pytest.mark.parametrize("what", ["members", "episodes"])
+def test_a_failing_worker_ends_in_one_line_that_names_the_chunk(what: str) -> None:
     pool = SerialPool(never_built, Failing)
     with pytest.raises(PoolError) as caught:
-        pool.evaluate(make_task(), make_recipes(512))
-    text = str(caught.value)
-    assert "\n" not in text
-    first, last = (int(word.strip(")")) for word in text.split("members ")[1].split(":")[0].split(" to "))
-    assert first <= 300 <= last
-    assert text.endswith("ValueError: not to be had")
+        pool.evaluate(make_task(), make_recipes(512)) if what == "members" else pool.collect(make_collect_task(512))
+    said = re.fullmatch(
+        rf"a worker failed on chunk \d+ \({what} (\d+) to (\d+)\): ValueError: not to be had", str(caught.value)
+    )
+    assert said is not None
+    assert int(said[1]) <= 300 <= int(said[2])
     assert isinstance(caught.value.__cause__, ValueError)
-
-
-@pytest.mark.parametrize(
-    ("error", "line"),
-    [
-        (ValueError("one\n\n two \n"), "ValueError: two"),
-        (KeyError("x"), "KeyError: 'x'"),
-        (MemoryError(), "MemoryError"),
-    ],
-)
-def test_last_line(error: Exception, line: str) -> None:
-    assert last_line(error) == line
+    assert last_line(MemoryError()) == "MemoryError"
 
 
 def test_chunks_change_nothing_for_the_real_worker() -> None:
     """All at once, in the pool's chunks, and member by member: the same bits."""
-    task, scenarios = drive_task()
+    task, maps = drive_task()
     recipes = make_recipes(40)
     for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (30, Kind.MIRRORED), (35, Kind.COPY)):
         recipes["kind"][first : first + 5] = kind
-    known = dict(zip(MAPS, scenarios, strict=True))
-    outcome = SerialPool(lambda *name: known[name]).evaluate(task, recipes)
-    whole, _, _, seconds = Worker().evaluate(task, scenarios, recipes)
-    single = np.concatenate([Worker().evaluate(task, scenarios, recipes[i : i + 1])[0] for i in range(40)])
+    outcome = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes)
+    whole, _, _, seconds = Worker().evaluate(task, maps, recipes)
+    single = np.concatenate([Worker().evaluate(task, maps, recipes[i : i + 1])[0] for i in range(40)])
     assert outcome.results.tobytes() == whole.tobytes() == single.tobytes()
     assert whole["distance"].max() > 0
     assert seconds > 0
@@ -391,16 +335,3 @@ def test_every_input_of_the_kernels_is_read_only() -> None:
     SerialPool(build, Looking).evaluate(make_task(MAPS[:1]), make_recipes(20))
     assert len(seen) > 3
     assert all(not array.flags.writeable and array.flags.c_contiguous for array in seen)
-
-
-def test_closing_twice_is_fine() -> None:
-    pool = SerialPool(never_built, Answering)
-    assert pool.workers() == 1
-    pool.close()
-    pool.close()
-
-
-def test_the_serial_pool_needs_no_ray(root: os.PathLike) -> None:
-    code = "import sys, cluster.workers.pool; print('ray' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=60)
-    assert done.stdout == "False\n"

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.e2e
 SCRIPT = """
     import ctypes
     import sys
-    from cluster.commands.common import main
+    from cluster.commands.common import main, undisturbed
     from cluster.workers.ray_pool import RayPool
     from test_pool import make_recipes, make_task, never_built
     from test_ray_process import Slow
@@ -49,7 +49,8 @@ SCRIPT = """
         except KeyboardInterrupt:
             return 130
         finally:
-            pool.close()
+            with undisturbed():
+                pool.close()
         return 0
 
     if __name__ == "__main__":
