@@ -5,7 +5,6 @@ An actor gets the values of references that are arguments of their own, read-onl
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
 import signal
@@ -29,20 +28,17 @@ class Actor:
 
     Args:
         factory: makes the worker.
-        own_process: whether nothing else lives in the process, which then ignores Ctrl-C.
     """
 
-    def __init__(self, factory: Callable[[], Worker], own_process: bool = False):
-        # Ctrl-C goes to every process of the terminal, but only the coordinator decides when workers stop.
-        if own_process:
-            with contextlib.suppress(ValueError):
-                signal.signal(signal.SIGINT, signal.SIG_IGN)
+    def __init__(self, factory: Callable[[], Worker]):
         self._worker = factory()
         self._serial = 0
         self._task: Task | CollectTask | None = None
         self._maps: dict[Name, Map] = {}
 
     def hello(self) -> int:
+        """The process's id. It ignores Ctrl-C, which goes to all of a terminal: the coordinator ends its workers."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         return os.getpid()
 
     def prepare(self, serial: int, *update: Any) -> int:

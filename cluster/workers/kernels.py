@@ -11,7 +11,6 @@ started often.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -48,10 +47,8 @@ class Warming:
 
     def wait(self) -> None:
         """Wait for what a run needs first. If such a process fails, this one compiles that when it needs it."""
-        ready = [process.stdout is not None and process.stdout.readline() for process in self.processes]
-        if all(ready):
-            with contextlib.suppress(OSError):
-                self.done.touch()
+        if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
+            self.done.touch()
 
     def stop(self) -> None:
         """End what still runs."""
@@ -66,18 +63,16 @@ def begin(settings: RunSettings) -> Warming:
     warming = Warming(_marker(settings))
     if not warming.done.exists():
         what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
-        # Neither the folder it is started from (-P) nor Ctrl-C is its own: it is stopped by `stop`.
-        for part in ("kernels", "roads"):
-            with contextlib.suppress(OSError):
-                warming.processes.append(
-                    subprocess.Popen(
-                        [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],
-                        stdin=subprocess.DEVNULL,
-                        stdout=subprocess.PIPE,
-                        stderr=subprocess.DEVNULL,
-                        start_new_session=True,
-                    )
-                )
+        warming.processes += [
+            subprocess.Popen(
+                [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],  # -P: nothing of this folder
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C does not reach it: `stop` ends it
+            )
+            for part in ("kernels", "roads")
+        ]
     return warming
 
 
@@ -151,10 +146,12 @@ def compile_everything() -> None:
         print(_marker(settings).name, flush=True)
 
 
-def main(part: str, scenario: str, policy: str, cars: str, command: str) -> None:
+def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", command: str = "") -> None:
     """What the process does."""
     traffic = int(cars)
-    if part == "kernels":
+    if part == "everything":
+        compile_everything()
+    elif part == "kernels":
         compile_kernels(policy, traffic, command)
         print("ready", flush=True)
     else:
@@ -165,7 +162,4 @@ def main(part: str, scenario: str, policy: str, cars: str, command: str) -> None
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["everything"]:
-        compile_everything()
-    else:
-        main(*sys.argv[1:])
+    main(*sys.argv[1:])

@@ -186,7 +186,7 @@ class RayPool(WorkerPool):
         import ray
 
         if not refs:
-            time.sleep(min(timeout_s, PAUSE_S))
+            time.sleep(timeout_s)
             return []
         ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0.0)  # with many workers one look costs more than this
         if not ready and timeout_s > 0.0:
@@ -308,7 +308,7 @@ class RayPool(WorkerPool):
             raise PoolError(f"{where}: {reason(self._failure)}") from self._failure
 
     def _start(self, slot: _Slot) -> None:
-        slot.actor = self._actor_class.remote(self._factory, own_process=True)
+        slot.actor = self._actor_class.remote(self._factory)
         slot.hello = slot.actor.hello.remote()
 
     def _replace(self, slot: _Slot, pause_s: float = 0.0) -> None:

@@ -140,7 +140,7 @@ class Stopping(Answering):
 def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> None:
     """As a host that is cut off: Ray says nothing. Later calls go on without it; it may come back, or be replaced."""
     wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(512)).results.tobytes()
-    pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path), patience_s=6.0)
+    pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path), patience_s=15.0)
 
     def evaluate() -> float:
         begun = time.monotonic()
