@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 from simulation import ROWS  # beside this file
 
-from cluster.runs.run import Session, make_tracker, new_run
+from cluster.runs.run import new_run
 from cluster.runs.settings import EvolveSettings
+from cluster.runs.train import Session
 from cluster.tracking.address import check_uri
 from cluster.training.trainer import Maps
 from cluster.workers.pool import Chunk, WorkerPool
@@ -103,8 +104,7 @@ def session(
     """A run as the command makes it, in a folder of its own; `initial` is a genome to start from."""
     run = new_run(folder, name, settings)
     run.path.mkdir(parents=True)
-    tracker = make_tracker(run, check_uri(f"sqlite:///{folder}/mlflow.db"), "scaling")
-    return Session(run, pool, maps, tracker, time.perf_counter(), initial)
+    return Session(run, pool, maps, check_uri(f"sqlite:///{folder}/mlflow.db"), "scaling", initial=initial)
 
 
 def learn(this: Session) -> None:

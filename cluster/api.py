@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from cluster.runs.champion import Champion, evaluate, load_champion
-from cluster.runs.run import new_learning
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.runs.train import new_learning
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool, WorkerPool

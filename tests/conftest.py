@@ -55,10 +55,11 @@ def root() -> Path:
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
     from cluster.tracking.address import check_uri
+    from cluster.tracking.mlflow_run import Identity
     from cluster.tracking.tracker import Tracker
 
     folder = tmp_path_factory.mktemp("mlflow")
-    begun = Tracker(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {})
+    begun = Tracker(Identity(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {}))
     begun.wait_ready(60)
     assert begun.close("FINISHED") is None
     assert os.listdir(folder) == ["mlflow.db"]

@@ -30,19 +30,15 @@ from cluster.commands.common import (
     parse,
     stoppable,
     typed,
-    undisturbed,
     warn_of_crowd,
 )
-from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, SettingsError, check_workers
+from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import is_map_file
 
 if TYPE_CHECKING:
     from cluster.runs.run import RunFolder
-    from cluster.tracking.mlflow_run import Status
-    from cluster.tracking.tracker import Tracker
-    from cluster.training.trainer import Maps
-    from cluster.workers.kernels import Warming
-    from cluster.workers.pool import WorkerPool
+    from cluster.runs.train import Session
 
 REMOVED = {
     "islands": "a run has one population; use --recombination all, the default, which needs no others",
@@ -269,23 +265,20 @@ def settings_of(flags: Flags) -> RunSettings:
 
 
 def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
-    from cluster.tracking.address import TrackingError, check_uri
-    from cluster.workers.pool import PoolError, SerialPool
-
     prog = kind.command
     console = Console()
     try:
         flags, run = _prepare(kind, arguments)
-        from cluster.runs.run import is_finished, log_missing, make_tracker
-        from cluster.training.trainer import Maps
-        from cluster.workers import kernels
-        from cluster.workers.ray_pool import RayPool
+        from cluster.commands.progress import Progress
+        from cluster.runs.champion import load_champion
+        from cluster.runs.run import is_finished
+        from cluster.runs.train import Workers, send_missing, train, undisturbed
+        from cluster.tracking.address import check_uri
         from cluster.workers.ray_session import check_address
-        from gridsim.config import SimConfig
 
         if is_finished(run):
             first = kind.counts[0]
-            sent, lost = log_missing(run, flags.tracking_uri, flags.experiment)
+            sent, lost = send_missing(run, flags.tracking_uri, flags.experiment)
             sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
             console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
             if lost:
@@ -296,100 +289,56 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
         address = flags.address or os.environ.get("RAY_ADDRESS") or None
         if address and flags.workers:
             address = check_address(address)
-    except (UsageError, SettingsError, TrackingError, PoolError) as error:
+    except GridSimError as error:
         fail(prog, str(error))
 
     warn_of_crowd(prog, flags.workers, flags.address)
     made = _make_folder(prog, run)
-    tracker = make_tracker(run, uri, flags.experiment, started=time.time() - time.perf_counter() + started)
-    closing = contextlib.ExitStack()
-    status: Status = "FAILED"
-    code = FAILED
-    message = ""
-    again = f"continue with: {called(prog)} --resume {typed(run.path)}"
+    workers = Workers(flags.workers, address, flags.patience)
+    resume = f"{called(prog)} --resume {typed(run.path)}"
+    again = f"continue with: {resume}"
+    code, message = 0, ""
     try:
         with stoppable():
-            maps = Maps(run.settings.scenario, SimConfig())
-            closing.callback(maps.close)
-            warming = kernels.begin(run.settings)
-            closing.callback(warming.stop)
-            pool: WorkerPool = SerialPool(maps.build)
-            if flags.workers:
-                pool = RayPool(flags.workers, maps.build, address, patience_s=flags.patience)
-            closing.callback(pool.close)
-            message = _run(console, run, pool, maps, tracker, flags, started, warming)
-        status, code = "FINISHED", 0
+            initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
+            progress = Progress(console, prog, typed(run.path), resume)
+            session = train(run, workers, uri, flags.experiment, progress, started, initial=initial)
     except KeyboardInterrupt:
-        status, code = "KILLED", INTERRUPTED
+        code = INTERRUPTED
     except Stopped:
-        status, code = "KILLED", TERMINATED
-    except Exception as error:
-        from cluster.runs.checkpoint import CheckpointError
-
-        if not isinstance(error, PoolError | CheckpointError | FloatingPointError | MemoryError | OSError):
-            raise
-        message = str(error) or type(error).__name__
+        code = TERMINATED
+    except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
+        code, message = FAILED, str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # to go on would be to come to the same
             again = f"repeat it with: {called(prog)} --config {typed(run.path)}/config.json --learning-rate ..."
     finally:
         with undisturbed():
-            if status == "KILLED":
-                Console(stderr=True).print("stopping; a moment ...", style="dim")
-            closing.close()
-            lost = tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
-    if lost:
-        later = f"; send it later with: {called(prog)} --resume {typed(run.path)}" if status == "FINISHED" else ""
-        print(f"{prog}: warning: {lost}{later}", file=sys.stderr)
+            workers.close()
+    if code == 0:
+        _show_end(console, session)
+        return code
     resumable = (run.path / "checkpoint.npz").is_file()
-    if status == "KILLED":
-        where = again if resumable else f"no {kind.counts[0]} was done yet"
-        print(f"{prog}: stopped; {where}", file=sys.stderr)
-        if not resumable:
-            _discard(made)
-    elif status == "FAILED":
-        if not resumable:
-            _discard(made)
+    if not resumable:
+        _discard(made)
+    if code == FAILED:
         fail(prog, message, again if resumable else "", FAILED)
-    else:
-        console.print(message, soft_wrap=True)
+    print(f"{prog}: stopped; {again if resumable else f'no {kind.counts[0]} was done yet'}", file=sys.stderr)
     return code
 
 
-def _run(
-    console: Console, run: RunFolder, pool: WorkerPool, maps: Maps, tracker: Tracker, flags: Flags,
-    started: float, warming: Warming,
-) -> str:  # fmt: skip
-    """Learn and finish. Returns the closing words."""
-    from cluster.commands import progress
+def _show_end(console: Console, session: Session) -> None:
+    """The closing words of a finished run."""
     from cluster.report import pictures
-    from cluster.runs.champion import load_champion
-    from cluster.runs.run import Session
-    from cluster.workers import kernels
 
-    initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
-    session = Session(run, pool, maps, tracker, started, initial)
-    session.learning.warn = lambda text: print(f"{flags.command}: warning: {text}", file=sys.stderr, flush=True)
-    if warming.processes:
-        with console.status("compiling the simulator for this machine, once (some 10 s)"):
-            warming.wait()
-    maps.ahead(session.learning.curriculum.map_seeds[:3])
-    kernels.compile_kernels(run.settings.policy, run.settings.traffic, run.settings.command)
-    run.write_config()
-    with progress.Progress(console, session, typed(run.path)) as bar:
-        session.on_row = bar.row
-        session.learning.on_progress = bar.members
-        session.learn()
-        summary = session.complete(flags.workers, bar.note)
-    if session.lost:
-        print(f"{flags.command}: warning: {session.lost}", file=sys.stderr)
+    summary, name, path = session.summary, session.learning.step_name, session.run.path
     console.print(pictures.held_out_table("The champion on held-out drives", summary["held_out"]))
-    found = "solved" if summary["solved"] else "the best so far"
-    name = session.learning.step_name
-    return (
-        f"{found} after {summary[name + 's']} {name}s, {summary['car_steps'] / 1e6:,.1f} million car-steps, "
-        f"{summary['wall_s']:.0f} s\nrun: {typed(run.path)}   champion: {typed(run.path / 'champion.npz')}\n"
-        f"watch it: {called('gridsim-watch')} {typed(run.path)}\n"
-        f"compare: {tracker.where()}"
+    console.print(
+        f"{'solved' if summary['solved'] else 'the best so far'} after {summary[name + 's']} {name}s, "
+        f"{summary['car_steps'] / 1e6:,.1f} million car-steps, {summary['wall_s']:.0f} s\n"
+        f"run: {typed(path)}   champion: {typed(path / 'champion.npz')}\n"
+        f"watch it: {called('gridsim-watch')} {typed(path)}\n"
+        f"compare: {session.tracker.where()}",
+        soft_wrap=True,
     )
 
 

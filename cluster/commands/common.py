@@ -134,17 +134,6 @@ def stoppable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """No signal may cut short the saving and closing."""
-    before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM)]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
-
-
 def main(prog: str, body: Callable[[], int]) -> NoReturn:
     """Run a command, which Ctrl-C and SIGTERM stop, and end this process with the code that `body` returns."""
     try:

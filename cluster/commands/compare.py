@@ -264,11 +264,12 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
 
 def _tracker(folder: ComparisonFolder, uri: str, name: str) -> Tracker:
     """MLflow's parent run."""
+    from cluster.tracking.mlflow_run import Identity
     from cluster.tracking.tracker import Tracker
 
     params = {key: " ".join(v) if isinstance(v, list) else str(v) for key, v in folder.plan.to_dict().items()}
     tags = {"algorithm": "comparison"}
-    return Tracker(uri, name, folder.path.name, params, tags, key=folder.tracking_key, start=False)
+    return Tracker(Identity(uri, name, folder.path.name, params, tags, key=folder.tracking_key))
 
 
 def _close(tracker: Tracker, results: Results | None, status: str) -> str | None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import deque
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -11,8 +13,10 @@ from rich.progress import Progress as Live
 from rich.progress import ProgressColumn, Task
 from rich.text import Text
 
+from cluster.runs.train import Reporter
+
 if TYPE_CHECKING:
-    from cluster.runs.run import Session
+    from cluster.runs.train import Session
     from cluster.training.trainer import Learning
 
 LINE_S = 5.0  # between lines where there is no terminal
@@ -36,11 +40,29 @@ class Line(ProgressColumn):
         return line.append(task.fields["rest"])
 
 
-class Progress:
-    """Shows how far a run is, its success and ETA, then distance, speed and car-steps per second."""
+class Progress(Reporter):
+    """Shows how far a run is, its success and ETA, then distance, speed and car-steps per second.
 
-    def __init__(self, console: Console, session: Session, folder: str):
-        self._console, self._learning = console, session.learning
+    Args: the console; the command's name; the run's folder and how to resume it, as the user would type these.
+    """
+
+    def __init__(self, console: Console, prog: str, folder: str, resume: str):
+        self._console, self._prog, self._folder, self._resume = console, prog, folder, resume
+
+    def warn(self, text: str) -> None:
+        print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
+
+    def unsent(self, text: str, finished: bool) -> None:
+        self.warn(f"{text}; send it later with: {self._resume}" if finished else text)
+
+    def compiling(self) -> AbstractContextManager[object]:
+        return self._console.status("compiling the simulator for this machine, once (some 10 s)")
+
+    def stopping(self) -> None:
+        Console(stderr=True).print("stopping; a moment ...", style="dim")
+
+    def learning(self, session: Session) -> Progress:
+        console, self._learning = self._console, session.learning
         self._live = console.is_terminal
         done, total, _ = self._learning.way()
         self._ends: deque[tuple[float, float, float]] = deque()  # of steps: when, how far, car-steps
@@ -54,7 +76,8 @@ class Progress:
         settings = session.run.settings
         verb = "continuing" if done else self._learning.verb
         what = f"{settings.policy} on {settings.scenario}, seed {settings.seed}"
-        console.print(f"{verb} {what} -> {folder}", soft_wrap=True)
+        console.print(f"{verb} {what} -> {self._folder}", soft_wrap=True)
+        return self
 
     def __enter__(self) -> Progress:
         self._bar.start()

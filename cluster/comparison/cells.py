@@ -6,22 +6,19 @@ import math
 import os
 import shutil
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import Any
 
 from cluster.commands.progress import way
 from cluster.comparison.plan import COMPARISON, Cell, CellError
 from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, Session, lock, make_tracker, new_run, open_run
+from cluster.runs.run import CHECKPOINT, CONFIG, RunError, RunFolder, new_run, open_run
 from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, SettingsError
-from cluster.tracking.mlflow_run import Status
-from cluster.training.trainer import Maps
-from cluster.workers import kernels
-from cluster.workers.pool import PoolError, SerialPool, WorkerPool
-from gridsim.config import SimConfig
-from gridsim.maps.map import Map
+from cluster.runs.train import Reporter, Session, Workers, train
+from cluster.training.trainer import Learning
+from cluster.workers.pool import PoolError
 
 UNBOUND = MAX_STEPS  # generations or car-steps, where a budget is what ends a run
 EVALUATIONS = 10  # of the DQN at least
@@ -45,8 +42,7 @@ class Cells:
     parent_id: str = ""
     note: Callable[..., None] = lambda text, more="": None
     patience: float = 0.0
-    _pool: WorkerPool | None = None
-    _maps: Maps | None = field(default=None, init=False)
+    _workers: Workers | None = None
 
     def __call__(self, cell: Cell) -> dict[str, Any]:
         try:
@@ -61,9 +57,8 @@ class Cells:
 
     def close(self) -> None:
         """Stop the workers."""
-        if self._pool:
-            self._pool.close()
-            self._pool = None
+        if self._workers:
+            self._workers.close()
 
     def _folder(self, cell: Cell) -> RunFolder:
         """A new run's folder, or that of one that goes on."""
@@ -79,56 +74,47 @@ class Cells:
         return new_run(cell.folder.parent, cell.name, settings_of(cell))
 
     def _train(self, cell: Cell, run: RunFolder) -> dict[str, Any]:
-        settings = run.settings
-        self._maps = maps = Maps(settings.scenario, SimConfig())
-        warming = kernels.begin(settings)
-        tracker = make_tracker(run, self.tracking_uri, self.experiment, self.parent_id)
-        status: Status = "KILLED"
-        try:
-            pool = self._workers(run.path.parent.name)
-            session = Session(
-                run, pool, maps, tracker, time.perf_counter(), film=False,
-                wall_limit_s=cell.plan.budget.wall_s or math.inf,
-                on_row=lambda _, row: self.note(
-                    f"{way(session.learning, bound=False)}  success {row['validation/success_rate']:.0%}",
-                    session.learning.describe(row),
-                ),
-            )  # fmt: skip
-            session.learning.warn = lambda text: print(f"{cell.name}: warning: {text}", file=sys.stderr, flush=True)
-            maps.ahead(session.learning.curriculum.map_seeds[:3])
-            if warming.processes:
-                self.note("compiling the simulator for this machine, once")
-            warming.wait()
-            kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
-            lock(run.path)
-            run.write_config()
-            session.process_started = time.perf_counter()  # a budget is of learning, not of what is loaded for it
-            session.learn()
-            summary = session.complete(self.workers, self.note)
-            status = "FINISHED"
-            return summary
-        except Exception:
-            status = "FAILED"
-            raise
-        finally:
-            warming.stop()
-            maps.close()
-            tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)
-
-    def _workers(self, comparison: str) -> WorkerPool:
-        """The pool of all runs."""
-        if self._pool is None and self.workers:
-            from cluster.workers.ray_pool import RayPool
-
+        if self._workers is None:
             address = self.address or os.environ.get("RAY_ADDRESS") or None
-            self._pool = RayPool(self.workers, self._build, address, patience_s=self.patience)
-        elif self._pool is None:
-            self._pool = SerialPool(self._build)
-        return self._pool
+            self._workers = Workers(self.workers, address, self.patience)
+        reporter = CellReporter(cell, self.note)
+        wall_limit_s = cell.plan.budget.wall_s or math.inf
+        return train(
+            run, self._workers, self.tracking_uri, self.experiment, reporter, parent_id=self.parent_id, film=False,
+            wall_limit_s=wall_limit_s,
+        ).summary  # fmt: skip
 
-    def _build(self, scenario: str, seed: int) -> Map:
-        assert self._maps is not None
-        return self._maps.build(scenario, seed)
+
+@dataclass
+class CellReporter(Reporter):
+    """Shows how far a cell is; `tell` shows a text, and perhaps more of it."""
+
+    cell: Cell
+    tell: Callable[..., None]
+    _learning: Learning | None = None
+
+    def warn(self, text: str) -> None:
+        print(f"{self.cell.name}: warning: {text}", file=sys.stderr, flush=True)
+
+    def compiling(self) -> AbstractContextManager[object]:
+        self.tell("compiling the simulator for this machine, once")
+        return nullcontext()
+
+    def learning(self, session: Session) -> AbstractContextManager[object]:
+        self._learning = session.learning
+        return nullcontext()
+
+    def row(self, steps: int, row: dict[str, float]) -> None:
+        assert self._learning is not None
+        success = f"success {row['validation/success_rate']:.0%}"
+        self.tell(f"{way(self._learning, bound=False)}  {success}", self._learning.describe(row))
+
+    def note(self, text: str) -> None:
+        self.tell(text)
+
+    def unsent(self, text: str, finished: bool) -> None:
+        command = "gridsim-dqn" if self.cell.learner == "dqn" else "gridsim-evolve"
+        self.warn(f"{text}; send it later with: {command} --resume {self.cell.folder}" if finished else text)
 
 
 def settings_of(cell: Cell) -> RunSettings:

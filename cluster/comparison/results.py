@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from cluster.runs import checkpoint
 from cluster.runs.champion import evaluate, load_champion
-from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.run import CHAMPION, CONFIG, SUMMARY, RunError, read_config
+from cluster.runs.checkpoint import CHAMPION, CheckpointError
+from cluster.runs.run import CONFIG, SUMMARY, RunError, read_config
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import label

@@ -1,6 +1,6 @@
 """Tracking addresses: which may be used, made absolute, and how they are shown. Knows nothing of MLflow.
 
-An address is looked at before MLflow is: given a dead one it would hang for minutes.
+An address is probed before MLflow is imported: with a dead one MLflow would hang for minutes.
 """
 
 import contextlib
@@ -20,7 +20,8 @@ from gridsim.errors import GridSimError
 DEFAULT_URI = "sqlite:///mlflow.db"
 UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
 PROBE_S = 3.0
-_SERVERS = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}
+_DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
+_PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # which a gateway in front of MLflow serves, too
 
 
 class TrackingError(GridSimError):
@@ -28,7 +29,7 @@ class TrackingError(GridSimError):
 
 
 def check_uri(uri: str | None = None) -> str:
-    """The tracking address made absolute, after a look whether it can be used: 4 s at most, and without MLflow.
+    """The tracking address made absolute and probed, within 4 s and without MLflow.
 
     None stands for MLFLOW_TRACKING_URI and, where that is not set, for `sqlite:///mlflow.db` in the working directory.
     Raises TrackingError for a server that does not answer, a database that cannot be written, a folder (MLflow 3
@@ -39,16 +40,21 @@ def check_uri(uri: str | None = None) -> str:
     if scheme == "sqlite":
         return _check_sqlite(uri)
     if scheme in ("http", "https"):
-        return _check_http(uri)
-    if scheme in _SERVERS:
-        return _check_server(uri, _SERVERS[scheme])
+        uri = uri.rstrip("/")
+        if reason := _probe(uri):
+            raise TrackingError(f"no MLflow server at {shown(uri)}: {reason}; start one, or use {DEFAULT_URI}")
+        return uri
+    if scheme in _DATABASES:
+        if reason := _probe(uri, _DATABASES[scheme]):
+            raise TrackingError(f"no database server at {shown(uri)}: {reason}")
+        return uri
     if scheme in ("", "file"):
         raise TrackingError(f"{uri}: MLflow 3 keeps no runs in folders; use sqlite:///mlflow.db or http://host:port")
     raise TrackingError(f"{shown(uri)}: not a tracking address; use sqlite:///mlflow.db or http://host:port")
 
 
 def _check_sqlite(uri: str) -> str:
-    """The address with an absolute path, after the database, or the folder for it, was found to be writable."""
+    """The address with an absolute path. Raises TrackingError if the database, or its folder, cannot be written."""
     path = sqlite_path(uri)
     if path is None:
         raise TrackingError(f"{uri}: names no file; use sqlite:///mlflow.db")
@@ -76,48 +82,38 @@ def sqlite_path(uri: str) -> Path | None:
     return None if match is None or match[1] == ":memory:" else Path(os.path.abspath(match[1]))
 
 
-def _check_http(uri: str) -> str:
-    """The address of a server, without a slash at its end, after an MLflow server answered there."""
-    uri = uri.rstrip("/")
-    problem: list[str | None] = []
-    # In a thread, as nothing else bounds the time that looking up a name takes.
-    thread = threading.Thread(target=lambda: problem.append(_probe_http(uri)), daemon=True)
+def _probe(uri: str, port: int = 0) -> str:
+    """Why a server cannot be used, or "". A database server, with its usual `port`, only has to accept a connection."""
+    reason = [f"no answer within {PROBE_S:g} s"]
+
+    def probe() -> None:
+        try:
+            if port:
+                parts = urllib.parse.urlsplit(uri)
+                socket.create_connection((parts.hostname or "localhost", parts.port or port), PROBE_S).close()
+            reason[0] = "" if port else _probe_http(uri)
+        except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
+            reason[0] = one_line(error)
+
+    thread = threading.Thread(target=probe, daemon=True)  # nothing else bounds the time that looking up a name takes
     thread.start()
     thread.join(PROBE_S + 1.0)
-    reason = problem[0] if problem else f"no answer within {PROBE_S:g} s"
-    if reason:
-        raise TrackingError(f"no MLflow server at {shown(uri)}: {reason}; start one, or use {DEFAULT_URI}")
-    return uri
+    return reason[0]
 
 
-def _probe_http(uri: str) -> str | None:
-    """What speaks against an MLflow server at `uri`, or None. Sends no credentials, and so checks no certificate."""
+def _probe_http(uri: str) -> str:
+    """Why there is no MLflow server at `uri`, or "". Sends no credentials, and so checks no certificate."""
     unchecked = ssl.create_default_context()
     unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
-    for page in ("/health", "/api/2.0/mlflow/experiments/search?max_results=1"):  # a gateway may know but the second
-        url = re.sub(r"//[^/@]*@", "//", uri) + page
-        try:
-            with urllib.request.urlopen(url, timeout=PROBE_S, context=unchecked) as answer:
-                if answer.read(64).lstrip().startswith((b"OK", b"{")):
-                    return None
-        except urllib.error.HTTPError as error:
-            if error.code in (400, 401, 403, 405, 429):
-                return None if b"Invalid Host header" not in error.read(200) else "it refuses this host name"
-            if error.code >= 500:
-                return f"it answers with error {error.code}"
-        except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
-            return one_line(error)
-    return "something else answers there"
-
-
-def _check_server(uri: str, port: int) -> str:
-    """The address of a database server, after something answered there."""
     try:
-        parts = urllib.parse.urlsplit(uri)
-        socket.create_connection((parts.hostname or "localhost", parts.port or port), PROBE_S).close()
-    except (OSError, ValueError) as error:
-        raise TrackingError(f"no database server at {shown(uri)}: {one_line(error)}") from error
-    return uri
+        with urllib.request.urlopen(shown(uri) + _PAGE, timeout=PROBE_S, context=unchecked) as answer:
+            return "" if answer.read(64).lstrip().startswith(b"{") else "something else answers there"
+    except urllib.error.HTTPError as error:
+        if b"Invalid Host header" in error.read(200):
+            return "it refuses this host name"
+        if error.code >= 500:
+            return f"it answers with error {error.code}"
+        return "" if error.code in (400, 401, 403, 405, 429) else "something else answers there"
 
 
 def connect(path: Path, mode: str) -> sqlite3.Connection:
@@ -139,4 +135,7 @@ def one_line(error: BaseException) -> str:
         return reasons[-1].strip()
     if "timed out" in text.lower():
         return "no answer in time"
-    return shown(text.splitlines()[0])[:200]
+    lines = [
+        line for line in text.splitlines() if not line.startswith("(raised as a result of")
+    ]  # SQLAlchemy's preface
+    return shown(lines[0])[:200]

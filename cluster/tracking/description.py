@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 from cluster.runs.champion import Champion
 from cluster.runs.settings import RunSettings, to_dict
 from cluster.tracking.commit import git_commit
-from cluster.tracking.mlflow_run import MODEL, RUN_ID, Version
-from cluster.tracking.tracker import Model
+from cluster.tracking.mlflow_run import MODEL, RUN_ID, Model
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.scenarios import label
 
@@ -122,7 +121,7 @@ def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
 
 
 def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str, float]) -> Model:
-    """The champion as a torch model: what is written, and what its registered version says."""
+    """The champion as a torch model, and what its registered version says."""
 
     def build() -> tuple[torch.nn.Module, np.ndarray]:
         from evolution.networks.export import example, to_torch
@@ -130,19 +129,19 @@ def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str
         spec = PolicySpec.parse(champion.policy)
         return to_torch(spec, champion.genome, champion.sim), example(spec, champion.sim)
 
-    facts = {
-        "policy": champion.policy,
-        "scenario": label(settings.scenario),
-        "algorithm": settings.algorithm,
-        "traffic": str(champion.traffic),
-        "seed": str(settings.seed),
-    }
-    version = Version(
+    return Model(
         model_name(settings),
         champion.sha256,
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
         "observations and return a number for each of the eight actions, of which the greatest acts.",
         note=f"{headline(settings)} {held_out['success_rate']:.1%} of the held-out drives succeed.",
-        tags={**facts, **{k: f"{v:.6g}" for k, v in held_out_metrics(held_out).items()}},
+        facts={
+            "policy": champion.policy,
+            "scenario": label(settings.scenario),
+            "algorithm": settings.algorithm,
+            "traffic": str(champion.traffic),
+            "seed": str(settings.seed),
+        },
+        scores={name: f"{value:.6g}" for name, value in held_out_metrics(held_out).items()},
+        build=build,
     )
-    return Model(version, build, facts)

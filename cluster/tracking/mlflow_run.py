@@ -1,14 +1,14 @@
 """A run as MLflow has it: found or created, its rows, files, description and model. The one module that imports MLflow.
 
-Everything here blocks and may raise whatever MLflow raises; any call can be repeated. `tracker.Tracker` makes these
-calls in its own thread and never lets a run wait.
+Everything here blocks and may raise whatever MLflow raises; any call can be repeated (`tracker.Tracker` does).
 
-Models are written here and never read: GridSim drives `champion.npz` (`checkpoint.load`: arrays and a checksum, no
-pickle) and loads nothing from MLflow, whoever may write to the server. What is written is `torch.export`'s graph with
+Models are written here and never read, whoever may write to the server. What is written is `torch.export`'s graph with
 its weights, MLflow's format `pt2`, never a pickled module. But `mlflow.pytorch.load_model`, in a program of the user's
 own, runs whatever a model's maker has put into it, in either format, unless MLFLOW_ALLOW_PICKLE_DESERIALIZATION is
 `false`: then it refuses all but plain tensors. Models that were written here load with it.
 """
+
+from __future__ import annotations
 
 import contextlib
 import hashlib
@@ -18,17 +18,21 @@ import os
 import shutil
 import tempfile
 import time
+import uuid
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from cluster.tracking.address import TrackingError, connect, shown, sqlite_path
 from cluster.tracking.commit import git_commit
 
 if TYPE_CHECKING:
-    from mlflow.entities import Experiment, FileInfo, Metric, Run
+    import numpy as np
+    import torch
+    from mlflow.entities import Experiment, FileInfo, Run
     from mlflow.tracking import MlflowClient
 
 Status = Literal["FINISHED", "KILLED", "FAILED"]
@@ -49,6 +53,7 @@ _COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_
 """What the view's run table shows of each run, and how wide, in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
+MAX_BATCH = 1000  # metrics that MLflow takes in one request
 
 # Only where the user has not decided otherwise. MLflow's own retries would go on for minutes; ours replace them.
 _ENVIRONMENT = {
@@ -80,17 +85,22 @@ class Row:
     Attributes:
         step: which.
         metrics: values by name.
-        timestamp: ms since the epoch; fixed when the row is handed over, so that a repeated request is the same one.
+        wall_s: seconds after the run's start, pauses left out; None: `given` counts.
+        given: ms since the epoch; fixed, so that a repeated request is the same one.
     """
 
     step: int
     metrics: Mapping[str, float]
-    timestamp: int
+    wall_s: float | None = None
+    given: int = field(default_factory=lambda: time.time_ns() // 1_000_000)
 
 
 @dataclass(frozen=True)
 class Identity:
     """Which run is meant, and what a new one begins with.
+
+    What a resumed run says differently (a larger number of generations, another commit) is added as tag
+    `resumed/<name>`, as MLflow lets no parameter change.
 
     Attributes:
         uri: what `address.check_uri` returned.
@@ -98,41 +108,46 @@ class Identity:
         name: of the run.
         params, tags: its parameters and tags.
         note: its description, Markdown.
-        key: the run's own unique name, by which it is found again (KEY_TAG).
+        key: the run's own unique name, by which it is found again where it was killed before its `run_id` was saved.
         run_id: MLflow's id of it, where that is known.
         late: the run is over, and what MLflow has of it stays as it is: its status, its times, its files.
-        started: ms since the epoch at which a new one began.
+        started: seconds since the epoch at which a new one began; None: now.
     """
 
     uri: str
     experiment: str
     name: str
-    params: Mapping[str, str] = field(default_factory=dict)
-    tags: Mapping[str, str] = field(default_factory=dict)
+    params: Mapping[str, str]
+    tags: Mapping[str, str]
     note: str = ""
-    key: str = ""
+    key: str = field(default_factory=lambda: uuid.uuid4().hex)
     run_id: str | None = None
     late: bool = False
-    started: int = 0
+    started: float | None = None
 
 
 @dataclass(frozen=True)
-class Version:
-    """What a registered model's version says of itself.
+class Model:
+    """The champion as a torch model, and the registered version that it becomes.
 
     Attributes:
         name: of the registered model.
         champion_sha256: digest of the champion's genome; a run registers one champion once.
-        about: what all versions of the model have in common, Markdown.
-        note: what this one is, Markdown.
-        tags: more of it.
+        about: what all versions of the registered model have in common, Markdown.
+        note: what this version is, Markdown.
+        facts: what the saved model says of itself, and the version's tags.
+        scores: more tags of the version.
+        build: makes the module and an input for it, float32 [n, inputs] with n of 2 or more, so that any number may be
+            given to what is written; called in the tracker's thread, as torch takes seconds to import.
     """
 
     name: str
     champion_sha256: str
-    about: str = ""
-    note: str = ""
-    tags: Mapping[str, str] = field(default_factory=dict)
+    about: str
+    note: str
+    facts: Mapping[str, str]
+    scores: Mapping[str, str]
+    build: Callable[[], tuple[torch.nn.Module, np.ndarray]]
 
 
 class LoggedRun:
@@ -141,7 +156,6 @@ class LoggedRun:
     Attributes:
         run_id: MLflow's id.
         experiment_id: MLflow's id of its experiment.
-        logged: the steps that MLflow has of each metric.
     """
 
     def __init__(self, identity: Identity):
@@ -155,7 +169,7 @@ class LoggedRun:
             _create_database(path)
         self._client = MlflowClient(tracking_uri=identity.uri)
         self.experiment_id = _experiment_id(self._client, identity.experiment, path)
-        self.logged: dict[str, set[int]] = {}
+        self._logged: defaultdict[str, set[int]] = defaultdict(set)  # the steps that MLflow has of each metric
         self._listed: dict[str | None, dict[str, int]] = {}  # folder -> sizes of the artifacts in it
         run = self._find() or self._create()
         self.run_id: str = run.info.run_id
@@ -163,21 +177,22 @@ class LoggedRun:
         self._started: int = run.info.start_time
         self._over = identity.late and run.info.status == "FINISHED"
 
-    def _create(self) -> "Run":
+    def _create(self) -> Run:
         from mlflow.entities import Param
         from mlflow.tracking.context.git_context import GitRunContext
         from mlflow.tracking.context.registry import resolve_tags
 
         asked, commit = self._identity, git_commit()
+        started = int(1000.0 * (time.time() if asked.started is None else asked.started))
         natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]  # mlflow.user, mlflow.source.*
         if commit != "unknown":
             natural["mlflow.source.git.commit"] = commit
         tags = {**natural, **self._tags(), **_note_tags(asked.note)}
-        run = self._client.create_run(self.experiment_id, asked.started, tags, asked.name)
+        run = self._client.create_run(self.experiment_id, started, tags, asked.name)
         self._client.log_batch(run.info.run_id, params=[Param(*param) for param in asked.params.items()])
         return run
 
-    def _find(self) -> "Run | None":
+    def _find(self) -> Run | None:
         """The run, with what it lacked of parameters and tags; None if this store has none, or only in its bin."""
         from mlflow.entities import Param, RunTag
 
@@ -188,7 +203,7 @@ class LoggedRun:
         if not self._identity.late:
             self._client.update_run(run_id, status="RUNNING")
         for name in data.metrics:
-            self.logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
+            self._logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
         # MLflow lets no parameter change; what is different is told beside it.
         resumed: dict[str, str] = {}
         for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
@@ -198,7 +213,7 @@ class LoggedRun:
         self._client.log_batch(run_id, params=params, tags=[RunTag(*tag) for tag in tags.items()])
         return run
 
-    def _search(self) -> "Run | None":
+    def _search(self) -> Run | None:
         """The run by its id, or else by its key."""
         from mlflow.exceptions import MlflowException
 
@@ -219,23 +234,26 @@ class LoggedRun:
         return {"git_commit": git_commit(), **self._identity.tags, KEY_TAG: self._identity.key}
 
     def log(self, rows: Sequence[Row]) -> int:
-        """Log what MLflow does not have of some rows, in one request: all of it, or nothing. Returns: of how many."""
-        metrics = list(self._missing(rows))
-        if metrics:
-            self._client.log_batch(self.run_id, metrics=metrics)
-        for metric in metrics:
-            self.logged.setdefault(metric.key, set()).add(metric.step)
-        return len({metric.step for metric in metrics})
-
-    def _missing(self, rows: Sequence[Row]) -> "Iterator[Metric]":
+        """Log what MLflow does not have of some rows. Returns: of how many."""
         from mlflow.entities import Metric
 
-        seen: set[tuple[str, int]] = set()
-        for row in rows:
-            for name, value in row.metrics.items():
-                if row.step not in self.logged.get(name, ()) and (name, row.step) not in seen:
-                    seen.add((name, row.step))
-                    yield Metric(name, value, row.timestamp, row.step)
+        missing = {
+            (name, row.step): Metric(name, float(value), self._time_of(row), row.step)
+            for row in rows
+            for name, value in row.metrics.items()
+            if row.step not in self._logged[name]
+        }
+        metrics = list(missing.values())
+        for k in range(0, len(metrics), MAX_BATCH):
+            batch = metrics[k : k + MAX_BATCH]
+            self._client.log_batch(self.run_id, metrics=batch)
+            for metric in batch:
+                self._logged[metric.key].add(metric.step)
+        return len({step for _, step in missing})
+
+    def _time_of(self, row: Row) -> int:
+        """In ms since the epoch."""
+        return row.given if row.wall_s is None else self._started + round(1000.0 * row.wall_s)
 
     def describe(self, text: str) -> None:
         """Replace the run's description, unless somebody has written one of his own."""
@@ -264,41 +282,37 @@ class LoggedRun:
             self._listed[folder] = {Path(each.path).name: each.file_size or 0 for each in listed if not each.is_dir}
         return self._listed[folder]
 
-    def register(self, version: Version) -> bool:
+    def register(self, model: Model) -> bool:
         """Make the uploaded model the newest version of its name, and give the best of all versions its alias.
 
         Returns: whether it was made; False where this run's champion is one already.
         """
-        client = self._client
-        found = client.search_model_versions(f"name = '{version.name}' and run_id = '{self.run_id}'")
-        new = all(each.tags.get(CHAMPION_TAG) != version.champion_sha256 for each in found)
-        if new:
-            self._create_version(version)
-        best = max(
-            client.search_model_versions(f"name = '{version.name}'"),
-            key=lambda each: (float(each.tags.get("held_out/success_rate", -1.0)), -int(each.version)),
-        )
-        if str(client.get_registered_model(version.name).aliases.get(BEST)) != str(best.version):
-            client.set_registered_model_alias(version.name, BEST, str(best.version))
-        return new
-
-    def _create_version(self, version: Version) -> None:
         from mlflow.exceptions import MlflowException
 
         client = self._client
-        try:
-            client.create_registered_model(version.name, description=version.about)
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_ALREADY_EXISTS":
-                raise
-        client.create_model_version(
-            version.name,
-            f"{self._artifacts.rstrip('/')}/{MODEL}",
-            self.run_id,
-            tags={CHAMPION_TAG: version.champion_sha256, **version.tags},
-            description=version.note,
-            await_creation_for=0,
+        found = client.search_model_versions(f"name = '{model.name}' and run_id = '{self.run_id}'")
+        new = all(each.tags.get(CHAMPION_TAG) != model.champion_sha256 for each in found)
+        if new:
+            try:
+                client.create_registered_model(model.name, description=model.about)
+            except MlflowException as error:
+                if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                    raise
+            client.create_model_version(
+                model.name,
+                f"{self._artifacts.rstrip('/')}/{MODEL}",
+                self.run_id,
+                tags={CHAMPION_TAG: model.champion_sha256, **model.facts, **model.scores},
+                description=model.note,
+                await_creation_for=0,
+            )
+        best = max(
+            client.search_model_versions(f"name = '{model.name}'"),
+            key=lambda each: (float(each.tags.get("held_out/success_rate", -1.0)), -int(each.version)),
         )
+        if str(client.get_registered_model(model.name).aliases.get(BEST)) != str(best.version):
+            client.set_registered_model_alias(model.name, BEST, str(best.version))
+        return new
 
     def end(self, status: Status, wall_s: float | None = None) -> None:
         """End the run, now or so many seconds after its start. One that is over stays as it is.
@@ -316,20 +330,18 @@ def _note_tags(text: str) -> dict[str, str]:
     return {NOTE_TAG: text, OWN_NOTE_TAG: hashlib.sha256(text.encode()).hexdigest()} if text else {}
 
 
-# ------------------------------------------------------------------------------------------------ models
+def write_model(folder: Path, model: Model) -> None:
+    """Write a torch model as MLflow's: graph and weights (`pt2`), signature and input example.
 
-
-def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, Any]) -> None:
-    """Write a torch module as MLflow's model: graph and weights (`pt2`), signature and input example.
-
-    Args: the folder, which is replaced as a whole; a torch.nn.Module without gradients; an input of it, float32 [n,
-    inputs] with n of 2 or more, so that any number may be given to what is written; what else it shall say of itself.
+    A folder that has the same champion is left as it is, another one is replaced as a whole.
     """
-    quiet()
+    if saved_champion(folder) == model.champion_sha256:
+        return
     import mlflow.pytorch
     import torch
     from mlflow.models import infer_signature
 
+    module, example = model.build()
     for left_behind in folder.parent.glob(f".{folder.name}.*.tmp"):
         shutil.rmtree(left_behind, ignore_errors=True)
     built = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
@@ -344,7 +356,7 @@ def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, A
                 serialization_format="pt2",
                 # Given, as MLflow would start a process and load the model there to find out.
                 pip_requirements=[f"mlflow=={mlflow.__version__}", f"torch=={torch.__version__.partition('+')[0]}"],
-                metadata=dict(metadata),
+                metadata={**model.facts, CHAMPION_TAG: model.champion_sha256},
             )
         shutil.rmtree(folder, ignore_errors=True)
         built.rename(folder)
@@ -353,16 +365,13 @@ def save_model(folder: Path, module: Any, example: Any, metadata: Mapping[str, A
 
 
 def saved_champion(folder: Path) -> str:
-    """Digest of the champion that `save_model` wrote to a folder (CHAMPION_TAG of its metadata), or ""."""
+    """Digest of the champion that `write_model` wrote to a folder, or ""."""
     quiet()
-    from mlflow.models import Model
+    from mlflow.models import Model as Saved
 
     with contextlib.suppress(Exception):  # not there, or not whole: it is written again
-        return str((Model.load(str(folder)).metadata or {}).get(CHAMPION_TAG, ""))
+        return str((Saved.load(str(folder)).metadata or {}).get(CHAMPION_TAG, ""))
     return ""
-
-
-# ------------------------------------------------------------------------------------------------ the store
 
 
 def _create_database(path: Path) -> None:
@@ -395,7 +404,7 @@ def _create_database(path: Path) -> None:
         whole.unlink(missing_ok=True)
 
 
-def _experiment_id(client: "MlflowClient", name: str, database: Path | None) -> str:
+def _experiment_id(client: MlflowClient, name: str, database: Path | None) -> str:
     """The experiment of that name, created if need be with its artifacts beside the database."""
     from mlflow.exceptions import MlflowException
 
@@ -413,9 +422,6 @@ def _experiment_id(client: "MlflowClient", name: str, database: Path | None) -> 
         raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
     _add_view(client, experiment)
     return experiment.experiment_id
-
-
-# ------------------------------------------------------------------------------------------------ MLflow's UI
 
 
 def run_table(server: str, experiment_id: str) -> str:
@@ -439,7 +445,7 @@ def run_tables(uri: str, server: str) -> dict[str, str]:
     return {each.name: run_table(server, each.experiment_id) for each in found}
 
 
-def _add_view(client: "MlflowClient", experiment: "Experiment") -> None:
+def _add_view(client: MlflowClient, experiment: Experiment) -> None:
     """Give an experiment the saved view, unless it has one, which may have been changed in the UI."""
     from mlflow.exceptions import MlflowException
 

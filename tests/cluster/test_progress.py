@@ -28,7 +28,7 @@ def learning(way=(12.3, 30.0, "M car-steps")):
 def begun(learner, width, terminal=True):
     console = Console(width=width, force_terminal=terminal, color_system=None, file=io.StringIO())
     session: Any = SimpleNamespace(learning=learner, run=SimpleNamespace(settings=learner.settings))
-    return Progress(console, session, "runs/x"), console
+    return Progress(console, "gridsim-evolve", "runs/x", "gridsim-evolve --resume runs/x").learning(session), console
 
 
 def drawn(bar, width):

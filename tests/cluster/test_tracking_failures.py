@@ -12,29 +12,24 @@ import threading
 import time
 
 import pytest
+from commands import wait_until
 from tracked import client, free_port, mlflow_server, row, steps, tracker
 
 from cluster.tracking.address import TrackingError, check_uri
 
-# ---------------------------------------------------------------------------------------------- what goes wrong
-
 
 def test_an_experiment_that_was_deleted(uri):
     client(uri).delete_experiment(client(uri).get_experiment_by_name("other").experiment_id)
-    refused = tracker(uri, experiment="other")
+    failed = tracker(uri, 1, experiment="other")
     with pytest.raises(TrackingError, match="'other' has been deleted"):
-        refused.wait_ready()
-    refused.log_row(0, row(0))
-    assert "1 row (step 0), the status FINISHED: experiment 'other' has been deleted" in refused.close("FINISHED")
+        failed.wait_ready()
+    assert "1 row (step 0), the status FINISHED: experiment 'other' has been deleted" in failed.close("FINISHED")
 
 
 def test_files_that_cannot_be_stored(uri, tmp_path, impatient):
-    logged = tracker(uri)
+    logged = tracker(uri, 1)
     (tmp_path / "store" / "mlartifacts").write_text("in the way")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "a.png").touch()
-    logged.log_row(0, row(0))
-    logged.log_artifacts(tmp_path / "run")
+    logged.log_files([tmp_path / "store" / "mlflow.db"])
     report = logged.close("FINISHED")
     assert re.fullmatch(rf"not logged to MLflow at {uri}: 1 file: (Not a directory|File exists).*", report)
     assert logged.close("FINISHED") == report
@@ -52,7 +47,7 @@ def test_a_database_that_is_locked_for_a_while(uri, impatient):
         with pytest.raises(TrackingError, match="database is locked"):
             check_uri(uri)
         database.execute("ROLLBACK")
-    assert logged.close("FINISHED", timeout_s=30) is None
+    assert logged.close("FINISHED") is None
     assert steps(uri, logged.run_id) == [0]
 
 
@@ -65,21 +60,18 @@ def test_a_disk_that_is_full_for_a_while(empty_database, tmp_path, impatient):
         shutil.copy(empty_database, disk / "mlflow.db")
         (tmp_path / "film.mp4").write_bytes(os.urandom(100_000))
         logged = tracker(check_uri(f"sqlite:///{disk}/mlflow.db"))
-        logged.log_row(0, row(0))
-        while logged.missing([0]):
-            time.sleep(0.05)
+        logged.wait_ready()
         with contextlib.suppress(OSError), open(disk / "filler", "wb", buffering=0) as filler:
             while filler.write(bytes(4096)):
                 pass
-        for step in range(1, 6):
+        for step in range(6):
             logged.log_row(step, row(step))
         logged.log_files([tmp_path / "film.mp4"])
-        while logged.error is None:
-            time.sleep(0.05)
+        wait_until(lambda: logged.error)
         assert re.search("full|disk I/O error|No space left", logged.error)
         time.sleep(0.5)  # and again, and again
         (disk / "filler").unlink()
-        assert logged.close("FINISHED", timeout_s=60) is None
+        assert logged.close("FINISHED") is None
         assert steps(logged.uri, logged.run_id) == list(range(6))
         stored = disk / "mlartifacts" / logged.run_id / "artifacts/film.mp4"
         assert stored.read_bytes() == (tmp_path / "film.mp4").read_bytes()
@@ -87,60 +79,43 @@ def test_a_disk_that_is_full_for_a_while(empty_database, tmp_path, impatient):
         subprocess.run(["umount", "--lazy", str(disk)], check=True)
 
 
-class Silent:
-    """A server that takes connections and never says a word."""
-
-    def __init__(self):
-        self.socket = socket.create_server(("127.0.0.1", 0))
-        self.uri = f"http://127.0.0.1:{self.socket.getsockname()[1]}"
-
-
 @pytest.fixture
 def silent():
-    server = Silent()
-    yield server
-    server.socket.close()
+    """The address of a server that takes connections and never says a word."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"http://127.0.0.1:{server.getsockname()[1]}"
 
 
 def test_a_server_that_says_nothing_is_waited_for_no_longer_than_allowed(silent, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "2")
-    stuck = tracker(silent.uri)
-    for step in range(3, 6):
-        stuck.log_row(step, row(step))
+    stuck = tracker(silent, 3)
     with pytest.raises(TrackingError, match=r"not ready after 0\.5 s"):
         stuck.wait_ready(timeout_s=0.5)
     started = time.perf_counter()
     report = stuck.close("KILLED", timeout_s=1.0)
     assert time.perf_counter() - started < 1.5
-    start = f"not logged to MLflow at {silent.uri}: 3 rows (step 3 to 5), the status KILLED: no answer "
+    start = f"not logged to MLflow at {silent}: 3 rows (step 0 to 2), the status KILLED: no answer "
     assert report in (start + "within 1 s", start + "in time")
-    stuck._thread.join(20)
-    assert not stuck._thread.is_alive()
-    assert stuck.error == "no answer in time"
+    wait_until(lambda: stuck.error == "no answer in time")
 
 
 @pytest.mark.e2e
 def test_a_server_that_goes_away_and_comes_back(tmp_path, empty_database, capfd):
     shutil.copy(empty_database, tmp_path / "served.db")
     port = free_port()
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "summary.json").write_text("{}")
+    (tmp_path / "summary.json").write_text("{}")
     with mlflow_server(tmp_path, port) as kill:
         uri = check_uri(f"http://127.0.0.1:{port}/")
         assert uri == f"http://127.0.0.1:{port}"
-        logged = tracker(uri)
-        for step in range(5):
-            logged.log_row(step, row(step))
+        logged = tracker(uri, 5)
         run_id = logged.wait_ready(60)
-        while logged.missing(range(5)):
-            time.sleep(0.1)
+        wait_until(lambda: logged.sent["row"] == 5)
         kill()
         time.sleep(2.0)  # the pause between two batches
         for step in range(5, 9):
             logged.log_row(step, row(step))
-        logged.log_artifacts(tmp_path / "run")
-        while logged.error is None:
-            time.sleep(0.1)
+        logged.log_files([tmp_path / "summary.json"])
+        wait_until(lambda: logged.error)
         started = time.perf_counter()
         report = logged.close("FINISHED")
         assert time.perf_counter() - started < 5.0
@@ -148,20 +123,15 @@ def test_a_server_that_goes_away_and_comes_back(tmp_path, empty_database, capfd)
             f"not logged to MLflow at {uri}: 4 rows (step 5 to 8), 1 file, the status FINISHED: Connection refused"
         )
     with mlflow_server(tmp_path, port):
-        resumed = tracker(uri, run_id=run_id)
-        for step in range(9):
-            resumed.log_row(step, row(step))
-        resumed.log_artifacts(tmp_path / "run")
-        assert resumed.close("FINISHED", timeout_s=30) is None
+        resumed = tracker(uri, 9, run_id=run_id)
+        resumed.log_files([tmp_path / "summary.json"])
+        assert resumed.close("FINISHED") is None
         assert resumed.run_id == run_id
         assert steps(uri, run_id) == list(range(9))
         assert client(uri).get_run(run_id).info.status == "FINISHED"
         assert [each.path for each in client(uri).list_artifacts(run_id)] == ["summary.json"]
         assert not os.path.exists(tmp_path / "mlartifacts")
     assert capfd.readouterr() == ("", "")
-
-
-# ---------------------------------------------------------------------------------------------- addresses
 
 
 def refused(uri):
@@ -254,28 +224,21 @@ def web_server():
     server.server_close()
 
 
-SEARCH = "/api/2.0/mlflow/experiments/search"
-
-
 def test_what_else_may_answer(web_server, silent, impatient):
     uri, pages = web_server
-    assert "something else answers" in refused(uri)
-    pages["/health"] = (200, b"<html>a page of somebody's own</html>")
-    assert "something else answers" in refused(uri)
-    pages["/health"] = (502, b"bad gateway")
-    assert "error 502" in refused(uri)
-    pages["/health"] = (403, b"Invalid Host header - possible DNS rebinding attack detected")
-    assert "refuses this host name" in refused(uri)
-    assert "no answer in time" in refused(silent.uri)
-    for answers in (
-        {"/health": (200, b"OK")},
-        {"/health": (401, b"You are not authenticated")},
-        {SEARCH: (200, b'{"experiments": []}')},
-        {"/health": (200, b"<html></html>"), SEARCH: (403, b"")},
+    page = "/api/2.0/mlflow/experiments/search"
+    for answer, reason in (
+        ((404, b"<html>not here</html>"), "something else answers"),
+        ((200, b"<html>a page of somebody's own</html>"), "something else answers"),
+        ((502, b"bad gateway"), "error 502"),
+        ((403, b"Invalid Host header - possible DNS rebinding attack detected"), "refuses this host name"),
     ):
-        pages.clear()
-        pages.update(answers)
+        pages[page] = answer
+        assert reason in refused(uri)
+    assert "no answer in time" in refused(silent)
+    for answer in ((200, b'{"experiments": []}'), (401, b"You are not authenticated"), (403, b"")):
+        pages[page] = answer
         assert check_uri(uri + "/") == uri
     pages.clear()
-    pages["/prefix/health"] = (200, b"OK")
+    pages[f"/prefix{page}"] = (200, b"{}")
     assert check_uri(f"{uri}/prefix/") == f"{uri}/prefix"

@@ -1,6 +1,7 @@
 """The champion as a torch model: written without pickle, read back by MLflow, registered once."""
 
 import contextlib
+import dataclasses
 import io
 import os
 import sqlite3
@@ -9,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tracked import client, drive_both, row, steps, tracker
+from tracked import client, drive_both, steps, tracker
 
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.settings import EvolveSettings
 from cluster.tracking.description import torch_model
-from cluster.tracking.mlflow_run import save_model, saved_champion
-from evolution.networks.export import example, to_torch
+from cluster.tracking.mlflow_run import saved_champion, write_model
+from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
@@ -27,13 +28,11 @@ HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mp
 NAME = "gridsim-curved-evolution"
 
 
-def written(folder, policy):
-    """A model in `folder`, and the module that it was made from."""
-    spec = PolicySpec.parse(policy)
-    genome = (0.3 * np.random.default_rng(1).standard_normal(spec.size)).astype(np.float32)
-    module = to_torch(spec, genome, SimConfig())
-    save_model(folder, module, example(spec, SimConfig()), {"champion_sha256": "abc"})
-    return module
+def champion_model(seed=1, success_rate=0.5, policy="mlp:6,7"):
+    genome = 0.3 * np.random.default_rng(seed).standard_normal(PolicySpec.parse(policy).size).astype(np.float32)
+    settings = EvolveSettings("curved", seed=seed)
+    held_out = HELD_OUT | {"success_rate": success_rate}
+    return torch_model(Champion(genome, policy, "curved", SimConfig()), settings, held_out)
 
 
 @pytest.mark.e2e
@@ -44,9 +43,11 @@ def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
 
     monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
     folder, inputs = tmp_path / "model", PolicySpec.parse(policy).inputs
-    module = written(folder, policy)
+    model = champion_model(policy=policy)
+    module, _ = model.build()
+    write_model(folder, model)
     assert os.listdir(tmp_path) == ["model"]
-    assert saved_champion(folder) == "abc"
+    assert saved_champion(folder) == model.champion_sha256
     assert saved_champion(tmp_path) == ""
 
     loaded = mlflow.pytorch.load_model(str(folder))
@@ -64,8 +65,8 @@ def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
     assert not [name for name in files if "pickle" in name or name.endswith((".pth", ".pkl"))]
     assert "cloudpickle" not in (folder / "requirements.txt").read_text()
 
-    second = written(folder, policy)  # in place of the first
-    assert torch.equal(second(x), module(x))
+    write_model(folder, champion_model(2, policy=policy))  # in place of the first
+    assert saved_champion(folder) == champion_model(2, policy=policy).champion_sha256
     assert os.listdir(tmp_path) == ["model"]
 
 
@@ -101,11 +102,11 @@ def test_a_hostile_model_is_refused_where_users_load_models(tmp_path, monkeypatc
     from mlflow.exceptions import MlflowException
 
     monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
-    written(tmp_path / "model", "mlp:6,7")
+    write_model(tmp_path / "model", champion_model())
     poisoned(tmp_path / "model/data/model.pt2", Evil(str(tmp_path / "touched")))
     with pytest.raises(MlflowException, match="disallowed"):
         mlflow.pytorch.load_model(str(tmp_path / "model"))
-    assert saved_champion(tmp_path / "model") == "abc"  # what GridSim looks at
+    assert saved_champion(tmp_path / "model") == champion_model().champion_sha256  # what GridSim looks at
     assert not (tmp_path / "touched").exists()
     monkeypatch.delenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION")
     with contextlib.suppress(Exception):
@@ -113,21 +114,10 @@ def test_a_hostile_model_is_refused_where_users_load_models(tmp_path, monkeypatc
     assert (tmp_path / "touched").exists()  # so that the test knows it if the poison has lost its power
 
 
-# ---------------------------------------------------------------------------------------------- registered
-
-
-def champion_model(seed, success_rate=0.5):
-    genome = np.random.default_rng(seed).standard_normal(PolicySpec.parse("mlp:6,7").size).astype(np.float32)
-    settings = EvolveSettings("curved", seed=seed)
-    held_out = HELD_OUT | {"success_rate": success_rate}
-    return torch_model(Champion(genome, "mlp:6,7", "curved", SimConfig()), settings, held_out)
-
-
-def logged(uri, folder, seed):
+def logged(uri, folder, model, key="the-key"):
     """A run that logs a row and a champion; returns its id and what its tracker said in the end."""
-    begun = tracker(uri)
-    begun.log_row(0, row(0))
-    begun.log_model(folder, champion_model(seed))
+    begun = tracker(uri, 1, key=key)
+    begun.log_model(folder, model)
     said = begun.close("FINISHED", timeout_s=120)
     return begun.run_id, said
 
@@ -136,23 +126,23 @@ def logged(uri, folder, seed):
 def test_a_champion_is_registered_once(uri, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
-    run_id, said = logged(uri, folder, seed=1)
+    run_id, said = logged(uri, folder, champion_model(1))
     assert said is None
     (version,) = client(uri).search_model_versions(f"name = '{NAME}'")
     assert version.run_id == run_id
     assert version.source == (tmp_path / "store/mlartifacts" / run_id / "artifacts/model").as_uri()
     assert version.tags.items() >= {"seed": "1", "policy": "mlp:6,7", "held_out/success_rate": "0.5"}.items()
-    assert version.tags["champion_sha256"] == champion_model(1).version.champion_sha256
+    assert version.tags["champion_sha256"] == champion_model(1).champion_sha256
     assert "seed 1" in version.description
     stored = {each.path for each in client(uri).list_artifacts(run_id, "model")}
     assert {"model/MLmodel", "model/data"} <= stored
     assert client(uri).list_artifacts(run_id, "model/data")[0].path == "model/data/model.pt2"
 
     before = (folder / "model/data/model.pt2").stat().st_mtime_ns
-    assert logged(uri, folder, seed=1) == (run_id, None)  # a killed run goes on, and ends again
+    assert logged(uri, folder, champion_model(1)) == (run_id, None)  # a killed run goes on, and ends again
     assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns == before
-    assert logged(uri, folder, seed=2) == (run_id, None)  # it was extended, and has another champion
+    assert logged(uri, folder, champion_model(2)) == (run_id, None)  # it was extended, and has another champion
     assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {1, 2}
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns != before
 
@@ -161,9 +151,7 @@ def test_a_champion_is_registered_once(uri, tmp_path):
 def test_the_best_version_has_an_alias(uri, tmp_path):
     best = []
     for seed, success_rate in enumerate((0.5, 0.75, 0.75, 0.25)):
-        begun = tracker(uri, key=f"key-{seed}")
-        begun.log_model(tmp_path, champion_model(seed, success_rate))
-        assert begun.close("FINISHED", timeout_s=120) is None
+        assert logged(uri, tmp_path, champion_model(seed, success_rate), key=f"key-{seed}")[1] is None
         best.append(int(client(uri).get_model_version_by_alias(NAME, "best").version))
     assert best == [1, 2, 2, 2]
 
@@ -172,22 +160,14 @@ def test_without_torch_everything_else_is_logged(uri, tmp_path):
     def build():
         raise ModuleNotFoundError("No module named 'torch'")
 
-    begun = tracker(uri)
-    begun.log_row(0, row(0))
-    begun.log_model(tmp_path, torch_model_with(build))
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/a.png").write_bytes(b"png")
-    begun.log_artifacts(tmp_path / "run")
-    assert begun.close("FINISHED", 60) == f"not logged to MLflow at {uri}: the model: No module named 'torch'"
+    begun = tracker(uri, 1)
+    begun.log_model(tmp_path, dataclasses.replace(champion_model(), build=build))
+    (tmp_path / "a.png").write_bytes(b"png")
+    begun.log_files([tmp_path / "a.png"])
+    assert begun.close("FINISHED") == f"not logged to MLflow at {uri}: the model: No module named 'torch'"
     assert steps(uri, begun.run_id) == [0]
     assert client(uri).get_run(begun.run_id).info.status == "FINISHED"
     assert [each.path for each in client(uri).list_artifacts(begun.run_id)] == ["a.png"]
-
-
-def torch_model_with(build):
-    from dataclasses import replace
-
-    return replace(champion_model(1), build=build)
 
 
 @pytest.mark.e2e
@@ -196,7 +176,7 @@ def test_without_a_registry_everything_else_is_logged(uri, tmp_path, impatient):
         database.execute("ALTER TABLE model_versions RENAME COLUMN run_id TO gone")
         database.commit()
     (tmp_path / "run").mkdir()
-    run_id, said = logged(uri, tmp_path / "run", seed=1)
+    run_id, said = logged(uri, tmp_path / "run", champion_model())
     assert said.startswith(f"not logged to MLflow at {uri}: the model: ")
     assert "\n" not in said
     assert steps(uri, run_id) == [0]
@@ -212,16 +192,12 @@ def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):
     assert client(uri).search_model_versions() == []
 
 
-# ---------------------------------------------------------------------------------------------- driving
-
-
 @pytest.mark.e2e
 def test_the_model_drives_2_km_as_the_champion_does(root, tmp_path):
     import mlflow.pytorch
 
     champion = load_champion(root / "benchmarks/champion.npz")
-    spec = PolicySpec.parse(champion.policy)
-    save_model(tmp_path / "model", to_torch(spec, champion.genome, champion.sim), example(spec, champion.sim), {})
+    write_model(tmp_path / "model", torch_model(champion, EvolveSettings("curved"), HELD_OUT))
     network = mlflow.pytorch.load_model(str(tmp_path / "model"))
     count, end, distance = drive_both(champion, network)
     assert end == "success"

@@ -5,8 +5,9 @@ from dataclasses import fields
 
 import pytest
 
-from cluster.runs.run import NOT_LOGGED, new_run
+from cluster.runs.run import new_run
 from cluster.runs.settings import DqnSettings, EvolveSettings
+from cluster.runs.train import NOT_LOGGED
 from cluster.tracking.description import describe, group, held_out_metrics, model_name, params, tags, title
 from cluster.training.dqn import COLUMNS as DQN_COLUMNS
 from cluster.training.evolution import COLUMNS

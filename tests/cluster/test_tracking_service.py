@@ -17,7 +17,8 @@ import pytest
 from commands import finish, rows, start, summary, wait_until
 from tracked import client, drive_registered, free_port, mlflow_server
 
-from cluster.runs.run import log_missing, open_run
+from cluster.runs.run import open_run
+from cluster.runs.train import send_missing
 
 pytestmark = pytest.mark.e2e
 
@@ -130,7 +131,7 @@ def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     assert run.info.end_time - run.info.start_time == pytest.approx(1000.0 * summary(folder)["wall_s"], abs=2.0)
 
     dump = [query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")]
-    assert log_missing(open_run(folder), "", "gridsim") == ("", None)
+    assert send_missing(open_run(folder), "", "gridsim") == ("", None)
     assert dump == [
         query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")
     ]
@@ -157,7 +158,7 @@ def test_an_edited_run_is_finished_all_the_same_and_nothing_of_it_is_sent(served
     path = tmp_path / "edited/summary.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     before = query(served.database, "SELECT * FROM metrics")
-    sent, lost = log_missing(open_run(tmp_path / "edited"), "", "gridsim")
+    sent, lost = send_missing(open_run(tmp_path / "edited"), "", "gridsim")
     assert sent == ""
     assert lost is not None
     assert lost.startswith("what MLflow lacks is not sent: ")

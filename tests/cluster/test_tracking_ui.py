@@ -22,11 +22,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 def logged(uri, name, success_rate):
     """A run with three rows and a champion; returns what its command says of MLflow in the end."""
-    begun = tracker(uri, experiment="gridsim", run_name=name, key=name)
+    begun = tracker(uri, experiment="gridsim", name=name, key=name)
     for step in range(3):
         begun.log_row(step, row(step) | {"validation/success_rate": 0.25 * step})
-    begun.log_summary({"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5})
-    begun.wall_s = 83.0
+    begun.log_row(2, {"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5}, 83.0)
     assert begun.close("FINISHED") is None
     return begun.where()
 

@@ -1,7 +1,6 @@
 """The generation loop among traffic: its episodes, the champion, resuming, lost members, the user's fitness."""
 
 import dataclasses
-import time
 from typing import ClassVar
 
 import numpy as np
@@ -9,8 +8,9 @@ import pytest
 from commands import rows
 
 from cluster.runs.checkpoint import load, save
-from cluster.runs.run import RunError, RunFolder, Session, make_tracker, open_run
+from cluster.runs.run import RunError, RunFolder, open_run
 from cluster.runs.settings import EvolveSettings
+from cluster.runs.train import Session
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Champion, Maps
 from cluster.workers.pool import PoolError, SerialPool
@@ -300,8 +300,7 @@ class InterruptedOnce(Session):
 def go_on_in(path, maps, session=Session):
     """A stopped run, to be continued from its folder, with a short validation."""
     run = open_run(path)
-    tracker = make_tracker(run, f"sqlite:///{path}/m.db", "test")
-    resumed = session(run, SerialPool(maps.build), maps, tracker, time.perf_counter())
+    resumed = session(run, SerialPool(maps.build), maps, f"sqlite:///{path}/m.db", "test")
     curriculum = resumed.learning.curriculum
     curriculum.config = dataclasses.replace(curriculum.config, validation=8)
     return resumed

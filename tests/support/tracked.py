@@ -11,6 +11,7 @@ from pathlib import Path
 
 from cluster.tracking import mlflow_run
 from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.mlflow_run import Identity
 from cluster.tracking.tracker import Tracker
 from gridsim.car.ego import End
 
@@ -45,18 +46,26 @@ def runs(uri):
     return [run for each in client(uri).search_experiments() for run in client(uri).search_runs([each.experiment_id])]
 
 
-def tracker(uri, **options):
-    given = {"experiment": "driving", "run_name": "a run", "params": PARAMS, "tags": TAGS, "key": "the-key", **options}
-    return Tracker(uri, **given)
+def tracker(uri, count=0, **options):
+    """A tracker that was given so many rows."""
+    given = {"experiment": "driving", "name": "a run", "params": PARAMS, "tags": TAGS, "key": "the-key", **options}
+    made = Tracker(Identity(uri, **given))
+    for step in range(count):
+        made.log_row(step, row(step))
+    return made
+
+
+def begin(uri, count, **options):
+    """A run of `count` rows that was stopped; returns its id."""
+    begun = tracker(uri, count, **options)
+    assert begun.close("KILLED", 60) is None
+    return begun.run_id
 
 
 def with_path(**more):
     """An environment in which scripts find the packages, whatever the working directory."""
-    root = str(Path(mlflow_run.__file__).resolve().parents[2])
-    return {**os.environ, "PYTHONPATH": root, **more}
-
-
-# ---------------------------------------------------------------------------------------------- a server
+    folders = [Path(mlflow_run.__file__).resolve().parents[2], Path(__file__).parent]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders)), **more}
 
 
 def free_port():
@@ -83,9 +92,6 @@ def mlflow_server(folder, port):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(server.pid, signal.SIGKILL)
         server.wait(10)
-
-
-# ---------------------------------------------------------------------------------------------- driving
 
 
 def drive_both(champion, network, traffic=0):
@@ -122,7 +128,6 @@ def drive_registered(uri, model, champion, traffic):
     """`drive_both` in a fresh process, which takes no pickle: a registered model and a champion.npz."""
     command = [sys.executable, "-c", FRESH, uri, model, str(champion), str(traffic)]
     safe = with_path(MLFLOW_ALLOW_PICKLE_DESERIALIZATION="false")
-    safe["PYTHONPATH"] += os.pathsep + str(Path(__file__).parent)
     done = subprocess.run(command, env=safe, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     count, end, distance = done.stdout.split()

@@ -1,0 +1,417 @@
+"""A training run, new or resumed, from its start to its end, for commands and comparisons alike.
+
+A step is a generation or an evaluation. The order of saving after each: the checkpoint (which holds the history),
+history.csv made from it, the MLflow row. It is saved while the workers are busy with the next one. Whatever kills the
+process, the folder holds a whole step, the last or the one before, and a resumed run gives the same champion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import signal
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cluster.runs import checkpoint
+from cluster.runs.champion import Champion, load_champion
+from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CheckpointError
+from cluster.runs.run import ELITES, HISTORY, SUMMARY, VIDEO, RunError, RunFolder, lock, write_summary
+from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.tracking import description
+from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.mlflow_run import Identity, Status
+from cluster.tracking.tracker import Tracker, count
+from cluster.training.evolution import Evolution
+from cluster.training.trainer import Learning, Maps, held_out_episodes, now
+from cluster.workers import kernels
+from cluster.workers.pool import SerialPool, WorkerPool
+from evolution.episodes.curriculum import HELD_OUT_SEEDS
+from evolution.episodes.rollout import trajectory as drive_trajectory
+from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
+from gridsim.maps.files import short_lap
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import is_map_file, label
+
+NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
+
+
+class Reporter:
+    """Shows how a run goes; this one shows warnings alone."""
+
+    def warn(self, text: str) -> None:
+        """One line."""
+        warnings.warn(text, stacklevel=2)
+
+    def compiling(self) -> AbstractContextManager[object]:
+        """While the simulator is being compiled."""
+        return nullcontext()
+
+    def learning(self, session: Session) -> AbstractContextManager[object]:
+        """From the first step until the champion is measured."""
+        return nullcontext()
+
+    def row(self, steps: int, row: dict[str, float]) -> None:
+        """So many steps are done; the last one's row."""
+
+    def members(self, stage: str, done: int, total: int) -> None:
+        """Part of a step is done."""
+
+    def note(self, text: str) -> None:
+        """What happens after the last step."""
+
+    def stopping(self) -> None:
+        """A run that was interrupted is being closed."""
+
+    def unsent(self, text: str, finished: bool) -> None:
+        """One line about what MLflow lacks, of a run that is finished or of one that is to be resumed."""
+        self.warn(text)
+
+
+@dataclass
+class Workers:
+    """The worker pool of a run, or of several one after another, opened for the first one.
+
+    Attributes:
+        number: of workers; 0 evaluates in this process.
+        address: of a Ray cluster, or None.
+        patience_s: seconds without any worker after which a run stops.
+    """
+
+    number: int
+    address: str | None
+    patience_s: float
+    _pool: WorkerPool | None = None
+    _maps: Maps | None = None
+
+    def open(self, maps: Maps) -> WorkerPool:
+        """The pool, which gets its maps from these."""
+        self._maps = maps
+        if self._pool is None and self.number:
+            from cluster.workers.ray_pool import RayPool
+
+            self._pool = RayPool(self.number, self._build, self.address, patience_s=self.patience_s)
+        return self._pool or SerialPool(self._build)
+
+    def close(self) -> None:
+        """Stop the workers; the next run has new ones."""
+        if self._pool:
+            self._pool.close()
+            self._pool = None
+
+    def _build(self, scenario: str, seed: int) -> Map:
+        assert self._maps is not None
+        return self._maps.build(scenario, seed)
+
+
+def train(
+    run: RunFolder, workers: Workers, uri: str, experiment: str, reporter: Reporter, started: float | None = None,
+    *, initial: np.ndarray | None = None, parent_id: str = "", film: bool = True, wall_limit_s: float = math.inf,
+) -> Session:  # fmt: skip
+    """Train a run to its end, finish it, and send it to MLflow.
+
+    Args: `started` is time.perf_counter() of the process's start; None: time counts from the first step on. For the
+    others see `Session`. The workers stay open.
+    Raises: GridSimError with one line, and whatever stops or breaks a run; the last whole step is saved.
+    """
+    settings = run.settings
+    status: Status = "KILLED"
+    session: Session | None = None
+    maps = Maps(settings.scenario, SimConfig())
+    warming = kernels.begin(settings)
+    try:
+        session = Session(
+            run, workers.open(maps), maps, uri, experiment, reporter, now() if started is None else started, initial,
+            parent_id, film, wall_limit_s,
+        )  # fmt: skip
+        if warming.processes:
+            with reporter.compiling():
+                warming.wait()
+        maps.ahead(session.learning.curriculum.map_seeds[:3])
+        kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
+        lock(run.path)
+        run.write_config()
+        if started is None:
+            session.started = now()
+        with reporter.learning(session):
+            session.learn()
+            session.finish(workers.number)
+        status = "FINISHED"
+        return session
+    except Exception:
+        status = "FAILED"
+        raise
+    finally:
+        with undisturbed():
+            if status == "KILLED":
+                reporter.stopping()
+            warming.stop()
+            maps.close()
+            if session and (lost := session.tracker.close(status)):
+                reporter.unsent(lost, status == "FINISHED")
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """No signal may cut short the saving and closing."""
+    before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+def new_learning(
+    settings: RunSettings, pool: WorkerPool, maps: Maps, initial: np.ndarray | None = None
+) -> Learning:  # fmt: skip
+    """The learner that such settings ask for."""
+    if isinstance(settings, EvolveSettings):
+        return Evolution(settings, pool, maps, initial)
+    assert isinstance(settings, DqnSettings)
+    from cluster.training.dqn import Dqn  # and PyTorch, which evolution does not need
+
+    return Dqn(settings, pool, maps, initial)
+
+
+@dataclass
+class Session:
+    """One process's share of a run, from start or resume to its end.
+
+    Attributes:
+        run: the folder.
+        pool: evaluates.
+        maps: builds maps.
+        uri, experiment: of MLflow.
+        reporter: shows how it goes.
+        started: time.perf_counter() from which the run's time counts.
+        initial: a genome to start from, float32 [genes].
+        parent_id: MLflow's run that this one belongs to, or "".
+        film: whether the champion is filmed.
+        wall_limit_s: seconds of learning, with those before a resumption, after which no step but the first is begun.
+        summary: what summary.json holds, once it is finished.
+    """
+
+    run: RunFolder
+    pool: WorkerPool
+    maps: Maps
+    uri: str
+    experiment: str
+    reporter: Reporter = field(default_factory=Reporter)
+    started: float = field(default_factory=now)
+    initial: np.ndarray | None = None
+    parent_id: str = ""
+    film: bool = True
+    wall_limit_s: float = math.inf
+    summary: dict[str, Any] = field(default_factory=dict)
+    learning: Learning = field(init=False)
+    tracker: Tracker = field(init=False)
+    _unsaved: bool = False  # whether the last step is in memory alone
+
+    def __post_init__(self) -> None:
+        self.learning = learning = new_learning(self.run.settings, self.pool, self.maps, self.initial)
+        learning.warn, learning.on_progress = self.reporter.warn, self.reporter.members
+        learning.meanwhile, learning.out_of_time = self._save_last, self._out_of_time
+        self._digest = self.run.digest()
+        if self.run.saved is not None:
+            try:
+                learning.restore(*self.run.saved)
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                path = self.run.path / CHECKPOINT
+                raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
+        self.tracker = make_tracker(
+            self.run, self.uri, self.experiment, self.parent_id, started=time.time() - self._wall_s()
+        )
+
+    def learn(self) -> None:
+        """Learn to the end, saving after every step."""
+        learning, scenario = self.learning, self.run.settings.scenario
+        if is_map_file(scenario) and (problem := short_lap(scenario, learning.sim)):
+            learning.warn(problem)
+        log_rows(self.tracker, learning.history)
+        if learning.history:
+            self._write_history()  # it may lack the last row: it is written after the checkpoint
+        try:
+            while not learning.done() and not (learning.steps and self._out_of_time()):
+                row = learning.step()
+                self.maps.ahead(HELD_OUT_SEEDS, later=True)  # `finish` needs them
+                learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
+                self._unsaved = True
+                self.reporter.row(learning.steps, row)
+            self._save_last()
+        except CheckpointError:
+            raise
+        except BaseException:
+            self._save_last()  # the state is whole until the next step changes it
+            raise
+
+    def _wall_s(self) -> float:
+        """Seconds that the run has taken, in this process and before."""
+        return self.learning.wall_before_s + now() - self.started
+
+    def _out_of_time(self) -> bool:
+        return self._wall_s() >= self.wall_limit_s
+
+    def _save_last(self) -> None:
+        """Save and log the last step, if that was not done."""
+        if self._unsaved:
+            self.save()
+            self._unsaved = False
+            log_rows(self.tracker, self.learning.history[-1:], self.learning.steps - 1)
+
+    def save(self) -> None:
+        """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
+        arrays, meta = self.learning.state()
+        meta |= {
+            "digest": self._digest,
+            "init_sha256": self.run.init_sha256,
+            "tracking": {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key},
+        }
+        checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
+        self._write_history()
+
+    def _write_history(self) -> None:
+        checkpoint.write_atomic(self.run.path / HISTORY, self.learning.history_csv(), durable=False)
+
+    def finish(self, workers: int) -> None:
+        """Measure the champion on held-out drives, write what is left to the folder, and hand it to the tracker."""
+        from cluster.report import pictures
+
+        self.reporter.note(f"measuring {'and filming ' if self.film else ''}the champion on held-out drives")
+        learning, path, settings = self.learning, self.run.path, self.run.settings
+        learning.conclude()
+        assert learning.champion is not None
+        champion = Champion(
+            learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic
+        )
+        champion.save(path / CHAMPION)
+        checkpoint.save(path / ELITES, {"genomes": np.array(learning.elites)}, {"policy": settings.policy})
+        episodes = held_out_episodes(self.maps, settings.traffic)
+        seed = episodes.maps[int(episodes.rows[0]["map"])]
+        scenario, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
+        with self._filmed(seed, start, world, f"{champion.scenario}, held-out map {scenario.seed:,}"):
+            figures = learning.held_out()
+            self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # while it is drawn
+            pictures.curves(learning.history, path / "curves.png", learning.step_name)
+            result, states, _ = drive_trajectory(
+                learning.spec, champion.genome, scenario, start, learning.curriculum.goal_limits(), learning.sim, world
+            )
+            title = f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m"
+            pictures.trajectory(scenario, states, path / "trajectory.png", title)
+        wall = self._wall_s()
+        best = learning.history[learning.champion.step]
+        self.summary = {
+            "name": self.run.name,
+            "mlflow_run_id": self.tracker.run_id or "",
+            "scenario": settings.scenario,
+            "seed": settings.seed,
+            "workers": workers,
+            **learning.summary(),
+            "car_steps": learning.car_steps,
+            "wall_s": round(wall, 3),
+            "car_steps_per_s": round(learning.car_steps / wall, 1),
+            "champion_sha256": champion.sha256,
+            f"champion_{learning.step_name}": learning.champion.step,
+            "validation_success_rate": learning.champion.success_rate,
+            "solved": learning.solved,
+            "lost_chunks": learning.lost_chunks,
+            "training_s": learning.history[-1]["wall_s"],
+            **{f"best_{name}": best[name] for name in ("car_steps", "wall_s")},
+            "held_out": figures,
+        }
+        write_summary(path, self.summary)
+        self._drop_replay()
+        self.reporter.note("logging to MLflow")
+        log_end(self.tracker, self.run, learning.steps - 1, self.summary, description.describe(self.run, self.summary))
+
+    def _drop_replay(self) -> None:
+        """Take a DQN's replay, most of its checkpoint, out of what is kept of a run that has ended."""
+        path = self.run.path / CHECKPOINT
+        with contextlib.suppress(CheckpointError):  # then it stays
+            arrays, meta = checkpoint.load(path)
+            if meta.pop("replay", None):
+                kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
+                checkpoint.save(path, kept, meta)
+
+    @contextlib.contextmanager
+    def _filmed(self, seed: int, start: np.ndarray, world: np.ndarray, title: str) -> Iterator[None]:
+        """Film the champion's drive meanwhile. Without a film there is a warning, and the run goes on."""
+        if not self.film:
+            yield
+            return
+        from cluster.report.film import Filming, VideoError
+
+        path = self.run.path
+        film = Filming(path / CHAMPION, seed, start, world, path / VIDEO, title)
+        try:
+            yield
+            film.wait(self.learning.on_progress)
+        except VideoError as error:
+            (path / VIDEO).unlink(missing_ok=True)
+            self.reporter.warn(f"no {VIDEO}: {error}")
+        finally:
+            film.stop()
+
+
+def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:
+    """The run's tracker; `parent_id` is MLflow's run that it belongs to. `more` is its `Identity`'s."""
+    known = run.saved[1]["tracking"] if run.saved else {}
+    tags = description.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
+    return Tracker(Identity(
+        uri, experiment, description.title(run.name, run.settings), description.params(run.settings), tags,
+        note=description.describe(run), key=run.tracking_key,
+        run_id=known.get("run_id") if known.get("uri") == uri else None, **more,
+    ))  # fmt: skip
+
+
+def log_rows(tracker: Tracker, rows: list[dict[str, float]], first: int = 0) -> None:
+    """Log rows of a history, of step `first` and those after it."""
+    for step, row in enumerate(rows, first):
+        tracker.log_row(step, {name: row[name] for name in row if name not in NOT_LOGGED}, row["wall_s"])
+
+
+def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any], note: str) -> None:
+    """Log what a finished run has beside rows and model; its summary gets the id of MLflow's run."""
+    tracker.log_row(step, description.held_out_metrics(summary["held_out"]), summary["wall_s"])
+    if not summary.get("mlflow_run_id"):
+        with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
+            summary["mlflow_run_id"] = tracker.wait_ready(30.0)
+            write_summary(run.path, summary)
+    tracker.describe(note)
+    tracker.log_files(sorted(path for path in run.path.glob("[!.]*") if path.is_file()))
+
+
+def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
+    """Send to MLflow what it lacks of a finished run, with the times of then; what MLflow has is not touched.
+
+    Args: the run, opened; the tracking address, or "" for the one that the run has; the experiment.
+    Returns: what was sent, in a few words, and one line about what could not be, or None.
+    """
+    assert run.saved is not None
+    arrays, meta = run.saved
+    path = run.path / SUMMARY
+    try:
+        summary, ended = json.loads(path.read_bytes()), path.stat().st_mtime
+        history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
+        model = description.torch_model(load_champion(run.path), run.settings, summary["held_out"])
+        note, started = description.describe(run, summary), ended - summary["wall_s"]
+        uri = check_uri(uri or meta["tracking"]["uri"] or None)
+    except GridSimError as error:
+        return "", f"what MLflow lacks is not sent: {error}"
+    except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited
+        reason = f"{run.path} has not the files of a finished run ({type(error).__name__})"
+        return "", f"what MLflow lacks is not sent: {reason}"
+    tracker = make_tracker(run, uri, experiment, late=True, started=started)
+    log_rows(tracker, history)
+    tracker.log_model(run.path, model)
+    log_end(tracker, run, len(history) - 1, summary, note)
+    lost = tracker.close("FINISHED")
+    return ", ".join(count(number, noun) for noun, number in tracker.sent.items() if number), lost
