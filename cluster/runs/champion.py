@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import math
 import os
 from dataclasses import dataclass
@@ -20,7 +19,8 @@ import numpy as np
 
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
-from cluster.runs.settings import MAX_TRAFFIC, SETTINGS, EvolveSettings
+from cluster.runs.run import read_config
+from cluster.runs.settings import MAX_TRAFFIC, EvolveSettings
 from cluster.training.trainer import Maps, summarise
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
 from evolution.episodes.rollout import Limits
@@ -29,6 +29,7 @@ from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
 from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED, check_name, default_traffic
 
 
@@ -155,13 +156,11 @@ def _check_finished(run: Path) -> None:
     if not (run / CONFIG).is_file():
         raise CheckpointError(f"{run} is no run's folder: it has neither {CHAMPION} nor {CONFIG}")
     try:
-        command = json.loads((run / CONFIG).read_text(encoding="utf-8"))["command"]
-        SETTINGS[command]
-    except (OSError, ValueError, KeyError, TypeError):
+        command = read_config(run / CONFIG)[0].command
+    except GridSimError:
         command = EvolveSettings.command
-    resumable = (run / CHECKPOINT).is_file()
     again = f"continue it with: {command} --resume {run}"
-    if not resumable:
+    if not (run / CHECKPOINT).is_file():
         again = f"start it anew with: {command} --config {run / CONFIG}"
     raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
 
@@ -181,22 +180,14 @@ def evaluate(
     held-out figures of summary.json.
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
-    name = scenario or champion.scenario
+    name, episode = scenario or champion.scenario, champion.sim.episode
+    limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
     maps = Maps(name, champion.sim)
     try:
         chosen = held_out(champion, maps, name, episodes, seed, traffic)
-        episode = champion.sim.episode
-        limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
-        scenarios = [maps.get(s) for s in chosen.maps]
-        results = roll_out(
-            PolicySpec.parse(champion.policy),
-            champion.genome[None],
-            scenarios,
-            chosen.rows,
-            limits,
-            champion.sim,
-            worlds=chosen.worlds,
-        )[0]
+        spec, roads = PolicySpec.parse(champion.policy), [maps.get(s) for s in chosen.maps]
+        genomes = champion.genome[None]
+        results = roll_out(spec, genomes, roads, chosen.rows, limits, champion.sim, worlds=chosen.worlds)[0]
         return summarise(results[0], episode.control_period)
     finally:
         maps.close()

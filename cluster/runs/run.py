@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, CONFIG, CheckpointError
+from cluster.runs.checkpoint import CHECKPOINT, CONFIG
 from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict, to_dict
 from cluster.tracking import description
 from gridsim.config import SimConfig
@@ -48,7 +48,7 @@ class RunFolder:
         init_sha256: digest of that genome, or "".
         map_sha256: digest of the map's file, or "".
         saved: arrays and meta of its checkpoint, where it is resumed.
-        tracking_key: by which MLflow's run is found again, even if a process was killed before it knew the run's id.
+        tracking_key: by which MLflow's run is found again.
     """
 
     path: Path
@@ -138,7 +138,7 @@ def lock(path: Path) -> None:
 
 
 def open_run(folder: Path) -> RunFolder:
-    """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError."""
+    """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError, CheckpointError."""
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
     lock(folder.resolve())
@@ -146,24 +146,16 @@ def open_run(folder: Path) -> RunFolder:
     run = RunFolder(folder.resolve(), settings, init, map_sha256=_map_sha256(settings))
     if not (folder / CHECKPOINT).is_file():
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from; start it anew with --config {folder / CONFIG}")
-    try:
-        run.saved = checkpoint.load(folder / CHECKPOINT)
-    except CheckpointError as error:
-        raise RunError(str(error)) from error
+    run.saved = checkpoint.load(folder / CHECKPOINT)
     meta = run.saved[1]
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():
         raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
-    tracking = meta["tracking"] if isinstance(meta.get("tracking"), dict) else {}
-    fits = (
-        all(type(meta.get(name)) is int for name in settings.counts)
-        and type(meta.get("solved")) is bool
-        and all(isinstance(tracking.get(name), str) for name in ("uri", "key"))
-        and isinstance(tracking.get("run_id"), str | None)
-    )
-    if not fits:
-        raise RunError(f"{folder / CHECKPOINT}: its parts are not those of a run")
-    run.tracking_key = tracking["key"]
+    try:
+        settings.ended(meta)
+        run.tracking_key = str(meta["tracking"]["key"])
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
+        raise RunError(f"{folder / CHECKPOINT}: its parts are not those of a run") from error
     return run
 
 

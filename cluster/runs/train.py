@@ -273,7 +273,7 @@ class Session:
         meta |= {
             "digest": self._digest,
             "init_sha256": self.run.init_sha256,
-            "tracking": {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key},
+            "tracking": {"uri": self.tracker.uri, "key": self.run.tracking_key},
         }
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
         self._write_history()
@@ -363,12 +363,10 @@ class Session:
 
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:
     """The run's tracker; `parent_id` is MLflow's run that it belongs to. `more` is its `Identity`'s."""
-    known = run.saved[1]["tracking"] if run.saved else {}
     tags = description.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(Identity(
         uri, experiment, description.title(run.name, run.settings), description.params(run.settings), tags,
-        note=description.describe(run), key=run.tracking_key,
-        run_id=known.get("run_id") if known.get("uri") == uri else None, **more,
+        note=description.describe(run), key=run.tracking_key, **more,
     ))  # fmt: skip
 
 

@@ -117,7 +117,7 @@ def _probe_http(uri: str) -> str:
 
 
 def connect(path: Path, mode: str) -> sqlite3.Connection:
-    """A SQLite database opened as its URI's `mode` says: ro, rw or rwc."""
+    """A SQLite database opened as its URI's `mode` says: ro or rw."""
     address = f"file:{urllib.parse.quote(str(path))}?mode={mode}"
     return sqlite3.connect(address, timeout=PROBE_S, isolation_level=None, uri=True)
 
@@ -135,7 +135,6 @@ def one_line(error: BaseException) -> str:
         return reasons[-1].strip()
     if "timed out" in text.lower():
         return "no answer in time"
-    lines = [
-        line for line in text.splitlines() if not line.startswith("(raised as a result of")
-    ]  # SQLAlchemy's preface
-    return shown(lines[0])[:200]
+    lines = text.splitlines()
+    # SQLAlchemy may put a hint of its own before what went wrong.
+    return shown(lines[1] if text.startswith("(raised as") and len(lines) > 1 else lines[0])[:200]

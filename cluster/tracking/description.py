@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from cluster.runs.champion import Champion
 from cluster.runs.settings import RunSettings, to_dict
 from cluster.tracking.commit import git_commit
 from cluster.tracking.mlflow_run import MODEL, RUN_ID, Model
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
 
+    from cluster.runs.champion import Champion
     from cluster.runs.run import RunFolder
 
 
@@ -99,23 +99,17 @@ def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
     held_out, inputs = summary["held_out"], PolicySpec.parse(settings.policy).inputs
     found = "Solved" if summary["solved"] else "The best so far"
     step = next(name for name in ("generations", "evaluations") if name in summary)
-    return "\n".join([
+    return "\n\n".join([
         headline(settings),
-        "",
         f"{found} after {summary[step]:,} {step}, {summary['car_steps'] / 1e6:,.1f} million car-steps and "
         f"{summary['wall_s']:,.0f} s. On {held_out['episodes']} held-out drives the champion succeeds in "
         f"**{held_out['success_rate']:.1%}**, drives {held_out['distance_m']:,.0f} m at {held_out['speed_mps']:.2f} "
         f"m/s, and collides in {held_out['collision_rate']:.1%}.",
-        "",
         "Watch it: `champion.mp4` among the artifacts, or",
-        "",
         f"    gridsim-watch {folder}",
-        "",
         f"Load it, a torch model of the environment's observations, float32 [n, {inputs}], which is registered as "
         f"`{model_name(settings)}`:",
-        "",
         f'    mlflow.pytorch.load_model("runs:/{RUN_ID}/{MODEL}")',
-        "",
         f"Repeat the run: `{settings.command} --config config.json`.",
     ])  # fmt: skip
 

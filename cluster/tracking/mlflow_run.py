@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Status = Literal["FINISHED", "KILLED", "FAILED"]
 
 KEY_TAG = "gridsim.key"
-"""The tag that a run is found again by, if it was killed before anybody knew its id."""
+"""The tag that a run is found again by."""
 NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
 """MLflow's tag of the description, and ours that says which was written here; the UI lists neither."""
 CHAMPION_TAG = "champion_sha256"
@@ -108,8 +108,7 @@ class Identity:
         name: of the run.
         params, tags: its parameters and tags.
         note: its description, Markdown.
-        key: the run's own unique name, by which it is found again where it was killed before its `run_id` was saved.
-        run_id: MLflow's id of it, where that is known.
+        key: the run's own unique name, made before MLflow is imported, by which the run is found again (KEY_TAG).
         late: the run is over, and what MLflow has of it stays as it is: its status, its times, its files.
         started: seconds since the epoch at which a new one began; None: now.
     """
@@ -121,7 +120,6 @@ class Identity:
     tags: Mapping[str, str]
     note: str = ""
     key: str = field(default_factory=lambda: uuid.uuid4().hex)
-    run_id: str | None = None
     late: bool = False
     started: float | None = None
 
@@ -151,7 +149,7 @@ class Model:
 
 
 class LoggedRun:
-    """A run in MLflow, opened: found by its id or key, or created.
+    """A run in MLflow, opened: found by its key, or created.
 
     Attributes:
         run_id: MLflow's id.
@@ -176,9 +174,15 @@ class LoggedRun:
         self._artifacts: str = run.info.artifact_uri
         self._started: int = run.info.start_time
         self._over = identity.late and run.info.status == "FINISHED"
+        self._complete(run)
+
+    def _find(self) -> Run | None:
+        """The run of this key in any experiment; None if this store has none, or only in its bin."""
+        experiments = [each.experiment_id for each in self._client.search_experiments()]
+        found = self._client.search_runs(experiments, f"tags.`{KEY_TAG}` = '{self._identity.key}'", max_results=1)
+        return found[0] if found else None
 
     def _create(self) -> Run:
-        from mlflow.entities import Param
         from mlflow.tracking.context.git_context import GitRunContext
         from mlflow.tracking.context.registry import resolve_tags
 
@@ -188,17 +192,12 @@ class LoggedRun:
         if commit != "unknown":
             natural["mlflow.source.git.commit"] = commit
         tags = {**natural, **self._tags(), **_note_tags(asked.note)}
-        run = self._client.create_run(self.experiment_id, started, tags, asked.name)
-        self._client.log_batch(run.info.run_id, params=[Param(*param) for param in asked.params.items()])
-        return run
+        return self._client.create_run(self.experiment_id, started, tags, asked.name)
 
-    def _find(self) -> Run | None:
-        """The run, with what it lacked of parameters and tags; None if this store has none, or only in its bin."""
+    def _complete(self, run: Run) -> None:
+        """Add what the run lacks of parameters and tags, and ask which steps it has."""
         from mlflow.entities import Param, RunTag
 
-        run = self._search()
-        if run is None:
-            return None
         run_id, data = run.info.run_id, run.data
         if not self._identity.late:
             self._client.update_run(run_id, status="RUNNING")
@@ -211,24 +210,6 @@ class LoggedRun:
         params = [Param(*param) for param in self._identity.params.items() if param[0] not in data.params]
         tags = {name: value for name, value in self._tags().items() if name not in data.tags} | resumed
         self._client.log_batch(run_id, params=params, tags=[RunTag(*tag) for tag in tags.items()])
-        return run
-
-    def _search(self) -> Run | None:
-        """The run by its id, or else by its key."""
-        from mlflow.exceptions import MlflowException
-
-        if self._identity.run_id:
-            try:
-                run = self._client.get_run(self._identity.run_id)
-            except MlflowException as error:
-                if error.error_code not in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
-                    raise
-            else:
-                if run.info.lifecycle_stage == "active":
-                    return run
-        wanted = f"tags.`{KEY_TAG}` = '{self._identity.key}'"
-        found = self._client.search_runs([self.experiment_id], wanted, max_results=1)
-        return self._client.get_run(found[0].info.run_id) if found else None
 
     def _tags(self) -> dict[str, str]:
         return {"git_commit": git_commit(), **self._identity.tags, KEY_TAG: self._identity.key}
@@ -387,12 +368,8 @@ def _create_database(path: Path) -> None:
         with tempfile.TemporaryDirectory() as folder:
             built = Path(folder, "mlflow.db")
             MlflowClient(tracking_uri=f"sqlite:///{built}").search_experiments(max_results=1)
-            whole.unlink(missing_ok=True)
-            with (
-                contextlib.closing(connect(built, "ro")) as source,
-                contextlib.closing(connect(whole, "rwc")) as copy,
-            ):
-                source.backup(copy)
+            with contextlib.closing(connect(built, "ro")) as database:
+                whole.write_bytes(database.serialize())
         try:
             os.link(whole, path)
         except FileExistsError:

@@ -156,7 +156,6 @@ class DqnLearner:
             torch.zeros(spec.size, device=self.device) for _ in range(4)
         )
         self._steps = torch.zeros((), device=self.device)
-        self._adam_state: tuple[list[torch.Tensor], ...] = ([self._mean], [self._variance], [], [self._steps])
         self._key = int(np.random.SeedSequence([seed, _SAMPLES]).generate_state(1, np.uint64)[0])
         self.load_weights(new_weights(spec, seed))
 
@@ -215,7 +214,10 @@ class DqnLearner:
         norm = torch.linalg.vector_norm(self._gradient)
         self._gradient.mul_((self.config.gradient_clip / norm).clamp_(max=1.0))
         learning_rate, epsilon = self.config.learning_rate_at(self.updates), self.config.adam_epsilon
-        _adam([self.online.genome], [self._gradient], *self._adam_state, lr=learning_rate, eps=epsilon)
+        _adam(
+            [self.online.genome], [self._gradient], [self._mean], [self._variance], [], [self._steps],
+            lr=learning_rate, eps=epsilon,
+        )  # fmt: skip
         self.updates += 1
         self._average.lerp_(self.online.genome, 1.0 / min(self.updates, self.config.average))
         if self.updates % self.config.target_period == 0:

@@ -31,9 +31,8 @@ def test_errors_are_measured_once(tmp_path):
     assert len(measured) == 5
 
 
-@pytest.mark.parametrize("learner", ["evolution", "dqn"])
-def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path, learner):
-    make_run(tmp_path / "r", learner)
+def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path):
+    make_run(tmp_path / "r")
     made = read_run(tmp_path / "r")
     metres = evaluate(load_champion(tmp_path / "r/champion.npz"), "curved", traffic=0)["distance_m"]
     weak = dataclasses.replace(made, figures={**made.figures, "distance_m": metres})
@@ -44,19 +43,12 @@ def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path,
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
-def test_every_learner_is_known_by_its_config(tmp_path, learner):
-    make_run(tmp_path / "a", learner)
-    assert read_run(tmp_path / "a").learner == learner
-
-
-def test_run_is_read(tmp_path):
-    make_run(tmp_path / "a", "dqn", "seamless", 3)
+def test_run_is_read(tmp_path, learner):
+    make_run(tmp_path / "a", learner, "seamless", 3)
     found = read_run(tmp_path / "a")
-    assert (found.learner, found.scenario, found.seed) == ("dqn", "seamless", 3)
-    figures = found.figures
-    assert (figures["wall_s"], figures["training_s"]) == (12.5, 6.0)
-    assert (figures["best_wall_s"], figures["best_car_steps"]) == (4.0, 3000.0)
-    assert (figures["distance_m"], figures["success_rate"]) == (900.0, 0.5)
+    assert (found.learner, found.scenario, found.seed) == (learner, "seamless", 3)
+    wanted = {"wall_s": 12.5, "training_s": 6.0, "best_wall_s": 4.0, "best_car_steps": 3000.0, "distance_m": 900.0}
+    assert found.figures.items() >= wanted.items()
 
 
 @pytest.mark.parametrize(
@@ -66,17 +58,11 @@ def test_run_is_read(tmp_path):
         ("config.json", None, "no run's folder"),
         ("champion.npz", None, "no such file"),
         ("summary.json", "", "damaged"),
-        ("summary.json", "{", "damaged"),
         ("summary.json", "[" * 100_000, "damaged"),
         ("summary.json", "[1]", "damaged"),
         ("summary.json", "{}", "do not belong together"),
         ("summary.json", '{"scenario": "curved", "seed": 0}', "not the champion"),
         ("config.json", '{"settings": []}', "not a config.json"),
-        (
-            "config.json",
-            '{"format": 2, "command": "gridsim-evolve", "settings": {"traffic": "x"}}',
-            "'traffic' must be",
-        ),
         ("champion.npz", "PK", "truncated|not a GridSim file"),
     ],
 )
@@ -99,7 +85,6 @@ def test_damaged_run_is_refused(tmp_path, file, text, said):
         {"held_out": {**HELD_OUT, "distance_m": None}},
         {"car_steps": True},
         {"wall_s": math.nan},
-        {"held_out": None},
         {"held_out": {}},
         {"training_s": -1.0},
         {"best_wall_s": "4"},

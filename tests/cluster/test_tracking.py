@@ -94,14 +94,13 @@ def test_a_run_without_a_row_is_never_created(tmp_path):
     assert not os.listdir(tmp_path)
 
 
-@pytest.mark.parametrize("by", ["run_id", "key"])
-def test_resume_logs_only_what_is_missing(uri, tmp_path, monkeypatch, by):
+def test_resume_logs_only_what_is_missing(uri, tmp_path, monkeypatch):
     begun = tracker(uri, 9)
     begun.log_row(9, {"car_steps": row(9)["car_steps"]})
     assert begun.close("KILLED") is None
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    resumed = tracker(uri, 15, **({"run_id": begun.run_id, "key": "other"} if by == "run_id" else {}))
+    resumed = tracker(uri, 15, experiment="other")
     resumed.wait_ready()
     assert client(uri).get_run(begun.run_id).info.status == "RUNNING"
     assert resumed.close("FINISHED") is None
@@ -116,7 +115,7 @@ def test_resume_logs_only_what_is_missing(uri, tmp_path, monkeypatch, by):
 def test_resume_notes_what_is_different(uri):
     run_id = begin(uri, 2)
     for generations in ("90", "120"):
-        begin(uri, 2, run_id=run_id, params={**PARAMS, "generations": generations, "new": "1"})
+        begin(uri, 2, params={**PARAMS, "generations": generations, "new": "1"})
     data = client(uri).get_run(run_id).data
     assert data.params == {**PARAMS, "new": "1"}
     assert {name: tag for name, tag in data.tags.items() if name.startswith("resumed/")} == {
@@ -131,7 +130,7 @@ def test_a_run_that_mlflow_does_not_know_gets_every_row(uri, tmp_path, gone):
         there = check_uri(f"sqlite:///{tmp_path}/mlflow.db")
     else:
         client(uri).delete_run(run_id)
-    again = begin(there, 6, run_id=run_id)
+    again = begin(there, 6)
     assert again != run_id
     assert steps(there, again) == list(range(6))
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tracked import client, drive_both, steps, tracker
+from tracked import client, steps, tracker
 
-from cluster.runs.champion import Champion, load_champion
+from cluster.runs.champion import Champion
 from cluster.runs.settings import EvolveSettings
 from cluster.tracking.description import torch_model
 from cluster.tracking.mlflow_run import saved_champion, write_model
@@ -190,16 +190,3 @@ def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):
     begun.log_model(tmp_path, champion_model(1))
     assert begun.close("KILLED", timeout_s=120) is None
     assert client(uri).search_model_versions() == []
-
-
-@pytest.mark.e2e
-def test_the_model_drives_2_km_as_the_champion_does(root, tmp_path):
-    import mlflow.pytorch
-
-    champion = load_champion(root / "benchmarks/champion.npz")
-    write_model(tmp_path / "model", torch_model(champion, EvolveSettings("curved"), HELD_OUT))
-    network = mlflow.pytorch.load_model(str(tmp_path / "model"))
-    count, end, distance = drive_both(champion, network)
-    assert end == "success"
-    assert distance >= 2000.0
-    assert count > 1500
