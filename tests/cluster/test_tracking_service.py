@@ -109,6 +109,7 @@ def test_a_run_outlives_an_outage_and_loses_nothing(served):
     _out, err = served.said["during"]
     assert (served.codes["during"], err) == (0, "")
     run = check_complete(served, "during")
+    assert len({summary(served.cwd / "runs" / name)["champion_sha256"] for name in ("during", "after")}) == 1
     assert run.info.run_name == "during: curved-evolution-s5 2 cars"
     assert run.data.tags["group"] == "curved evolution mlp:64+motion+steering 2 cars, until 2.0, population 48"
 
@@ -137,11 +138,6 @@ def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     ]
 
 
-def test_an_outage_changes_no_champion(served):
-    shas = {summary(served.cwd / "runs" / name)["champion_sha256"] for name in ("during", "after")}
-    assert len(shas) == 1
-
-
 def test_the_registered_champion_drives_as_the_file_does(served):
     """In a fresh process, from the registry alone."""
     count, end, distance = drive_registered(
@@ -152,7 +148,7 @@ def test_the_registered_champion_drives_as_the_file_does(served):
     assert distance > 0.0
 
 
-@pytest.mark.parametrize("change", [{"held_out": 3}, {"wall_s": None}, {"held_out": {"success_rate": "all"}}])
+@pytest.mark.parametrize("change", [{"held_out": 3}, {"wall_s": None}])
 def test_an_edited_run_is_finished_all_the_same_and_nothing_of_it_is_sent(served, tmp_path, change):
     shutil.copytree(served.cwd / "runs/during", tmp_path / "edited")
     path = tmp_path / "edited/summary.json"
