@@ -21,7 +21,6 @@ CLEARANCE_SHARE = 0.7  # weight of the shortest ray
 CRASH_REWARD = -1.0
 
 # Lanes. Own choices, unless a source is named.
-BEND_COMFORT = 2.0  # m/s2, lateral acceleration that `Lanes.limits` allows
 CROSSING_GAP = 2.9  # m between two lanes' centre lines below which cars on them, 2 m wide, may touch
 
 # Traffic, beside `TrafficConfig`. These are float32 because kernels read them as globals. Own choices, unless a source
@@ -37,9 +36,8 @@ NEIGHBOUR_WIDENING = _F(0.004)  # 1/m, and so much more per square metre of dist
 LOOK_AHEAD = _F(8.0)  # m that a car looks ahead at standstill, beyond the jam distance ...
 LOOK_AHEAD_TIME = _F(1.5)  # s, and the way it drives in that time, beside its comfortable braking distance
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
-STOP_LINE_GAP = _F(
-    0.25
-)  # m before a junction's line at which a car waits; if longer, its rear might be in a junction behind
+# m before a junction's line at which a car waits; if longer, its rear might be in a junction behind
+STOP_LINE_GAP = _F(0.25)
 EGO_DODGE_SLOPE = _F(0.12)  # m to the right for each m of way, on a path that dodges the oncoming ego car
 PATH_SAMPLE = _F(1.25)  # m between points of a path that are tested; below half a car's width plus CAUTION
 

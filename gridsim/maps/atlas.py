@@ -11,11 +11,6 @@ from gridsim.jit import njit
 from gridsim.maps.network import Network
 from gridsim.maps.roads import Road, freeze
 
-LANE_ARRAYS = (
-    "points", "speeds", "offsets", "steps", "successors", "left", "right", "crossing_offsets", "crossings", "clear",
-    "room", "boxes",
-)  # fmt: skip
-
 
 class Atlas(NamedTuple):
     """Concatenated maps; all arrays read-only and C-contiguous."""
@@ -35,27 +30,32 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     lanes = networks[0]
     if len(networks) > 1:
         most = max(network.successors.shape[1] for network in networks)
-        columns = {name: [getattr(network, name) for network in networks] for name in LANE_ARRAYS}
+        names = [name for name in Network._fields if name not in ("width", "height")]
+        columns = {name: [getattr(network, name) for network in networks] for name in names}
         columns["successors"] = [
             np.pad(array, ((0, 0), (0, most - array.shape[1])), constant_values=-1) for array in columns["successors"]
         ]
         together = {name: freeze(np.concatenate(arrays)) for name, arrays in columns.items()}
         lanes = Network(**together, width=lanes.width, height=lanes.height)
-    sizes = [(len(network.points), len(network.steps), len(network.crossings)) for network in networks]
     parts = [(road.field, road.start_row, road.start) for road in roads]
-    lengths = np.array([[len(array) for array in part] for part in parts], dtype=np.int64)
     arrays = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
     field, start_row, start = (freeze(array) for array in arrays)
     return Atlas(
         field=field,
         start_row=start_row,
         start=start,
-        bounds=freeze(np.concatenate([np.zeros((1, 3), dtype=np.int64), np.cumsum(lengths, axis=0)])),
+        bounds=_bounds(parts),
         sides=freeze(np.array([[r.columns, r.rows, r.thin] for r in roads], dtype=np.uint32)),
         sizes=freeze(np.array([[r.width, r.height, r.speed_low, r.speed_high] for r in roads], dtype=np.float32)),
         lanes=lanes,
-        lane_bounds=freeze(np.concatenate([[[0, 0, 0]], np.cumsum(np.array(sizes, dtype=np.int64), axis=0)])),
+        lane_bounds=_bounds([(network.points, network.steps, network.crossings) for network in networks]),
     )
+
+
+def _bounds(parts: Sequence[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """Where each map's arrays begin when they are concatenated: int64 [maps + 1, arrays]."""
+    lengths = [[len(array) for array in part] for part in parts]
+    return freeze(np.cumsum([[0] * len(parts[0]), *lengths], axis=0, dtype=np.int64))
 
 
 @njit

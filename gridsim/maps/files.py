@@ -28,6 +28,8 @@ import yaml
 from PIL import Image
 
 from gridsim.config import FILE_SPEEDS, START_SPEED, SimConfig, VehicleConfig
+from gridsim.errors import GridSimError
+from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
@@ -37,9 +39,7 @@ from gridsim.maps.roads import (
     FIELD_UNITS,
     HEADING_BINS,
     HEADING_WRAP,
-    MEMORY_LIMIT_CELLS,
     START_CELLS_PER_M,
-    Lanes,
     Strips,
     freeze,
     make_road,
@@ -57,6 +57,7 @@ KEYS = (
 MAX_YAML = 1 << 16  # bytes
 MAX_IMAGE = 1 << 27  # bytes
 MAX_PIXELS = 1 << 26
+MAX_NODES = 1 << 24  # of the field
 MAX_TABLE = 1 << 28  # bytes of the table of start ranges
 RESOLUTION = (0.01, 1.0)  # m a pixel, from, to
 SHORTEST_SIDE = 16  # m
@@ -90,10 +91,9 @@ class MapFile:
 def load_map(name: str, config: SimConfig | None = None) -> Map:
     """The map of a file; the same object as long as the file does not change.
 
-    Raises: ValueError with one line that names the problem.
+    Raises: GridSimError with one line that names the problem.
     """
-    path = Path(os.path.abspath(name))
-    return _load(str(path), *(_stamp(file) for file in _files(path)), config=config or SimConfig())
+    return _load(os.path.abspath(name), map_digest(name), config or SimConfig())
 
 
 def short_lap(name: str, config: SimConfig) -> str:
@@ -110,37 +110,34 @@ def short_lap(name: str, config: SimConfig) -> str:
 
 
 def map_digest(name: str) -> str:
-    """SHA-256 of a map's files. Raises: ValueError with one line if they cannot be read."""
+    """SHA-256 of a map's files. Raises: GridSimError with one line if they cannot be read."""
     path = Path(os.path.abspath(name))
-    limits = (MAX_YAML, MAX_IMAGE) if path.suffix.lower() in YAMLS else (MAX_IMAGE,)
-    digests = [hashlib.sha256(_bytes(f, limit)).digest() for f, limit in zip(_files(path), limits, strict=True)]
-    return hashlib.sha256(b"".join(digests)).hexdigest()
+    files = dict.fromkeys((path, read_map_file(path).image))  # a picture alone is a map, too
+    return hashlib.sha256(b"".join(hashlib.sha256(_bytes(file)).digest() for file in files)).hexdigest()
 
 
 def read_map_file(path: Path) -> MapFile:
     """Read and check a map's YAML; for a picture alone, use defaults. The picture itself is not opened.
 
-    Raises: ValueError with one line.
+    Raises: GridSimError with one line.
     """
     suffix = path.suffix.lower()
     if suffix in PICTURES:
         return MapFile(path)
     if suffix not in YAMLS:
-        raise ValueError(f"{path}: a map is a .yaml file of map_server's form or a picture ({', '.join(PICTURES)})")
-    text = _bytes(path, MAX_YAML)
+        raise GridSimError(f"{path}: a map is a .yaml file of map_server's form or a picture ({', '.join(PICTURES)})")
+    text = _bytes(path)
     try:
         values = yaml.safe_load(text)
     except Exception as error:  # PyYAML raises many types of error on invalid input
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
-        raise ValueError(f"{path}: not valid YAML{where}: {getattr(error, 'problem', None) or _shown(error)}") from None
+        problem = getattr(error, "problem", None) or _shown(error)
+        raise GridSimError(f"{path}: not valid YAML{where}: {problem}") from None
     try:
         return _checked(path, values)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-
-
-# ------------------------------------------------------------------------------------------------------- the file
+        raise GridSimError(f"{path}: {error}") from None
 
 
 def _shown(value: object) -> str:
@@ -152,34 +149,22 @@ def _shown(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _stamp(path: Path) -> tuple[str, int, int]:
-    """Path, time and size: they change with the file. Raises: ValueError if it is not a file."""
+def _bytes(path: Path) -> bytes:
+    """A file's bytes. Raises: GridSimError with one line if it is no file, too large or unreadable."""
+    limit = MAX_YAML if path.suffix.lower() in YAMLS else MAX_IMAGE
     try:
         status = path.stat()
+        regular = stat.S_ISREG(status.st_mode)
+        if regular and status.st_size <= limit:
+            with path.open("rb") as file:
+                return file.read(limit)
     except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from None
+        raise GridSimError(f"{path}: {error.strerror or error}") from None
     except ValueError:
-        raise ValueError(f"{_shown(str(path))} is not a valid path") from None
-    if not stat.S_ISREG(status.st_mode):
-        raise ValueError(f"{path}: not a file")
-    return str(path), status.st_mtime_ns, status.st_size
-
-
-def _bytes(path: Path, limit: int) -> bytes:
-    size = _stamp(path)[2]
-    if size > limit:
-        raise ValueError(f"{path}: it has {size:,} bytes; the limit is {limit:,}")
-    try:
-        with path.open("rb") as file:
-            return file.read(limit)
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from None
-
-
-def _files(path: Path) -> list[Path]:
-    """The files of a map: the YAML, if any, and the picture."""
-    image = read_map_file(path).image
-    return [image] if image == path else [path, image]
+        raise GridSimError(f"{_shown(str(path))} is not a valid path") from None
+    if not regular:
+        raise GridSimError(f"{path}: not a file")
+    raise GridSimError(f"{path}: it has {status.st_size:,} bytes; the limit is {limit:,}")
 
 
 def _number(value: Any, what: str, low: float, high: float) -> float:
@@ -217,10 +202,11 @@ def _checked(path: Path, values: Any) -> MapFile:
         raise ValueError(f"unknown key {_shown(unknown[0])}; there are: {', '.join(KEYS)}")
     if "image" not in values or ("resolution" in values) == ("scale" in values):
         raise ValueError("it needs an image, and either its resolution (m a pixel) or its scale (pixels a metre)")
+    finest, coarsest = RESOLUTION
     if "scale" in values:
-        resolution = 1.0 / _number(values["scale"], "scale (pixels a metre)", 1.0 / RESOLUTION[1], 1.0 / RESOLUTION[0])
+        resolution = 1.0 / _number(values["scale"], "scale (pixels a metre)", 1.0 / coarsest, 1.0 / finest)
     else:
-        resolution = _number(values["resolution"], "resolution (m a pixel)", *RESOLUTION)
+        resolution = _number(values["resolution"], "resolution (m a pixel)", finest, coarsest)
     mode = values.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
         raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
@@ -232,38 +218,32 @@ def _checked(path: Path, values: Any) -> MapFile:
     occupied = _number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
     if not 0.0 < free <= occupied:
         raise ValueError(f"free_thresh must be above 0 and not above occupied_thresh, not {free:g} with {occupied:g}")
-    low, high = (
-        _number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit)
-        for value in _list(values.get("speed", list(FILE_SPEEDS)), "speed", (2,))
-    )
+    speed = _list(values.get("speed", list(FILE_SPEEDS)), "speed", (2,))
+    low, high = (_number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit) for value in speed)
     if not low < high:
         raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
+    starts = values.get("starts", [])
+    if not isinstance(starts, list):
+        raise ValueError(f"starts must be a list of [x, y] or [x, y, heading], not {_shown(starts)}")
     return MapFile(
         image=_image_path(path, values["image"]),
         resolution=resolution,
         origin=(x, y),
         negate=_flag(values.get("negate", 0), "negate"),
         free_thresh=free,
-        starts=_given_starts(values.get("starts", [])),
+        starts=tuple(_start(value) for value in starts),
         torus=_flag(values.get("torus", False), "torus"),
         speed=(low, high),
     )
 
 
-def _given_starts(values: Any) -> tuple[tuple[float, float, float], ...]:
-    if not isinstance(values, list):
-        raise ValueError(f"starts must be a list of [x, y] or [x, y, heading], not {_shown(values)}")
-    starts = []
-    for value in values:
-        x, y, *heading = _list(value, "a start", (2, 3))
-        starts.append(
-            (
-                _number(x, "a start's x (m)", -1e8, 1e8),
-                _number(y, "a start's y (m)", -1e8, 1e8),
-                _number(heading[0], "a start's heading (rad)", -2 * math.pi, 2 * math.pi) if heading else math.nan,
-            )
-        )
-    return tuple(starts)
+def _start(value: Any) -> tuple[float, float, float]:
+    x, y, *heading = _list(value, "a start", (2, 3))
+    return (
+        _number(x, "a start's x (m)", -1e8, 1e8),
+        _number(y, "a start's y (m)", -1e8, 1e8),
+        _number(heading[0], "a start's heading (rad)", -2 * math.pi, 2 * math.pi) if heading else math.nan,
+    )
 
 
 def _image_path(path: Path, image: Any) -> Path:
@@ -280,46 +260,39 @@ def _image_path(path: Path, image: Any) -> Path:
     return folder / image
 
 
-# ---------------------------------------------------------------------------------------------------- the picture
-
-
 def read_free(file: MapFile) -> np.ndarray:
     """Which pixels are road: bool [rows, columns], the lowest row first.
 
-    Raises: ValueError with one line if the picture is unreadable, too large, all road or all wall.
+    Raises: GridSimError with one line if the picture is unreadable, too large, all road or all wall.
     """
-    data = _bytes(file.image, MAX_IMAGE)
+    data = _bytes(file.image)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is stricter
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
             picture = Image.open(io.BytesIO(data), formats=tuple(dict.fromkeys(PICTURES.values())))
-        width, height = picture.size
-    except Image.DecompressionBombError:
-        raise ValueError(f"{file.image}: more than {MAX_PIXELS:,} pixels; make the picture smaller") from None
+            if picture.width * picture.height > MAX_PIXELS:
+                raise Image.DecompressionBombError
+    except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+        raise GridSimError(f"{file.image}: more than {MAX_PIXELS:,} pixels; make the picture smaller") from None
     except Exception:
-        raise ValueError(f"{file.image}: not a readable picture ({', '.join(PICTURES)})") from None
-    if width * height > MAX_PIXELS:
-        raise ValueError(f"{file.image}: {width:,} x {height:,} pixels are more than {MAX_PIXELS:,}; make it smaller")
+        raise GridSimError(f"{file.image}: not a readable picture ({', '.join(PICTURES)})") from None
     try:
         free = _free(picture, file)
     except Exception as error:  # decoders raise many types of error
-        raise ValueError(f"{file.image}: truncated or damaged: {_shown(str(error))}") from None
+        raise GridSimError(f"{file.image}: truncated or damaged: {_shown(str(error))}") from None
     if not free.any():
-        raise ValueError(f"{file.image}: all wall; road is what is {'darker' if file.negate else 'brighter'}")
+        raise GridSimError(f"{file.image}: all wall; road is what is {'darker' if file.negate else 'brighter'}")
     if free.all():
-        raise ValueError(f"{file.image}: all road; wall is what is {'brighter' if file.negate else 'darker'}")
+        raise GridSimError(f"{file.image}: all road; wall is what is {'brighter' if file.negate else 'darker'}")
     return free[::-1]
 
 
 def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
     """Decode a picture: bool [rows, columns], True for road, which is opaque and below the threshold of darkness."""
-    if picture.mode == "F":
-        raise ValueError("its pixels are real numbers; save it with 8 or 16 bits")
+    opaque: np.ndarray | bool = True
     if picture.mode.startswith("I"):
         light, full = np.asarray(picture).astype(np.uint16), 65_535
-        opaque = None
     else:
-        opaque = None
         if picture.has_transparency_data:
             picture = picture.convert("RGBA")
             opaque = np.asarray(picture.getchannel("A")) >= 128
@@ -328,8 +301,7 @@ def _free(picture: Image.Image, file: MapFile) -> np.ndarray:
             picture = picture.convert("RGB").convert("L", (1 / 3, 1 / 3, 1 / 3, 0))
         light, full = np.asarray(picture), 255
     values = np.arange(full + 1) / full
-    free = ((values if file.negate else 1.0 - values) < file.free_thresh)[light]
-    return free if opaque is None else free & opaque
+    return ((values if file.negate else 1.0 - values) < file.free_thresh)[light] & opaque
 
 
 def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
@@ -352,17 +324,17 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
         sides.append(side)
     columns, rows = sides
     width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
-    if columns * rows > MEMORY_LIMIT_CELLS:
+    if columns * rows > MAX_NODES:
         raise ValueError(
             f"a world of {width:,.0f} m x {height:,.0f} m (its sides are powers of two) is too large: "
-            f"at most {MEMORY_LIMIT_CELLS / CELLS_PER_M**2:,.0f} square metres; check the resolution, or crop it"
+            f"at most {MAX_NODES / CELLS_PER_M**2:,.0f} square metres; check the resolution, or crop it"
         )
     return columns, rows
 
 
 @lru_cache(maxsize=4)
-def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Map:
-    """Build a map. `stamps` are part of the cache's key, so that a changed file is read again."""
+def _load(name: str, _digest: str, config: SimConfig) -> Map:
+    """Build a map. The digest is part of the cache's key, so that a changed file is read again."""
     path = Path(name)
     file = read_map_file(path)
     free = read_free(file)
@@ -377,17 +349,18 @@ def _load(name: str, *stamps: tuple[str, int, int], config: SimConfig) -> Map:
         else:
             poses = find_starts(nodes, config.vehicle)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise GridSimError(f"{path}: {error}") from None
     starts = np.zeros((len(poses), 5), dtype=np.float32)
     starts[:, :3], starts[:, 3] = poses, START_SPEED
-    lanes = Lanes.none()
+    width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
+    lanes = lay_lanes([], width, height)
     return Map(
         name=name,
         seed=0,
         road=make_road(nodes, file.speed, config.sensors.range),
         lanes=lanes,
-        strips=Strips(freeze(np.zeros((0, 5))), freeze(np.zeros((0, 6))), freeze(np.zeros((0, 5)))),
-        network=make_network(lanes, columns / CELLS_PER_M, rows / CELLS_PER_M, 0.0, config.traffic),
+        strips=Strips.of(),
+        network=make_network(lanes, width, height, 0.0, config.traffic),
         torus=file.torus,
         starts=freeze(starts),
     )

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import BEND_COMFORT, CROSSING_GAP, VehicleConfig
+from gridsim.config import CROSSING_GAP
 from gridsim.jit import njit
 from gridsim.maps.roads import Lanes, Strips
 
@@ -31,29 +31,27 @@ class Path(NamedTuple):
     pieces: tuple[tuple[float, float], ...]  # length (m, above 0) and curvature (1/m, left positive) of each
 
 
-def end_of(path: Path) -> tuple[float, float, float]:
-    """Pose (m, m, rad) where a path ends."""
-    pose = path[:3]
+def _poses(path: Path) -> list[tuple[float, float, float]]:
+    """Poses (m, m, rad) where each piece of a path begins, and where the last one ends."""
+    poses = [path[:3]]
     for length, curvature in path.pieces:
-        pose = _pose_after(*pose, length, curvature)
-    return pose
+        poses.append(_pose_after(*poses[-1], length, curvature))
+    return poses
 
 
 def beside(path: Path, offset: float) -> list[Path]:
     """The pieces of a path as separate paths, shifted `offset` m to the left."""
-    pose, result = path[:3], []
-    for length, curvature in path.pieces:
-        x, y, heading = pose
+    result = []
+    for (x, y, heading), (length, curvature) in zip(_poses(path), path.pieces, strict=False):
         scale = 1.0 - offset * curvature
         piece = (length * scale, curvature / scale)
         result.append(Path(x - offset * math.sin(heading), y + offset * math.cos(heading), heading, (piece,)))
-        pose = _pose_after(x, y, heading, length, curvature)
     return result
 
 
 def backwards(path: Path) -> Path:
     """The same curve in the opposite direction."""
-    x, y, heading = end_of(path)
+    x, y, heading = _poses(path)[-1]
     return Path(x, y, heading + math.pi, tuple((length, -curvature) for length, curvature in reversed(path.pieces)))
 
 
@@ -61,41 +59,24 @@ def sample(path: Path, step: float) -> tuple[np.ndarray, float]:
     """Points float32 [n, 2] along a path, and their spacing in m, `step` at most."""
     length = sum(length for length, _ in path.pieces)
     intervals = math.ceil(length / step)
-    offsets = np.array([0, intervals + 1])
-    pieces = np.array(path.pieces)
-    points, _ = _sample(
-        np.array([path[:3]]), pieces, np.array([0, len(pieces)]), np.array([length / intervals]), offsets
-    )
+    points, _ = _sample([path], np.array([length / intervals]), np.array([0, intervals + 1], dtype=np.int32))
     return points, length / intervals
 
 
 def strips_along(path: Path, half_width: float) -> Strips:
     """Drivable area along a path."""
-    pose = path[:3]
     lines, arcs = [], []
-    for length, curvature in path.pieces:
-        x, y, heading = pose
-        pose = _pose_after(x, y, heading, length, curvature)
+    poses = _poses(path)
+    for (x, y, heading), (end_x, end_y, _), (length, curvature) in zip(poses, poses[1:], path.pieces, strict=False):
         if curvature == 0.0:
-            lines.append([x, y, pose[0], pose[1], half_width])
+            lines.append([x, y, end_x, end_y, half_width])
         else:
             r = 1.0 / curvature  # signed: the centre is to the left or to the right
             first = heading - math.copysign(math.pi / 2, r)
             arcs.append(
                 [x - r * math.sin(heading), y + r * math.cos(heading), abs(r), first, length * curvature, half_width]
             )
-    return Strips(np.array(lines).reshape(-1, 5), np.array(arcs).reshape(-1, 6))
-
-
-def through_square(turn: int, half: float, offset: float) -> tuple[tuple[float, float], ...]:
-    """Pieces of a lane through a square of side 2 * half, `offset` m to the right of the road's middle.
-
-    turn: sides from the one it enters by to the one it leaves by, counter-clockwise: 1 right, 2 straight, 3 left.
-    """
-    if turn == 2:
-        return ((2.0 * half, 0.0),)
-    radius = half + offset if turn == 3 else half - offset
-    return ((math.pi / 2 * radius, (1.0 if turn == 3 else -1.0) / radius),)
+    return Strips.of(lines, arcs)
 
 
 @njit
@@ -107,7 +88,7 @@ def _pose_after(x, y, heading, length, curvature):
 
 
 @njit
-def _sample(starts, pieces, piece_offsets, steps, offsets):
+def _sample_pieces(starts, pieces, piece_offsets, steps, offsets):
     """Points float32 [n, 2] equally spaced along each path, and the end poses float64 [lanes, 3]."""
     points = np.empty((offsets[-1], 2), dtype=np.float32)
     ends = np.empty((len(starts), 3))
@@ -127,21 +108,17 @@ def _sample(starts, pieces, piece_offsets, steps, offsets):
     return points, ends
 
 
-@njit
-def _successors(starts, ends, width, height, successors):
-    """Fill successors [lanes, k] with the lanes that begin where each lane ends; returns the smallest count of them."""
-    least = len(starts)
-    for i in range(len(starts)):
-        count = 0
-        for j in range(len(starts)):
-            dx, dy, turn = starts[j, 0] - ends[i, 0], starts[j, 1] - ends[i, 1], starts[j, 2] - ends[i, 2]
-            dx, dy = dx - width * round(dx / width), dy - height * round(dy / height)
-            turn -= 2.0 * math.pi * round(turn / (2.0 * math.pi))
-            if max(abs(dx), abs(dy), abs(turn)) < _SAME and count < successors.shape[1]:
-                successors[i, count] = j
-                count += 1
-        least = min(least, count)
-    return least
+def _sample(paths: Sequence[Path], steps: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`_sample_pieces` of paths."""
+    starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(-1, 3)
+    pieces = np.array([piece for path in paths for piece in path.pieces], dtype=np.float64).reshape(-1, 2)
+    return _sample_pieces(starts, pieces, np.cumsum([0, *(len(path.pieces) for path in paths)]), steps, offsets)
+
+
+def _away(one: np.ndarray, other: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """From each of points [n, 2] to each of points [m, 2], the short way on the torus: [n, m, 2]."""
+    away = other - one[:, None]
+    return away - np.round(away / sides) * sides
 
 
 @njit
@@ -159,32 +136,25 @@ def _near(one, other, width, height):
 
 
 @njit
-def _crossings(points, offsets, successors, abreast, width, height):
+def _near_pairs(points, offsets, one, other, width, height):
+    """`_near` of pairs of lanes."""
+    near = np.empty(len(one), dtype=np.bool_)
+    for k in range(len(one)):
+        i, j = one[k], other[k]
+        near[k] = _near(points[offsets[i] : offsets[i + 1]], points[offsets[j] : offsets[j + 1]], width, height)
+    return near
+
+
+def _crossings(points: np.ndarray, offsets: np.ndarray, related: np.ndarray, sides: np.ndarray) -> np.ndarray:
     """Whether cars on two lanes may collide in a junction: bool [lanes, lanes], symmetric."""
-    n = len(offsets) - 1
-    cross = np.zeros((n, n), dtype=np.bool_)
-    middle, radius = np.empty((n, 2)), np.zeros(n)
-    for i in range(n):
-        centre = (offsets[i] + offsets[i + 1]) // 2
-        middle[i, 0], middle[i, 1] = points[centre, 0], points[centre, 1]
-        for k in range(offsets[i], offsets[i + 1]):
-            radius[i] = max(radius[i], math.hypot(points[k, 0] - middle[i, 0], points[k, 1] - middle[i, 1]))
-    for i in range(n):
-        first = points[offsets[i]]
-        for j in range(i + 1, n):
-            dx, dy = middle[j, 0] - middle[i, 0], middle[j, 1] - middle[i, 1]
-            dx, dy = dx - width * round(dx / width), dy - height * round(dy / height)
-            if math.hypot(dx, dy) > radius[i] + radius[j] + CROSSING_GAP or i // abreast == j // abreast:
-                continue
-            fx, fy = points[offsets[j], 0] - first[0], points[offsets[j], 1] - first[1]
-            fx, fy = fx - width * round(fx / width), fy - height * round(fy / height)
-            related = max(abs(fx), abs(fy)) < _SAME
-            for k in range(successors.shape[1]):
-                related = related or successors[i, k] == j or successors[j, k] == i
-            if not related:
-                one, other = points[offsets[i] : offsets[i + 1]], points[offsets[j] : offsets[j + 1]]
-                cross[i, j] = cross[j, i] = _near(one, other, width, height)
-    return cross
+    middle = points[(offsets[:-1] + offsets[1:]) // 2]
+    distance = np.hypot(*(points - np.repeat(middle, np.diff(offsets), axis=0)).T)
+    radius = np.maximum.reduceat(distance, offsets[:-1])
+    apart = np.hypot(*np.moveaxis(_away(middle, middle, sides), 2, 0)) - radius - radius[:, None]
+    one, other = np.nonzero(np.triu(~related & (apart < CROSSING_GAP + _SAME)))
+    cross = np.zeros_like(related)
+    cross[one, other] = _near_pairs(points, offsets, one, other, *sides)
+    return cross | cross.T
 
 
 def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int = 1) -> Lanes:
@@ -195,33 +165,33 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
 
     Raises: ValueError if a lane has no successor.
     """
-    n = len(paths)
+    n, sides = len(paths), np.array([width, height], dtype=np.float64)
     lengths = np.array([sum(length for length, _ in path.pieces) for path in paths])
     longest = lengths.reshape(-1, abreast).max(axis=1, initial=0.0)
     intervals = np.repeat(np.maximum(np.ceil(longest / LANE_STEP - 1e-9), 1), abreast).astype(np.int32)
     steps = lengths / intervals
     offsets = np.concatenate([[0], np.cumsum(intervals + 1)]).astype(np.int32)
+    points, ends = _sample(paths, steps, offsets)
     starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(n, 3)
-    pieces = np.array([piece for path in paths for piece in path.pieces], dtype=np.float64).reshape(-1, 2)
-    piece_offsets = np.cumsum([0, *(len(path.pieces) for path in paths)])
-    sharpest = np.array([max(abs(curvature) for _, curvature in path.pieces) for path in paths])
-    points, ends = _sample(starts, pieces, piece_offsets, steps, offsets)
-    successors = np.full((n, FORKS), -1, dtype=np.int32)
-    if n and _successors(starts, ends, width, height, successors) == 0:
+    turn = starts[:, 2] - ends[:, None, 2]
+    same_way = np.abs(turn - np.round(turn / (2 * math.pi)) * (2 * math.pi)) < _SAME
+    follows = same_way & (np.abs(_away(ends[:, :2], starts[:, :2], sides)) < _SAME).all(axis=2)
+    if not follows.any(axis=1).all():
         raise ValueError("a lane must end where another begins")
-    cross = _crossings(points, offsets, successors, abreast, width, height)
+    successors = np.full((n, FORKS), -1, dtype=np.int32)
+    one, other = np.nonzero(follows)
+    successors[one, np.arange(len(one)) - np.searchsorted(one, one)] = other
     index = np.arange(n, dtype=np.int32)
-    fastest = VehicleConfig().speed_limit
+    fork = (np.abs(_away(starts[:, :2], starts[:, :2], sides)) < _SAME).all(axis=2)
+    neighbours = index[:, None] // abreast == index // abreast
+    cross = _crossings(points, offsets, fork | neighbours | follows | follows.T, sides)
     return Lanes(
         points=points,
         offsets=offsets,
         successors=successors,
         steps=steps.astype(np.float32),
-        lengths=lengths.astype(np.float32),
         left=np.where(index % abreast == 0, -1, index - 1).astype(np.int32),
         right=np.where(index % abreast == abreast - 1, -1, index + 1).astype(np.int32),
         crossing_offsets=np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
         crossings=np.nonzero(cross)[1].astype(np.int32),
-        junction=cross.any(axis=1).astype(np.uint8),
-        limits=np.minimum(np.sqrt(BEND_COMFORT / np.maximum(sharpest, 1e-9)), fastest).astype(np.float32),
     )

@@ -11,7 +11,8 @@ import numpy as np
 
 from gridsim.config import START_SPEED, SimConfig
 from gridsim.jit import njit
-from gridsim.maps.network import Network, make_network, network_of_lanes
+from gridsim.maps.lanes import lay_lanes
+from gridsim.maps.network import Network, make_network
 from gridsim.maps.roads import (
     CELLS_PER_M,
     HEADING_BINS,
@@ -22,8 +23,6 @@ from gridsim.maps.roads import (
     Strips,
     freeze,
 )
-
-ROAD_FIELDS = ("columns", "rows", "width", "height", "speed_low", "speed_high", "thin")
 
 
 @dataclass(frozen=True)
@@ -60,48 +59,23 @@ class Map:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The map as plain arrays, which processes can share without copying."""
-        scalars = np.array([float(getattr(self.road, name)) for name in ROAD_FIELDS] + [self.seed, self.torus])
-        return {
-            "name": np.frombuffer(self.name.encode(), dtype=np.uint8),
-            "scalars": scalars,
-            "field": self.road.field,
-            "start_row": self.road.start_row,
-            "start": self.road.start,
-            **vars(self.lanes),
-            **vars(self.strips),
-            "speeds": self.network.speeds,
-            "clear": self.network.clear,
-            "room": self.network.room,
-            "starts": self.starts,
-        }
+        own = {"name": self.name, "seed": self.seed, "torus": self.torus, "starts": self.starts}
+        parts = (own, vars(self.lanes), vars(self.strips), self.road._asdict(), self.network._asdict())
+        return {name: np.asarray(value) for part in parts for name, value in part.items()}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Map:
         """The inverse of `arrays`. The arrays are not copied, and become read-only."""
-        frozen = {key: freeze(value) for key, value in arrays.items()}
-        columns, rows, width, height, low, high, thin, seed, torus = frozen["scalars"]
-        f = np.float32
-        lanes = Lanes(**{f.name: frozen[f.name] for f in fields(Lanes)})
+        values: dict[str, Any] = {name: freeze(array) if array.ndim else array[()] for name, array in arrays.items()}
         return cls(
-            name=frozen["name"].tobytes().decode(),
-            seed=int(seed),
-            road=Road(
-                frozen["field"],
-                frozen["start_row"],
-                frozen["start"],
-                np.uint32(columns),
-                np.uint32(rows),
-                f(width),
-                f(height),
-                f(low),
-                f(high),
-                np.uint32(thin),
-            ),
-            lanes=lanes,
-            strips=Strips(**{f.name: frozen[f.name] for f in fields(Strips)}),
-            network=network_of_lanes(lanes, frozen["speeds"], frozen["clear"], frozen["room"], width, height),
-            torus=bool(torus),
-            starts=frozen["starts"],
+            name=str(values["name"]),
+            seed=int(values["seed"]),
+            road=Road(**{name: values[name] for name in Road._fields}),
+            lanes=Lanes(**{part.name: values[part.name] for part in fields(Lanes)}),
+            strips=Strips(**{part.name: values[part.name] for part in fields(Strips)}),
+            network=Network(**{name: values[name] for name in Network._fields}),
+            torus=bool(values["torus"]),
+            starts=values["starts"],
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -115,27 +89,20 @@ class Map:
 
 def blank(config: SimConfig) -> Map:
     """A map of 8 m x 8 m without any road, used to compile kernels before the first map is built."""
-    side = 8
-    lanes, f = Lanes.none(), np.float32
-    return Map(
-        name="blank",
-        seed=0,
-        road=Road(
-            field=freeze(np.zeros((side * CELLS_PER_M) ** 2, dtype=np.uint32)),
-            start_row=freeze(np.full((side * START_CELLS_PER_M) ** 2, -1, dtype=np.int32)),
-            start=freeze(np.zeros(HEADING_BINS + HEADING_WRAP, dtype=np.uint8)),
-            columns=np.uint32(side * CELLS_PER_M),
-            rows=np.uint32(side * CELLS_PER_M),
-            width=f(side),
-            height=f(side),
-            speed_low=f(0.0),
-            speed_high=f(1.0),
-            thin=np.uint32(1),
-        ),
-        lanes=lanes,
-        strips=Strips(np.zeros((0, 5)), np.zeros((0, 6)), np.zeros((0, 5))),
-        network=make_network(lanes, side, side, 1.0, config.traffic),
+    side, lanes = 8, lay_lanes([], 8.0, 8.0)
+    nodes, f = np.uint32(side * CELLS_PER_M), np.float32
+    road = Road(
+        field=freeze(np.zeros(nodes * nodes, dtype=np.uint32)),
+        start_row=freeze(np.full((side * START_CELLS_PER_M) ** 2, -1, dtype=np.int32)),
+        start=freeze(np.zeros(HEADING_BINS + HEADING_WRAP, dtype=np.uint8)),
+        columns=nodes,
+        rows=nodes,
+        width=f(side),
+        height=f(side),
+        speed_low=f(0.0),
+        speed_high=f(1.0),
     )
+    return Map("blank", 0, road, lanes, Strips.of(), make_network(lanes, side, side, 1.0, config.traffic))
 
 
 @njit
@@ -159,7 +126,7 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
     if not len(road_map.lanes):
         return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(freeze(road_map.lanes.points), road_map.mileage, shares, np.float32(START_SPEED), starts)
+    _starts_at(road_map.lanes.points, road_map.mileage, shares, np.float32(START_SPEED), starts)
     return starts
 
 

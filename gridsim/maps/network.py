@@ -107,9 +107,9 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
 def _boxes(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """`Network.boxes` of lanes."""
     if len(offsets) < 2:
-        return freeze(np.zeros((0, 4), dtype=np.float32))
+        return np.zeros((0, 4), dtype=np.float32)
     low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
-    return freeze(np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32))
+    return np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32)
 
 
 def make_network(
@@ -125,45 +125,22 @@ def make_network(
     Args: clearances float32 [points], m from the lanes' points to the road's edge. Without them, `room` is 0.
     """
     f = np.float32
-    speeds = np.empty(len(lanes.points), dtype=np.float32)
+    points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
+    sides = f(width), f(height)
+    speeds, room = np.empty(len(points), dtype=np.float32), np.zeros(len(points), dtype=np.float32)
     clear = np.zeros(len(lanes.crossings), dtype=np.float32)
-    points, offsets, steps = freeze(lanes.points), freeze(lanes.offsets), freeze(lanes.steps)
-    successors = freeze(lanes.successors)
     if len(lanes):
         _speed_profile(points, offsets, steps, successors, f(speed_limit), f(config.lateral), f(config.comfort), speeds)
-        _clear_points(
-            points, offsets, steps, freeze(lanes.crossing_offsets), freeze(lanes.crossings), f(width), f(height),
-            f(config.apart), clear,
-        )  # fmt: skip
-    room = np.zeros(len(lanes.points), dtype=np.float32)
-    if clearances is not None and len(lanes):
+        crossing = lanes.crossing_offsets, lanes.crossings
+        _clear_points(points, offsets, steps, *crossing, *sides, f(config.apart), clear)
+    if clearances is not None:
         beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
         room = np.clip(clearances - f(config.kerb), 0.0, config.give_way).astype(np.float32)
-        room[np.repeat(beside, np.diff(lanes.offsets))] = 0.0
+        room[np.repeat(beside, np.diff(offsets))] = 0.0
         _ease(offsets, steps, successors, f(config.taper), room)
-    return network_of_lanes(lanes, freeze(speeds), freeze(clear), freeze(room), width, height)
-
-
-def network_of_lanes(
-    lanes: Lanes, speeds: np.ndarray, clear: np.ndarray, room: np.ndarray, width: float, height: float
-) -> Network:
-    """The network from arrays that `make_network` computed; they must be read-only."""
-    return Network(
-        points=lanes.points,
-        speeds=speeds,
-        offsets=lanes.offsets,
-        steps=lanes.steps,
-        successors=lanes.successors,
-        left=lanes.left,
-        right=lanes.right,
-        crossing_offsets=lanes.crossing_offsets,
-        crossings=lanes.crossings,
-        clear=clear,
-        room=room,
-        boxes=_boxes(lanes.points, lanes.offsets),
-        width=np.float32(width),
-        height=np.float32(height),
-    )
+    found = {"speeds": speeds, "clear": clear, "room": room, "boxes": _boxes(points, offsets)}
+    frozen = {name: freeze(array) for name, array in found.items()}
+    return Network(**vars(lanes), **frozen, width=sides[0], height=sides[1])
 
 
 @leaf

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
@@ -76,7 +75,7 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
     used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
     first = [0 if torus else min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
     per_node = [n / side if torus else _NODE / resolution for n, side in zip(free.shape, (rows, columns), strict=True)]
-    nodes = np.full((rows, columns), FIELD_FLOOR, dtype=np.float32)
+    nodes = np.empty((rows, columns), dtype=np.float32)
     for j in range(0, rows, _TILE):
         for i in range(0, columns, _TILE):
             index, window, at = [], [], []
@@ -89,19 +88,12 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
                 window.append(slice(low, high))
                 at.append((pixel + halo - low) * cut - 0.5)
             part = padded[window[0], window[1]]
-            if not part.any():
-                continue
-            if part.all():
-                nodes[np.ix_(*index)] = _DEEPEST
-                continue
-            part = part.repeat(cut, axis=0).repeat(cut, axis=1)
-            grid = np.meshgrid(*at, indexing="ij")
-            distance = ndimage.map_coordinates(_signed(part, resolution / cut), grid, order=1, mode="nearest")
+            distance = np.float32(_DEEPEST if part.any() else FIELD_FLOOR)
+            if part.any() and not part.all():
+                signed = _signed(part.repeat(cut, axis=0).repeat(cut, axis=1), resolution / cut)
+                distance = ndimage.map_coordinates(signed, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest")
             nodes[np.ix_(*index)] = np.clip(distance, FIELD_FLOOR, _DEEPEST)
     return nodes
-
-
-# ----------------------------------------------------------------------------------------------------- the starts
 
 
 def _clearance_at(nodes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -144,23 +136,13 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return across + math.pi / 2, np.hypot(xx - yy, 2.0 * xy) / np.maximum(xx + yy, 1e-6)
 
 
-def _open_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """For points [n, 2] without a clear direction, the axis (rad) with the longest free way both ways."""
-    angles = np.arange(36) * math.pi / 36
-    ways = np.empty((len(points), len(angles)))
-    for k, angle in enumerate(angles):
-        there, back = (np.column_stack([points, np.full(len(points), angle + turn)]) for turn in (0.0, math.pi))
-        ways[:, k] = np.minimum(_way_ahead(nodes, there, vehicle, 50.0), _way_ahead(nodes, back, vehicle, 50.0))
-    return angles[np.argmax(ways, axis=1)]
-
-
-def _widest_heading(nodes: np.ndarray, pose: np.ndarray, vehicle: VehicleConfig) -> float:
-    """The middle (rad) of the sector of headings with the longest free way from a pose."""
-    headings = np.arange(72) * math.pi / 36
-    ways = _way_ahead(nodes, np.column_stack([np.tile(pose[:2], (72, 1)), headings]), vehicle, 50.0)
-    best = int(np.argmax(ways))
-    sector = best + np.arange(-6, 7)
-    return float((sector * math.pi / 36)[ways[sector % 72] >= 0.9 * ways[best]].mean())
+def _widest_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """For points [n, 2], the middle (rad) of the sector of headings with the longest free way."""
+    headings = [np.column_stack([points, np.full(len(points), k * math.pi / 36)]) for k in range(72)]
+    ways = np.column_stack([_way_ahead(nodes, poses, vehicle, 50.0) for poses in headings])
+    best, turns = ways.argmax(axis=1, keepdims=True), np.arange(-6, 7)
+    open_ways = np.take_along_axis(ways, (best + turns) % 72, axis=1) >= 0.9 * ways.max(axis=1, keepdims=True)
+    return (best[:, 0] + np.average(np.broadcast_to(turns, open_ways.shape), axis=1, weights=open_ways)) * math.pi / 36
 
 
 def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -211,24 +193,24 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
         )
     ridge = large & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.25)
     angle, coherence = _directions(nodes)
-    row, column = np.nonzero(ridge & (coherence >= _COHERENCE))
-    along = np.column_stack([column * _NODE, row * _NODE, angle[row, column]])
     row, column = np.nonzero(ridge)
-    points = _spread_sample(np.column_stack([column, row]) * _NODE, _STARTS)
-    choices: tuple[Callable[[], np.ndarray], ...] = (
-        lambda: _spread_sample(along, 4 * _STARTS),
-        lambda: np.column_stack([points, _open_headings(nodes, points, vehicle)]),
-    )
-    for choice in choices:
-        ahead = choice()
+    points = np.column_stack([column, row]) * _NODE
+    along = np.column_stack([points, angle[row, column]])[coherence[row, column] >= _COHERENCE]
+
+    def drivable(ahead: np.ndarray) -> np.ndarray:
         poses = np.concatenate([ahead, ahead + _BACK])
-        poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & (_way_ahead(nodes, poses, vehicle, _AHEAD) >= _AHEAD)]
-        if len(poses):
-            return _spread_sample(poses, _STARTS)
-    raise ValueError(
-        f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
-        f"check the resolution and what is bright"
-    )
+        return poses[_fits(nodes, poses, vehicle, _MARGIN) & (_way_ahead(nodes, poses, vehicle, _AHEAD) >= _AHEAD)]
+
+    poses = drivable(_spread_sample(along, 4 * _STARTS))
+    if not len(poses):  # a plaza
+        points = _spread_sample(points, _STARTS)
+        poses = drivable(np.column_stack([points, _widest_headings(nodes, points, vehicle)]))
+    if not len(poses):
+        raise ValueError(
+            f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
+            f"check the resolution and what is bright"
+        )
+    return _spread_sample(poses, _STARTS)
 
 
 def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
@@ -243,9 +225,8 @@ def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig
         inside = bool((pose[:2] >= 0.0).all() and (pose[:2] < size).all())
         if inside and math.isnan(pose[2]):
             column, row = (pose[:2] * CELLS_PER_M).round().astype(int) % nodes.shape[::-1]
-            pose[2] = (
-                angle[row, column] if coherence[row, column] >= _COHERENCE else _widest_heading(nodes, pose, vehicle)
-            )
+            clear = coherence[row, column] >= _COHERENCE
+            pose[2] = angle[row, column] if clear else _widest_headings(nodes, pose[None, :2], vehicle)[0]
             ways = np.array([pose, pose + _BACK])
             pose[:] = ways[np.argmax(_way_ahead(nodes, ways, vehicle, 50.0))]
         if not inside or not _fits(nodes, pose[None], vehicle, _TOUCH)[0]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gridsim.jit import leaf, njit
 
@@ -26,7 +27,6 @@ START_UNITS = 4.0  # steps of a start range byte per metre
 START_CELLS_PER_M = 1  # cells of the ray start table per metre
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
 THIN_WALL = 3.0  # m; a plain ray may miss walls that are thinner
-MEMORY_LIMIT_CELLS = 1 << 24  # nodes of a field; above this a map is refused
 
 _F, _I, _U = np.float32, np.int32, np.uint32
 _SIMD_CONES = 16  # cones of the ray start table that are marched in lockstep
@@ -47,8 +47,16 @@ class Road(NamedTuple):
     thin: np.uint32 = _U(1)  # 1 if walls may be thinner than THIN_WALL, so that rays march with care
 
 
+class _Arrays:
+    """Base of records of arrays, which become read-only."""
+
+    def __post_init__(self):
+        for name, array in vars(self).items():
+            object.__setattr__(self, name, freeze(array))
+
+
 @dataclass(frozen=True)
-class Strips:
+class Strips(_Arrays):
     """Centre lines with half widths, in metres: the exact drivable area.
 
     Attributes:
@@ -61,9 +69,15 @@ class Strips:
     arcs: np.ndarray
     blocks: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
 
+    @classmethod
+    def of(cls, lines: ArrayLike = (), arcs: ArrayLike = (), blocks: ArrayLike = ()) -> Strips:
+        """From rows of numbers."""
+        rows = ((lines, 5), (arcs, 6), (blocks, 5))
+        return cls(*(np.asarray(part, dtype=np.float64).reshape(-1, width) for part, width in rows))
+
 
 @dataclass(frozen=True)
-class Lanes:
+class Lanes(_Arrays):
     """Directed lanes as polylines of equally spaced points: s metres along lane l is at index s / steps[l].
 
     Attributes:
@@ -72,63 +86,40 @@ class Lanes:
         successors: int32 [lanes, k], filled up with -1; every lane has at least one. A successor begins where the lane
             ends, up to whole turns of the torus.
         steps: float32 [lanes], m along the lane between its points; 1 m at most.
-        lengths: float32 [lanes], m: steps * (points - 1).
         left: int32 [lanes], the lane to the left to which a car may change, or -1. Its point i is beside point i.
         right: int32 [lanes], as `left`.
         crossing_offsets: int32 [lanes + 1], where each lane's part of `crossings` begins.
         crossings: int32, for each lane the lanes with which it conflicts in a junction: they cross it or merge into its
             end. Lanes with the same beginning, predecessors, successors and neighbours are not among them.
-        junction: uint8 [lanes], 1 if a lane has crossings.
-        limits: float32 [lanes], m/s at which lateral acceleration in the sharpest bend is BEND_COMFORT.
     """
 
     points: np.ndarray
     offsets: np.ndarray
     successors: np.ndarray
     steps: np.ndarray
-    lengths: np.ndarray
     left: np.ndarray
     right: np.ndarray
     crossing_offsets: np.ndarray
     crossings: np.ndarray
-    junction: np.ndarray
-    limits: np.ndarray
-
-    @classmethod
-    def none(cls) -> Lanes:
-        """No lanes, as on a map from a file."""
-        empty = freeze(np.zeros(0, dtype=np.int32))
-        none = freeze(np.zeros(0, dtype=np.float32))
-        return cls(
-            points=freeze(np.zeros((0, 2), dtype=np.float32)),
-            offsets=freeze(np.zeros(1, dtype=np.int32)),
-            successors=freeze(np.zeros((0, 1), dtype=np.int32)),
-            steps=none,
-            lengths=none,
-            left=empty,
-            right=empty,
-            crossing_offsets=freeze(np.zeros(1, dtype=np.int32)),
-            crossings=empty,
-            junction=freeze(np.zeros(0, dtype=np.uint8)),
-            limits=none,
-        )
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Float64 [lanes], m."""
+        return self.steps * (np.diff(self.offsets) - 1)
 
     def lane(self, i: int) -> np.ndarray:
         """Points [n, 2] of lane i."""
         return self.points[self.offsets[i] : self.offsets[i + 1]]
 
-    def crossing(self, i: int) -> np.ndarray:
-        """Lanes [k] that conflict with lane i."""
-        return self.crossings[self.crossing_offsets[i] : self.crossing_offsets[i + 1]]
-
 
 @njit(nogil=True)
-def _cut_blocks(field, blocks, widest, wrap, node):
+def _cut_blocks(field, blocks, widest):
     """Lower the clearance at nodes around each block; `widest` is the largest half width of a road."""
     rows, columns = field.shape
+    node = 1.0 / CELLS_PER_M
     for k in range(blocks.shape[0]):
         x, y, heading, half_length, half_width = blocks[k]
         c, s = math.cos(heading), math.sin(heading)
@@ -136,8 +127,6 @@ def _cut_blocks(field, blocks, widest, wrap, node):
         reach_y = abs(s) * half_length + abs(c) * half_width + widest
         i0, i1 = int(math.floor((x - reach_x) / node)), int(math.ceil((x + reach_x) / node))
         j0, j1 = int(math.floor((y - reach_y) / node)), int(math.ceil((y + reach_y) / node))
-        if not wrap:
-            i0, i1, j0, j1 = max(i0, 0), min(i1, columns - 1), max(j0, 0), min(j1, rows - 1)
         for j in range(j0, j1 + 1):
             for i in range(i0, i1 + 1):
                 dx, dy = i * node - x, j * node - y
@@ -151,10 +140,10 @@ def _cut_blocks(field, blocks, widest, wrap, node):
 
 
 @njit(nogil=True)
-def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
+def _clearance_nodes(lines, arcs, columns, rows):
     """Maximum of (half width - distance) at each node, at least FIELD_FLOOR; visits only the nodes near each strip."""
     field = np.full((rows, columns), _F(FIELD_FLOOR), dtype=np.float32)
-    reach = -FIELD_FLOOR
+    node = 1.0 / CELLS_PER_M
     for k in range(lines.shape[0] + arcs.shape[0]):
         is_line = k < lines.shape[0]
         if is_line:
@@ -169,18 +158,11 @@ def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
             e0x, e0y = ax + radius * math.cos(first), ay + radius * math.sin(first)
             e1x, e1y = ax + radius * math.cos(first + sweep), ay + radius * math.sin(first + sweep)
             px, py = ax + radius * mx, ay + radius * my
-            if half > 0.25 * math.pi + 1e-6:
-                x_low, x_high, y_low, y_high = ax - radius, ax + radius, ay - radius, ay + radius
-            else:
-                x_low, x_high = min(e0x, e1x, px), max(e0x, e1x, px)
-                y_low, y_high = min(e0y, e1y, py), max(e0y, e1y, py)
-        band = w + reach
-        # Below a quarter turn, the ends and the middle bound the arc but for its bulge, which the slack covers.
-        slack = 0.0 if is_line else 0.09 * radius
-        i0, i1 = int(math.floor((x_low - band - slack) / node)), int(math.ceil((x_high + band + slack) / node))
-        j0, j1 = int(math.floor((y_low - band - slack) / node)), int(math.ceil((y_high + band + slack) / node))
-        if not wrap:
-            i0, i1, j0, j1 = max(i0, 0), min(i1, columns - 1), max(j0, 0), min(j1, rows - 1)
+            size = 2.0 * radius * math.sin(0.5 * half)  # from the arc's middle to its ends
+            x_low, x_high, y_low, y_high = px - size, px + size, py - size, py + size
+        band = w - FIELD_FLOOR
+        i0, i1 = int(math.floor((x_low - band) / node)), int(math.ceil((x_high + band) / node))
+        j0, j1 = int(math.floor((y_low - band) / node)), int(math.ceil((y_high + band) / node))
         for j in range(j0, j1 + 1):
             y = j * node
             for i in range(i0, i1 + 1):
@@ -202,52 +184,36 @@ def _clearance_nodes(lines, arcs, columns, rows, wrap, node):
     return field
 
 
-@njit
-def _pack(nodes):
+def _pack(nodes: np.ndarray) -> np.ndarray:
     """Pack clearance (m) [rows, columns] into the four-corner words that `clearance` reads."""
-    rows, columns = nodes.shape
-    quantised = np.empty((rows, columns), dtype=np.uint32)
-    for j in range(rows):
-        for i in range(columns):
-            value = (nodes[j, i] - _F(FIELD_FLOOR)) * _F(FIELD_UNITS) + _F(0.5)
-            quantised[j, i] = np.uint32(min(max(value, _F(0.0)), _F(255.0)))
-    packed = np.empty(rows * columns, dtype=np.uint32)
-    for j in range(rows):
-        below = (j + 1) % rows
-        for i in range(columns):
-            right = (i + 1) % columns
-            packed[j * columns + i] = (
-                quantised[j, i]
-                | (quantised[j, right] << np.uint32(8))
-                | (quantised[below, i] << np.uint32(16))
-                | (quantised[below, right] << np.uint32(24))
-            )
-    return packed
+    units = (nodes - _F(FIELD_FLOOR)) * _F(FIELD_UNITS) + _F(0.5)
+    here = np.clip(units, 0.0, 255.0).astype(np.uint32)
+    above = np.roll(here, -1, axis=0)
+    return (here | np.roll(here, -1, axis=1) << 8 | above << 16 | np.roll(above, -1, axis=1) << 24).ravel()
+
+
+def _rows_on_road(nodes: np.ndarray) -> np.ndarray:
+    """For each 1 m cell, its row in the ray start table if a node in it or on its edge is on the road, else -1."""
+    k = CELLS_PER_M // START_CELLS_PER_M
+    road = nodes > 0.0
+    for axis in (0, 1):
+        road = np.logical_or.reduce([np.roll(road, -i, axis=axis) for i in range(k + 1)])
+    cells = road[::k, ::k].ravel()
+    return np.where(cells, np.cumsum(cells) - 1, -1).astype(np.int32)
 
 
 @njit(nogil=True, fastmath=False)
-def _ray_starts(nodes, columns, rows, ray_range):
+def _ray_starts(nodes, row_of, ray_range):
     """The ray start table: for each 1 m cell on the road and each bin of 4 degrees, a lower bound of all rays' ranges.
 
     A cone that contains every ray of the cell and bin is marched through the field until it may touch an edge. Compiled
     without fast math, so that every machine computes the same table.
-    Returns: (row of each cell or -1, ranges as bytes [rows, bins + wrap]).
+    Returns: ranges as bytes [table's rows, HEADING_BINS].
     """
+    rows, columns = nodes.shape
     k = CELLS_PER_M // START_CELLS_PER_M
     cells_x, cells_y = columns // k, rows // k
-    row_of = np.full(cells_x * cells_y, -1, dtype=np.int32)
-    count = 0
-    for j in range(cells_y):
-        for i in range(cells_x):
-            best = _F(FIELD_FLOOR)
-            for dj in range(k + 1):
-                for di in range(k + 1):
-                    best = max(best, nodes[(j * k + dj) % rows, (i * k + di) % columns])
-            if best > _F(0.0):
-                row_of[j * cells_x + i] = count
-                count += 1
-    stride = HEADING_BINS + HEADING_WRAP
-    ranges = np.zeros(count * stride, dtype=np.uint8)
+    ranges = np.empty((row_of.max() + 1, HEADING_BINS), dtype=np.uint8)
     radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
     spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
     margin = _F(0.2)  # m; the march ends below it
@@ -282,11 +248,8 @@ def _ray_starts(nodes, columns, rows, ray_range):
                         t[b] += free if goes else _F(0.0)
                         going |= _I(goes)
             for b in range(HEADING_BINS):
-                ranges[row * stride + b] = np.uint8(min(t[b], ray_range) * _F(START_UNITS))
-    for row in range(count):
-        for b in range(HEADING_WRAP):
-            ranges[row * stride + HEADING_BINS + b] = ranges[row * stride + b]
-    return row_of, ranges
+                ranges[row, b] = np.uint8(min(t[b], ray_range) * _F(START_UNITS))
+    return ranges
 
 
 @leaf
@@ -328,30 +291,29 @@ def power_of_two(n: float) -> int:
     return 1 << max(int(math.ceil(n)) - 1, 0).bit_length()
 
 
-def clearance_nodes(strips: Strips, width: float, height: float, torus: bool = True) -> np.ndarray:
+def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
     """Clearance float32 [rows, columns] at the nodes of the field, in m.
 
-    Raises: ValueError if a side is not a power of two, or the field would be too large.
+    Raises: ValueError if a side is not a power of two.
     """
     columns, rows = round(width * CELLS_PER_M), round(height * CELLS_PER_M)
-    if power_of_two(columns) != columns or power_of_two(rows) != rows:
+    if columns.bit_count() != 1 or rows.bit_count() != 1:
         raise ValueError(f"a field's sides must be powers of two, not {columns} x {rows}")
-    if columns * rows > MEMORY_LIMIT_CELLS:
-        raise ValueError(f"a map of {width:.0f} m x {height:.0f} m is too large")
-    nodes = _clearance_nodes(freeze(strips.lines), freeze(strips.arcs), columns, rows, torus, 1.0 / CELLS_PER_M)
+    nodes = _clearance_nodes(strips.lines, strips.arcs, columns, rows)
     widest = max(strips.lines[:, 4].max(initial=0.0), strips.arcs[:, 5].max(initial=0.0))
-    _cut_blocks(nodes, freeze(strips.blocks), widest, torus, 1.0 / CELLS_PER_M)
+    _cut_blocks(nodes, strips.blocks, widest)
     return nodes
 
 
 def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float, thin: bool = True) -> Road:
     """The Road of a clearance field (m) [rows, columns]; thin: whether walls may be thinner than THIN_WALL."""
     rows, columns = nodes.shape
-    start_row, start = _ray_starts(nodes, columns, rows, _F(ray_range))
+    start_row = _rows_on_road(nodes)
+    start = _ray_starts(nodes, start_row, _F(ray_range))
     return Road(
         field=freeze(_pack(nodes)),
         start_row=freeze(start_row),
-        start=freeze(start),
+        start=freeze(np.concatenate([start, start[:, :HEADING_WRAP]], axis=1).ravel()),
         columns=np.uint32(columns),
         rows=np.uint32(rows),
         width=_F(columns / CELLS_PER_M),

@@ -10,20 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from gridsim.config import FILE_SPEEDS, TRAFFIC_PACE, SimConfig
+from gridsim.errors import GridSimError
 from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
 from gridsim.maps.generators.highway import highway_layout
 from gridsim.maps.generators.seamless import roundabout_layout, seamless_layout
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.roads import (
-    Lanes,
-    Strips,
-    clearance_nodes,
-    clearances,
-    freeze,
-    make_road,
-)
+from gridsim.maps.roads import Lanes, Strips, clearance_nodes, clearances, make_road
 
 TRAINING_SEED = 0  # first seed of the training maps
 VALIDATION_SEED = 1_000_000  # ... of the maps on which the champion is chosen
@@ -56,10 +50,10 @@ def is_map_file(name: str) -> bool:
 
 
 def check_name(name: str) -> None:
-    """Raises: ValueError with one line if the name is neither in the registry nor a map file's."""
+    """Raises: GridSimError with one line if the name is neither in the registry nor a map file's."""
     if name not in REGISTRY and not is_map_file(name):
         names = ", ".join(sorted(REGISTRY))
-        raise ValueError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
+        raise GridSimError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
 
 
 def label(name: str) -> str:
@@ -85,11 +79,11 @@ def seed_of_map(name: str, seed: int) -> int:
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    Raises: ValueError with one line for an unknown scenario, a negative seed, or an invalid map file.
+    Raises: GridSimError with one line for an unknown scenario, a negative seed, or an invalid map file.
     """
     check_name(name)
     if seed < 0:
-        raise ValueError(f"a seed must be 0 or more, not {seed}")
+        raise GridSimError(f"a seed must be 0 or more, not {seed}")
     if is_map_file(name):
         from gridsim.maps.files import load_map  # imported here, because workers never read files
 
@@ -99,14 +93,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
     strips, lanes, width, height = spec.layout(rng)
     nodes = clearance_nodes(strips, width, height)
-    lanes = Lanes(**{name: freeze(array) for name, array in vars(lanes).items()})
     road = make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls)
     top = TRAFFIC_PACE * sum(spec.speed_interval)
-    return Map(
-        name=name,
-        seed=seed,
-        road=road,
-        lanes=lanes,
-        strips=Strips(**{name: freeze(array) for name, array in vars(strips).items()}),
-        network=make_network(lanes, width, height, top, config.traffic, clearances(road, lanes.points)),
-    )
+    network = make_network(lanes, width, height, top, config.traffic, clearances(road, lanes.points))
+    return Map(name, seed, road, lanes, strips, network)

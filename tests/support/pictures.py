@@ -9,13 +9,13 @@ from PIL import Image
 from gridsim.car.ego import collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
-from gridsim.maps.roads import Strips, clearance, freeze
+from gridsim.maps.roads import Strips, clearances, freeze
 
 PPM = 16
 W, H = 100.0, 72.0  # m
 LINES = np.array([[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]])
 ARCS = np.array([[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]])
-STRIPS = Strips(LINES, ARCS)
+STRIPS = Strips.of(LINES, ARCS)
 
 
 def distance(x, y):
@@ -53,30 +53,21 @@ def write_yaml(folder, pixels=None, name="map", **values):
 
 
 @njit
-def clearances(road, points, out):
-    for k in range(len(points)):
-        out[k] = clearance(road, points[k, 0], points[k, 1])
-
-
-@njit
-def crashed(road, constants, starts, out):
+def _crashed(road, constants, starts, out):
     for k in range(len(starts)):
-        out[k] = collides(
-            road, constants, starts[k, 0], starts[k, 1], np.float32(math.cos(starts[k, 2])),
-            np.float32(math.sin(starts[k, 2])),
-        )  # fmt: skip
+        x, y, heading = starts[k, 0], starts[k, 1], starts[k, 2]
+        out[k] = collides(road, constants, x, y, np.float32(math.cos(heading)), np.float32(math.sin(heading)))
+
+
+def crashes(road, starts):
+    """Whether a car would touch a wall at each of starts float32 [n, 5]."""
+    out = np.empty(len(starts), dtype=np.bool_)
+    _crashed(road, constants(SimConfig()), freeze(starts), out)
+    return out
 
 
 def read(road, points):
-    out = np.empty(len(points), dtype=np.float32)
-    clearances(road, freeze(np.asarray(points, dtype=np.float32)), out)
-    return out
-
-
-def crashes(scenario):
-    out = np.empty(len(scenario.starts), dtype=np.bool_)
-    crashed(scenario.road, constants(SimConfig()), scenario.starts, out)
-    return out
+    return clearances(road, freeze(np.asarray(points, dtype=np.float32)))
 
 
 def strip(cx, cy, angle, half_width, half_length=45.0):

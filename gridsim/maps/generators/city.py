@@ -11,8 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gridsim.maps.generators.seamless import DIRECTIONS, rotated, square_strips
-from gridsim.maps.lanes import Path, lay_lanes, through_square
+from gridsim.maps.generators.squares import DIRECTIONS, Layout, components
+from gridsim.maps.lanes import Path
 from gridsim.maps.roads import Lanes, Strips
 
 SIDE = 256.0  # m, of the torus
@@ -51,24 +51,11 @@ def street_graph(rng: np.random.Generator, columns: int, rows: int) -> np.ndarra
         other = ((j + dy) % rows, (i + dx) % columns)
         if left and edges[j, i].sum() > 2 and edges[other].sum() > 2:
             edges[j, i, d] = edges[other][d + 2] = False
-            if _connected(edges):
+            if not components(edges).any():  # all are in part 0
                 left -= 1
             else:
                 edges[j, i, d] = edges[other][d + 2] = True
     return edges
-
-
-def _connected(edges: np.ndarray) -> bool:
-    rows, columns, _ = edges.shape
-    seen, stack = {(0, 0)}, [(0, 0)]
-    while stack:
-        j, i = stack.pop()
-        for d in np.flatnonzero(edges[j, i]):
-            place = ((j + DIRECTIONS[d][1]) % rows, (i + DIRECTIONS[d][0]) % columns)
-            if place not in seen:
-                seen.add(place)
-                stack.append(place)
-    return len(seen) == rows * columns
 
 
 def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tuple[float, float, float]]:
@@ -88,10 +75,7 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
     corner = rng.uniform(*CORNER, (rows, columns))
     half_road = rng.uniform(*HALF_ROAD)
     bay_half = half_road + BAY_DEPTH / 2  # a bay is a strip as wide as the road and itself
-    lines: list[list[float]] = []
-    arcs: list[list[float]] = []
-    blocks: list[list[float]] = []
-    paths: list[Path] = []
+    layout = Layout(half_road, LANE_WIDTH)
 
     def street(x: float, y: float, d: int, length: float) -> None:
         """A piece of street from (x, y), with its lanes, bays and parked cars."""
@@ -100,10 +84,10 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
         def place(along: float, left: float) -> tuple[float, float]:
             return x + along * ux - left * uy, y + along * uy + left * ux
 
-        lines.append([*place(0.0, 0.0), *place(length, 0.0), half_road])
+        layout.line(*place(0.0, 0.0), *place(length, 0.0))
         right, left = place(0.0, -LANE_WIDTH / 2), place(length, LANE_WIDTH / 2)
-        paths.append(Path(*right, heading, ((length, 0.0),)))
-        paths.append(Path(*left, heading + math.pi, ((length, 0.0),)))
+        layout.paths.append(Path(*right, heading, ((length, 0.0),)))
+        layout.paths.append(Path(*left, heading + math.pi, ((length, 0.0),)))
         for side in (1.0, -1.0):
             spare = length - 2 * BAY_AWAY - BAY_LENGTH
             if rng.random() >= BAY_SHARE or spare < 0.0:
@@ -111,28 +95,20 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
             before, after = np.sort(rng.uniform(0.0, spare, 2))
             first, last = BAY_AWAY + before, length - BAY_AWAY - (spare - after)
             shift = side * BAY_DEPTH / 2
-            lines.append([*place(first, shift), *place(last, shift), bay_half])
+            layout.lines.append([*place(first, shift), *place(last, shift), bay_half])
             for along, out, skew in _parked(rng, first, last):
-                blocks.append([*place(along, side * (bay_half - out)), heading + skew, *CAR])
+                layout.blocks.append([*place(along, side * (bay_half - out)), heading + skew, *CAR])
 
     for j in range(rows):
         for i in range(columns):
             x, y, half = float(xs[i]), float(ys[j]), float(corner[j, i])
             arms = [int(d) for d in np.flatnonzero(edges[j, i])]
-            here_lines, here_arcs = square_strips(arms, half, half_road)
-            lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in here_lines]
-            arcs += [[a + x, b + y, *rest] for a, b, *rest in here_arcs]
-            for entry in arms:
-                edge_x, edge_y = rotated(np.array([half, LANE_WIDTH / 2]), entry)
-                for exit in arms:
-                    if exit != entry:
-                        pieces = through_square((exit - entry) % 4, half, LANE_WIDTH / 2)
-                        paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, pieces))
+            layout.join(x, y, half, arms)
+            layout.connect(x, y, half, arms)
             if edges[j, i, 0]:
                 gap = (xs[(i + 1) % columns] - x) % SIDE
                 street(x + half, y, 0, gap - half - corner[j, (i + 1) % columns])
             if edges[j, i, 1]:
                 gap = (ys[(j + 1) % rows] - y) % SIDE
                 street(x, y + half, 1, gap - half - corner[(j + 1) % rows, i])
-    strips = Strips(np.array(lines), np.array(arcs).reshape(-1, 6), np.array(blocks).reshape(-1, 5))
-    return strips, lay_lanes(paths, SIDE, SIDE), SIDE, SIDE
+    return layout.finish(SIDE)

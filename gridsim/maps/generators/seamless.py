@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from gridsim.maps.lanes import Path, lay_lanes, through_square
+from gridsim.maps.generators.squares import DIRECTIONS, Layout, Pieces, components, rotated
 from gridsim.maps.roads import Lanes, Strips
 
 TILE = 32.0  # m, side of a tile
@@ -28,9 +28,6 @@ ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles of the seamless road
 FEWEST_ROUNDABOUTS = 6  # on a map of the roundabout scenario
 EDGE_SHARE = 0.9  # share of the graph's edges that are kept where SHORTEST_BLOCK allows
 SHORTEST_BLOCK = 10  # tiles around the smallest block of the network
-
-# Edges of a tile in counter-clockwise order: east, north, west, south.
-DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 def _closes_short_block(edges: np.ndarray, tile: int, direction: int) -> bool:
@@ -73,24 +70,11 @@ def tile_graph(rng: np.random.Generator) -> np.ndarray:
             for tile in ends:
                 for d in np.flatnonzero(edges[tile]):
                     edges[tile, d] = edges[_neighbour(int(tile), int(d)), (d + 2) % 4] = False
-        largest = _largest_component(edges)
+        part = components(edges.reshape(TILES, TILES, 4))
+        largest = part == np.bincount(part).argmax()
         edges[~largest] = False
         if largest.sum() >= TILES * TILES // 2:
             return edges
-
-
-def _largest_component(edges: np.ndarray) -> np.ndarray:
-    """Mask [tiles] of the largest connected part."""
-    label = np.full(len(edges), -1)
-    for tile in range(len(edges)):
-        stack = [tile] if label[tile] < 0 and edges[tile].any() else []
-        while stack:
-            here = stack.pop()
-            if label[here] < 0:
-                label[here] = tile
-                stack += [_neighbour(here, d) for d in range(4) if edges[here, d]]
-    used = label[label >= 0]
-    return label == np.bincount(used).argmax() if used.size else label >= 0
 
 
 def _flare() -> tuple[float, float, float]:
@@ -103,56 +87,26 @@ def _flare() -> tuple[float, float, float]:
     return x, y, math.atan2(y, x)
 
 
-def rotated(points: np.ndarray, quarters: int) -> np.ndarray:
-    """Points [n, 2] rotated counter-clockwise by quarter turns."""
-    c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
-    return points @ np.array([[c, s], [-s, c]], dtype=np.float64)
-
-
-def _around(turn: int) -> tuple[tuple[float, float], ...]:
-    """Pieces of the lane through a roundabout, counter-clockwise; `turn` as in `through_square`."""
+def _around(turn: int, half: float, _offset: float) -> Pieces:
+    """Pieces of the lane through a roundabout, counter-clockwise; arguments as of `squares.through_square`."""
     x, _, angle = _flare()
-    straight = (TILE / 2 - x, 0.0)
+    straight = (half - x, 0.0)
     flare = ((math.pi / 2 - angle) * ROUNDABOUT_FLARE, -1.0 / ROUNDABOUT_FLARE)
     ring = ((turn * math.pi / 2 - 2 * angle) * ROUNDABOUT_RADIUS, 1.0 / ROUNDABOUT_RADIUS)
     return (straight, flare, ring, flare, straight)
 
 
-def _ring_strips(arms: list[int]) -> tuple[list[list[float]], list[list[float]]]:
-    """Lines and arcs of a roundabout centred on the origin."""
-    half = TILE / 2
-    x, y, angle = _flare()
-    lines: list[list[float]] = []
-    arcs = [[0.0, 0.0, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF]]
+def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
+    """The strips of a roundabout centred on (x, y)."""
+    flare_x, flare_y, angle = _flare()
+    layout.arcs.append([x, y, ROUNDABOUT_RADIUS, 0.0, 2 * math.pi, ROUNDABOUT_HALF])
     for arm in arms:
         dx, dy = DIRECTIONS[arm]
         inner = ROUNDABOUT_RADIUS - ROUNDABOUT_HALF + HALF_ROAD + 0.25  # its round end must not cover the island
-        lines.append([dx * half, dy * half, dx * inner, dy * inner, HALF_ROAD])
+        layout.line(dx * TILE / 2 + x, dy * TILE / 2 + y, dx * inner + x, dy * inner + y)
         for side in (1.0, -1.0):  # way in, way out
-            (cx, cy), first = rotated(np.array([[x, side * y]]), arm)[0], arm * math.pi / 2 - side * math.pi / 2
-            arcs.append([cx, cy, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
-    return lines, arcs
-
-
-def square_strips(arms: list[int], half: float, half_road: float) -> tuple[list[list[float]], list[list[float]]]:
-    """Lines and arcs that join the middles of some sides of a square (side 2 * half, centred on the origin)."""
-    lines: list[list[float]] = []
-    arcs: list[list[float]] = []
-    if len(arms) == 3:
-        # This area is already covered, but near the seams of the other three strips their clearance is too small.
-        dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
-        lines.append([dx * half, dy * half, 0.0, 0.0, half_road])
-    for k, a in enumerate(arms):
-        for b in arms[k + 1 :]:
-            ax, ay = DIRECTIONS[a]
-            bx, by = DIRECTIONS[b]
-            if (b - a) % 4 == 2:
-                lines.append([ax * half, ay * half, bx * half, by * half, half_road])
-            else:
-                first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
-                sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
-                arcs.append([half * (ax + bx), half * (ay + by), half, first, sweep, half_road])
-    return lines, arcs
+            (cx, cy), first = rotated(flare_x, side * flare_y, arm), arm * math.pi / 2 - side * math.pi / 2
+            layout.arcs.append([cx + x, cy + y, ROUNDABOUT_FLARE, first, side * (angle - math.pi / 2), FLARE_HALF])
 
 
 def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
@@ -170,23 +124,14 @@ def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, f
 
 def _layout(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[Strips, Lanes, float, float]:
     """The map of a graph; `share` of the T and crossing tiles are roundabouts."""
-    lines: list[list[float]] = []
-    arcs: list[list[float]] = []
-    paths: list[Path] = []
+    layout = Layout(HALF_ROAD, LANE_WIDTH)
     for tile in range(len(edges)):
         arms = [int(d) for d in np.flatnonzero(edges[tile])]
-        roundabout = rng.random() < share and len(arms) > 2
         x, y = (tile % TILES + 0.5) * TILE, (tile // TILES + 0.5) * TILE
-        tile_lines, tile_arcs = _ring_strips(arms) if roundabout else square_strips(arms, TILE / 2, HALF_ROAD)
-        lines += [[a + x, b + y, c + x, d + y, w] for a, b, c, d, w in tile_lines]
-        arcs += [[a + x, b + y, *rest] for a, b, *rest in tile_arcs]
-        for entry in arms:
-            edge_x, edge_y = rotated(np.array([TILE / 2, LANE_WIDTH / 2]), entry)
-            for exit in arms:
-                if exit != entry:
-                    turn = (exit - entry) % 4
-                    pieces = _around(turn) if roundabout else through_square(turn, TILE / 2, LANE_WIDTH / 2)
-                    paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, pieces))
-    lanes = lay_lanes(paths, TILE * TILES, TILE * TILES)
-    strips = Strips(np.array(lines, dtype=np.float64).reshape(-1, 5), np.array(arcs, dtype=np.float64).reshape(-1, 6))
-    return strips, lanes, TILE * TILES, TILE * TILES
+        if rng.random() < share and len(arms) > 2:
+            _roundabout(layout, x, y, arms)
+            layout.connect(x, y, TILE / 2, arms, _around)
+        else:
+            layout.join(x, y, TILE / 2, arms)
+            layout.connect(x, y, TILE / 2, arms)
+    return layout.finish(TILE * TILES)

@@ -1,0 +1,104 @@
+"""Networks of roads laid square by square: graphs on a grid that wraps round, and the strips and lanes of a square."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gridsim.maps.lanes import Path, lay_lanes
+from gridsim.maps.roads import Lanes, Strips
+
+# Edges of a square in counter-clockwise order: east, north, west, south.
+DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+Pieces = tuple[tuple[float, float], ...]  # length (m) and curvature (1/m) of each, as in `lanes.Path`
+
+
+def components(edges: np.ndarray) -> np.ndarray:
+    """Which connected part each node of a grid that wraps round belongs to: int [rows * columns].
+
+    Args: edges bool [rows, columns, 4], whether a node's edge in each of DIRECTIONS is open.
+    """
+    rows, columns, _ = edges.shape
+    index = np.arange(rows * columns).reshape(rows, columns)
+    pairs = [(index, np.roll(index, (-dy, -dx), axis=(0, 1)), edges[..., d]) for d, (dx, dy) in enumerate(DIRECTIONS)]
+    one, other = (np.concatenate([pair[k][pair[2]] for pair in pairs]) for k in (0, 1))
+    joined = coo_array((np.ones(len(one)), (one, other)), shape=(index.size, index.size))
+    return connected_components(joined, directed=False)[1]
+
+
+def rotated(x: float, y: float, quarters: int) -> tuple[float, float]:
+    """A point rotated counter-clockwise by quarter turns."""
+    c, s = DIRECTIONS[quarters % 4]
+    return x * c - y * s, x * s + y * c
+
+
+def through_square(turn: int, half: float, offset: float) -> Pieces:
+    """Pieces of a lane through a square of side 2 * half, `offset` m to the right of the road's middle.
+
+    turn: sides from the one it enters by to the one it leaves by, counter-clockwise: 1 right, 2 straight, 3 left.
+    """
+    if turn == 2:
+        return ((2.0 * half, 0.0),)
+    radius = half + offset if turn == 3 else half - offset
+    return ((math.pi / 2 * radius, (1.0 if turn == 3 else -1.0) / radius),)
+
+
+class Layout:
+    """Strips and lanes of a network of two-lane roads, collected while it is laid.
+
+    Args: half_road m from the centre line to the road's edge; lane_width m.
+    """
+
+    def __init__(self, half_road: float, lane_width: float):
+        self.half_road, self.offset = half_road, lane_width / 2
+        self.lines: list[list[float]] = []
+        self.arcs: list[list[float]] = []
+        self.blocks: list[list[float]] = []
+        self.paths: list[Path] = []
+
+    def line(self, x: float, y: float, end_x: float, end_y: float) -> None:
+        """A straight road."""
+        self.lines.append([x, y, end_x, end_y, self.half_road])
+
+    def join(self, x: float, y: float, half: float, arms: list[int]) -> None:
+        """Roads between the middles of some sides of a square (side 2 * half) centred on (x, y)."""
+        if len(arms) == 3:
+            # This area is already covered, but near the seams of the other three strips their clearance is too small.
+            dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
+            self.line(dx * half + x, dy * half + y, x, y)
+        for k, a in enumerate(arms):
+            for b in arms[k + 1 :]:
+                ax, ay = DIRECTIONS[a]
+                bx, by = DIRECTIONS[b]
+                if (b - a) % 4 == 2:
+                    self.line(ax * half + x, ay * half + y, bx * half + x, by * half + y)
+                else:
+                    first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
+                    sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
+                    self.arcs.append([half * (ax + bx) + x, half * (ay + by) + y, half, first, sweep, self.half_road])
+
+    def connect(
+        self,
+        x: float,
+        y: float,
+        half: float,
+        arms: list[int],
+        pieces: Callable[[int, float, float], Pieces] = through_square,
+    ) -> None:
+        """Lanes from each to each other of some sides of a square; `pieces` is called like `through_square`."""
+        for entry in arms:
+            edge_x, edge_y = rotated(half, self.offset, entry)
+            for exit in arms:
+                if exit != entry:
+                    turn = (exit - entry) % 4
+                    way = pieces(turn, half, self.offset)
+                    self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
+
+    def finish(self, side: float) -> tuple[Strips, Lanes, float, float]:
+        """The strips, lanes, width and height (m) of a square map."""
+        return Strips.of(self.lines, self.arcs, self.blocks), lay_lanes(self.paths, side, side), side, side
