@@ -96,42 +96,19 @@ def _fill_grids(table, ranges, grids):
 
 
 def grids(table: GridTable, ranges: np.ndarray) -> np.ndarray:
-    """Grids uint8 [n, 80, 80] of ranges float32 [n, rays] in m.
-
-    Raises: ValueError with one line if ranges have another shape.
-    """
-    rays = len(table.first) - 1
-    if ranges.ndim != 2 or ranges.shape[1] != rays:
-        raise ValueError(f"a grid is made of the ranges of {rays} rays, [n, {rays}], not {ranges.shape}")
+    """Grids uint8 [n, 80, 80] of ranges float32 [n, rays] in m."""
     made = np.empty((len(ranges), CELLS, CELLS), dtype=np.uint8)
     _fill_grids(table, np.ascontiguousarray(ranges, dtype=np.float32), made.reshape(len(ranges), CELLS * CELLS))
     return made
 
 
-@njit(nogil=True)
-def _push_frames(stacked, grids, begun):
-    frames, area = stacked.shape[1], stacked.shape[2]
-    for n in range(stacked.shape[0]):
-        for k in range(frames):
-            if begun[n] or k == frames - 1:
-                for i in range(area):
-                    stacked[n, k, i] = grids[n, i]
-            else:
-                for i in range(area):
-                    stacked[n, k, i] = stacked[n, k + 1, i]
-
-
 def push_frames(stacked: np.ndarray, grids: np.ndarray, begun: np.ndarray) -> None:
     """Append each car's new grid to its stack and drop the oldest; the newest is last.
 
-    Args: stacked uint8 [n, frames, 80, 80], C-contiguous, changed in place; grids uint8 [n, 80, 80]; begun bool [n],
-    whether an episode has just begun; then all frames become the first grid.
-    Raises: ValueError with one line if shapes do not fit.
+    Args: stacked uint8 [n, frames, 80, 80], changed in place; grids uint8 [n, 80, 80]; begun bool [n], whether an
+    episode has just begun; then all frames become the first grid.
     """
-    n = len(grids)
-    if grids.shape != (n, CELLS, CELLS) or stacked.ndim != 4 or begun.shape != (n,):
-        raise ValueError(f"grids {grids.shape} and begun {begun.shape} are not [n, {CELLS}, {CELLS}] and [n]")
-    if stacked.shape != (n, stacked.shape[1], CELLS, CELLS) or not stacked.flags.c_contiguous:
-        raise ValueError(f"a stack for {n} grids is [{n}, frames, {CELLS}, {CELLS}], contiguous, not {stacked.shape}")
-    flat = stacked.reshape(n, stacked.shape[1], CELLS * CELLS)
-    _push_frames(flat, np.ascontiguousarray(grids).reshape(n, CELLS * CELLS), np.ascontiguousarray(begun))
+    for k in range(stacked.shape[1] - 1):
+        stacked[:, k] = stacked[:, k + 1]
+    stacked[:, -1] = grids
+    stacked[begun] = grids[begun, None]

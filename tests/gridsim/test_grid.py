@@ -101,41 +101,6 @@ def test_ahead_is_up_and_left_is_left():
     assert (CELLS, CELL) == (80, 0.5)
 
 
-def test_an_open_field_is_free_as_far_as_the_fan_goes():
-    grid = one(np.full(31, REACH, dtype=F))
-    ahead, left = centres()
-    inside = np.abs(left) <= math.tan(math.radians(60.0)) * ahead
-    assert (grid == np.where(inside, FREE, UNKNOWN)).all()
-
-
-def test_a_picture_of_a_grid_has_three_shades():
-    assert UNKNOWN < FREE < OCCUPIED
-    assert {UNKNOWN.dtype, FREE.dtype, OCCUPIED.dtype} == {np.dtype(np.uint8)}
-    grid = one(np.full(31, 20.0, dtype=F))
-    assert sorted(np.unique(grid)) == [UNKNOWN, FREE, OCCUPIED]
-    assert grid.min() >= 0
-    assert grid.max() / 255 == 1.0
-
-
-@given(shorter=st.floats(0, 1, width=32), ray=st.integers(0, 30))
-def test_a_ray_decides_on_its_own_cells_alone(shorter, ray):
-    ranges = np.full(31, 30.0, dtype=F)
-    before = one(ranges)
-    ranges[ray] *= F(shorter)
-    after = one(ranges)
-    own = np.zeros(CELLS * CELLS, dtype=bool)
-    own[TABLE.cells[TABLE.first[ray] : TABLE.first[ray + 1]]] = True
-    assert (before == after).ravel()[~own].all()
-
-
-def test_each_cell_in_view_has_one_ray():
-    assert len(np.unique(TABLE.cells)) == len(TABLE.cells) == TABLE.first[-1]
-    for ray in range(31):
-        radii = TABLE.radii[TABLE.first[ray] : TABLE.first[ray + 1]]
-        assert len(radii) > 30
-        assert (np.diff(radii) >= 0).all()
-
-
 def test_a_batch_is_its_cars():
     ranges = np.random.default_rng(2).uniform(0, 50, (20, 31)).astype(F)
     alone = np.full((20, CELLS * CELLS), 77, dtype=np.uint8)
@@ -144,12 +109,6 @@ def test_a_batch_is_its_cars():
     assert (grids(TABLE, ranges).reshape(20, -1) == alone).all()
     assert (grids(TABLE, ranges[::2]).reshape(10, -1) == alone[::2]).all()
     assert grids(TABLE, ranges[:0]).shape == (0, 80, 80)
-
-
-@pytest.mark.parametrize("shape", [(31,), (2, 30), (2, 31, 1)])
-def test_ranges_of_another_shape_are_refused(shape):
-    with pytest.raises(ValueError, match="31 rays"):
-        grids(TABLE, np.zeros(shape, dtype=F))
 
 
 # --- Real roads ------------------------------------------------------------------------------------------------------
@@ -223,12 +182,3 @@ def test_a_stack_holds_the_last_frames_newest_last(frames, begins):
             first = max(k for k in range(step + 1) if k == 0 or (car == 0 and begins[k]))
             wanted = [past[max(k, first)][car] for k in range(step - frames + 1, step + 1)]
             assert (stack[car] == np.array(wanted)).all()
-
-
-@pytest.mark.parametrize(
-    ("stack", "new", "begun"),
-    [((2, 4, 80, 80), (3, 80, 80), 3), ((3, 4, 80, 80), (3, 80, 80), 2), ((3, 80, 80), (3, 80, 80), 3)],
-)
-def test_stacks_of_another_shape_are_refused(stack, new, begun):
-    with pytest.raises(ValueError, match="grids"):
-        push_frames(np.zeros(stack, np.uint8), np.zeros(new, np.uint8), np.zeros(begun, bool))
