@@ -10,8 +10,8 @@ import pytest
 from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.roads import HEADING_BINS, Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
-from gridsim.sensing.rays import AMONG_THIN_WALLS, PLAIN, fan, fast_march, fast_march_thin, march, sense
-from gridsim.sensing.simd import SIMD_RAYS
+from gridsim.sensing.rays import fan, sense
+from gridsim.sensing.simd import AMONG_THIN_WALLS, PLAIN, SIMD_RAYS, march, vector_march
 
 F = np.float32
 K = constants(SimConfig())
@@ -22,14 +22,17 @@ POSES_A_MAP = 2500
 MAPS = (0, 1, 2, 3)
 
 
-@numba.njit
-def vector_march(field, columns, rows, px, py, reach, beams):
-    fast_march(field, columns, rows, px, py, reach, beams)
+def compiled(how):
+    vector = vector_march(how)
+
+    @numba.njit
+    def call(field, columns, rows, px, py, reach, beams):
+        vector(field, columns, rows, px, py, reach, beams)
+
+    return call
 
 
-@numba.njit
-def vector_march_thin(field, columns, rows, px, py, reach, beams):
-    fast_march_thin(field, columns, rows, px, py, reach, beams)
+VECTOR = {how: compiled(how) for how in (PLAIN, AMONG_THIN_WALLS)}
 
 
 def look(road, points, headings, k=K, count=31):
@@ -66,6 +69,11 @@ class Views:
     def with_edges_moved(self, margin, of=slice(None)):
         return self.exact.widened(margin).cast(self.points[of], self.angles[of], REACH)
 
+    def unexplained(self, margin, of):
+        """Share of rays that end 0.2 m or more beyond the exact ranges of roads `margin` m narrower and wider."""
+        low, high = self.with_edges_moved(-margin, of), self.with_edges_moved(margin, of)
+        return ((self.seen[of] < low - 0.2) | (self.seen[of] > high + 0.2)).mean()
+
 
 @pytest.fixture(scope="module")
 def views():
@@ -80,36 +88,13 @@ def scenario(views):
 def test_rays_are_those_of_the_exact_geometry(views):
     """10,000 poses: any place on the road, any heading."""
     seen, true = (np.concatenate([getattr(v, name) for v in views]) for name in ("seen", "true"))
-    assert seen.shape == (10_000, 31)
-    error = np.abs(seen - true).ravel()
-    # A ray grazes an edge where a shift of the edges by 3 cm changes its range most: told from the geometry alone.
-    shift = np.concatenate([v.with_edges_moved(0.03) - v.with_edges_moved(-0.03) for v in views]).ravel()
-    kept = error[np.argsort(shift, kind="stable")[: round(0.995 * error.size)]]
-    p50, p99 = np.quantile(kept, [0.5, 0.99])
-    print(f"rays, without the 0.5 % that graze an edge: p50 {p50:.4f} m, p99 {p99:.4f} m; ", end="")
-    print("all of them: p50 {:.4f} m, p99 {:.4f} m".format(*np.quantile(error, [0.5, 0.99])))
-    assert p50 <= 0.03
-    assert p99 <= 0.2
+    error = np.abs(seen - true)
+    assert np.quantile(error, 0.5) <= 0.03
     assert np.quantile(error, 0.99) <= 0.2
-
-
-def test_a_ray_far_off_is_a_grazing_one(views):
-    """Nearly every ray lies between the exact ranges of a road with edges 0.1 m further in and 0.1 m further out."""
-    view = views[0]
-    inner = np.flatnonzero(view.exact.clearance(view.points) > 0.15)[:1000]
-    low, high = view.with_edges_moved(-0.1, inner), view.with_edges_moved(0.1, inner)
-    seen = view.seen[inner]
-    outside = (seen < low - 0.2) | (seen > high + 0.2)
-    print(f"rays not explained by edges 0.1 m off: {outside.mean():.5f}")
-    assert outside.mean() < 0.003
-
-
-def test_ranges_are_within_the_sensors_reach(views):
-    seen = np.concatenate([v.seen for v in views])
-    assert np.isfinite(seen).all()
     assert seen.min() >= 0.0
-    assert seen.max() <= REACH
-    assert (seen == REACH).any()
+    assert seen.max() == REACH
+    inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.15)[:1000]
+    assert views[0].unexplained(0.1, inner) < 0.003  # a ray far off is one that grazes an edge
 
 
 def test_the_first_ray_is_the_rightmost():
@@ -122,7 +107,7 @@ def test_the_first_ray_is_the_rightmost():
 
 
 def strip_road(lines=(), arcs=(), side=64.0):
-    strips = Strips(np.array(lines, dtype=float).reshape(-1, 5), np.array(arcs, dtype=float).reshape(-1, 6))
+    strips = Strips.of(lines, arcs)
     return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), REACH), oracle.ExactRoad(strips, side, side)
 
 
@@ -170,7 +155,7 @@ def test_rays_see_parked_cars():
         at = np.stack([x.ravel(), y.ravel() + (8.0 if size[0] > 1 else 0.0)], axis=1) + rng.uniform(-2, 2, (64, 2))
         blocks += [[*p, rng.uniform(0, 3), *size] for p in at]
     lines = np.array([[0.0, y, 128.0, y, 24.0] for y in (16.0, 48.0, 80.0, 112.0)])
-    strips = Strips(lines, np.zeros((0, 6)), np.array(blocks))
+    strips = Strips.of(lines, (), blocks)
     exact, inner = oracle.ExactRoad(strips, 128.0, 128.0), oracle.ExactRoad(strips, 128.0, 128.0)
     inner.blocks[:, 3:5] -= 0.36
     road = make_road(clearance_nodes(strips, 128.0, 128.0), (5.0, 12.0), REACH)
@@ -181,26 +166,17 @@ def test_rays_see_parked_cars():
     for thin in (True, False):
         seen = look(road._replace(thin=np.uint32(thin)), points, headings)
         missed[thin] = (seen > inner.cast(points, angles, REACH) + 0.5).mean()
-    print(f"rays that miss a block: {missed[True]:.5f}, without looking out for it {missed[False]:.5f}")
     assert missed[True] < 2e-4
     assert missed[False] > 5 * missed[True]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_rays_in_the_city(seed):
+def test_rays_in_the_city():
     """Corners of parked cars, which the field rounds by 0.1 m, make one ray in a hundred a far one: hence p97."""
-    view = Views(seed, "city", 1200)
-    error = np.abs(view.seen - view.true).ravel()
-    shift = (view.with_edges_moved(0.03) - view.with_edges_moved(-0.03)).ravel()
-    kept = error[np.argsort(shift, kind="stable")[: round(0.995 * error.size)]]
-    print("city rays: p50 {:.3f}, p97 {:.3f}, p99 {:.3f} m".format(*np.quantile(kept, [0.5, 0.97, 0.99])))
-    assert np.quantile(kept, 0.5) <= 0.03
-    assert np.quantile(kept, 0.97) <= 0.2
-    inner = np.flatnonzero(view.exact.clearance(view.points) > 0.2)
-    low, high = view.with_edges_moved(-0.15, inner), view.with_edges_moved(0.15, inner)
-    outside = (view.seen[inner] < low - 0.2) | (view.seen[inner] > high + 0.2)
-    print(f"city rays not explained by edges 0.15 m off: {outside.mean():.5f}")
-    assert outside.mean() < 0.003
+    view = Views(0, "city", 1200)
+    error = np.abs(view.seen - view.true)
+    assert np.quantile(error, 0.5) <= 0.03
+    assert np.quantile(error, 0.97) <= 0.25
+    assert view.unexplained(0.15, np.flatnonzero(view.exact.clearance(view.points) > 0.2)) < 0.003
 
 
 def test_an_empty_world_and_a_full_one():
@@ -210,7 +186,7 @@ def test_an_empty_world_and_a_full_one():
     assert look(road, [(40.0, 40.0)], [1.0]).max() == 0.0  # far off the road everything is hidden
 
 
-@pytest.mark.parametrize(("rays", "view"), [(2, 120.0), (5, 60.0), (32, 120.0), (33, 200.0), (61, 120.0), (64, 240.0)])
+@pytest.mark.parametrize(("rays", "view"), [(2, 120.0), (32, 60.0), (33, 200.0), (64, 240.0)])
 def test_any_number_of_rays(scenario, views, rays, view):
     k = constants(SimConfig(sensors=SensorConfig(rays=rays, field_of_view=view)))
     points, headings = views[0].points[:300], views[0].headings[:300]
@@ -239,46 +215,29 @@ def test_the_sensor_knows_no_border(scenario, views):
     assert np.quantile(np.abs(turned - seen), 0.98) < 1e-3
 
 
-def march_both(road, point, angles, start=0.0, thin=False):
+def march_both(road, point, angles, start=0.0, how=PLAIN):
     """Ranges [2, SIMD_RAYS] by the plain kernel and by the vector code, of rays from one point."""
-    results = []
-    how, vector = (AMONG_THIN_WALLS, vector_march_thin) if thin else (PLAIN, vector_march)
-    for kernel, more in ((march, (how,)), (vector, ())):
-        beams = np.stack([np.cos(angles), np.sin(angles), np.full(SIMD_RAYS, start)]).astype(F)
-        kernel(road.field, road.columns, road.rows, F(2 * point[0]), F(2 * point[1]), F(REACH), beams, *more)
-        results.append(beams[2])
-    return np.array(results)
+    beams = np.stack([np.cos(angles), np.sin(angles), np.full(SIMD_RAYS, start)]).astype(F)
+    both = beams, beams.copy()
+    drive = road.field, road.columns, road.rows, F(2 * point[0]), F(2 * point[1]), F(REACH)
+    march(*drive, both[0], how)
+    VECTOR[how](*drive, both[1])
+    return np.array([both[0][2], both[1][2]])
 
 
-@pytest.mark.parametrize("thin", [False, True])
-def test_vector_code_is_the_plain_kernel(scenario, views, thin):
-    """One ray in all lanes: then no lane marches on for another's sake, and the two are the same arithmetic."""
+@pytest.mark.parametrize("how", [PLAIN, AMONG_THIN_WALLS])
+def test_vector_code_is_the_plain_kernel(scenario, views, how):
+    """One ray in all lanes gives the same: no lane marches on for another's sake. In lanes of their own, a ray that
+    has arrived keeps coming closer to the edge while others are on their way."""
     rng = np.random.default_rng(4)
-    inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:400]
-    both = []
-    for point in views[0].points[inner]:
-        plain, vector = march_both(scenario.road, point, np.full(SIMD_RAYS, rng.uniform(-math.pi, math.pi)), thin=thin)
-        assert (vector == vector[0]).all()
-        assert (plain == plain[0]).all()
-        both.append((plain[0], vector[0]))
-    plain, vector = np.array(both).T
+    points = views[0].points[np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:500]]
+    first = rng.uniform(-math.pi, math.pi, (len(points), 1)) + np.zeros(SIMD_RAYS)
+    plain, vector = np.stack([march_both(scenario.road, *ray, how=how) for ray in zip(points, first, strict=True)], 1)
     assert 0.02 < (plain == REACH).mean() < 0.5
     assert np.abs(plain - vector).max() < 2e-3
-
-
-@pytest.mark.parametrize("thin", [False, True])
-def test_vector_code_is_the_plain_kernel_lane_by_lane(scenario, views, thin):
-    """A ray that has arrived keeps coming closer to the edge while others of its block are on their way."""
-    rng = np.random.default_rng(5)
-    inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.2)[:600]
-    points = views[0].points[inner]
-    angles = rng.uniform(-math.pi, math.pi, (len(points), 1)) + np.radians(np.linspace(-60, 60, SIMD_RAYS))
-    plain, vector = np.stack(
-        [march_both(scenario.road, p, a, thin=thin) for p, a in zip(points, angles, strict=True)], axis=1
-    )
-    true = views[0].exact.cast(points, angles, REACH)
-    away = np.abs(plain - vector)
-    print("plain and vector march: p50 {:.1e}, p90 {:.1e}, p99 {:.1e} m".format(*np.quantile(away, [0.5, 0.9, 0.99])))
+    angles = first + np.radians(np.linspace(-60, 60, SIMD_RAYS))
+    plain, vector = np.stack([march_both(scenario.road, *ray, how=how) for ray in zip(points, angles, strict=True)], 1)
+    true, away = views[0].exact.cast(points, angles, REACH), np.abs(plain - vector)
     assert np.quantile(away, 0.9) < 1e-3
     assert np.quantile(away, 0.985) < 0.1
     for q in (0.9, 0.97, 0.99):
@@ -296,16 +255,9 @@ def test_both_marches_take_a_start_and_stay_within_reach(scenario, start):
         assert (vector == REACH).all()
 
 
-@pytest.mark.parametrize("view", [300.0, 360.0])
-def test_wider_fans_than_the_start_table_holds_are_refused(view):
-    with pytest.raises(ValueError, match="240 degrees"):
-        constants(SimConfig(sensors=SensorConfig(rays=64, field_of_view=view)))
-
-
-@pytest.mark.parametrize("view", [120.0, 240.0])
-def test_the_start_table_holds_the_widest_fan_that_is_allowed(scenario, view):
+def test_the_start_table_holds_the_widest_fan_that_is_allowed(scenario):
     """A fan never wraps: the bins repeated behind the last are as many as any fan needs."""
-    k = constants(SimConfig(sensors=SensorConfig(rays=64, field_of_view=view)))
+    k = constants(SimConfig(sensors=SensorConfig(rays=64, field_of_view=240.0)))
     stride = scenario.road.start.size // (int(scenario.road.start_row.max()) + 1)
     assert stride >= HEADING_BINS + math.ceil(fan(64, k.ray_first, k.ray_step)[2].max())
 
