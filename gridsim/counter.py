@@ -26,3 +26,9 @@ def mix(x: np.uint64) -> np.uint64:
 def uniform(bits: np.uint64) -> np.float32:
     """Uniform float32 in [0, 1) from the upper 24 bits."""
     return _F(bits >> _U(40)) * _UNIT24
+
+
+@njit
+def uniform64(bits: np.uint64) -> np.float64:
+    """Uniform float64 in [0, 1) from the upper 53 bits."""
+    return np.float64(bits >> _U(11)) * (1.0 / (1 << 53))

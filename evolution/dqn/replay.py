@@ -17,7 +17,7 @@ import numpy as np
 from evolution.dqn.experience import NO_ACTION, Experience, ages, observation_dtype_and_width, unpack
 from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.car.ego import End
-from gridsim.counter import GOLDEN, mix
+from gridsim.counter import GOLDEN, mix, uniform64
 from gridsim.jit import njit
 
 _U = np.uint64
@@ -33,12 +33,6 @@ class Batch(NamedTuple):
     discounts: np.ndarray  # float32 [n], the factor of the value of the next observation
 
 
-@njit
-def _uniform(bits):
-    """Uniform float64 in [0, 1) from the upper 53 bits: `counter.uniform`'s 24 are too coarse for a million rows."""
-    return float(bits >> _U(11)) * (1.0 / (1 << 53))
-
-
 @njit(nogil=True)
 def _draw(drawable, size, key, rows):
     """Fill rows [n] uniformly with drawable rows below `size`."""
@@ -46,7 +40,7 @@ def _draw(drawable, size, key, rows):
     for i in range(rows.shape[0]):
         row = 0
         while True:
-            row = int(_uniform(mix(key + place * GOLDEN)) * size)
+            row = int(uniform64(mix(key + place * GOLDEN)) * size)
             place += _U(1)
             if drawable[row]:
                 break

@@ -9,7 +9,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from gridsim.config import SimConfig
-from gridsim.counter import GOLDEN, mix
+from gridsim.counter import GOLDEN, mix, uniform64
 from gridsim.jit import njit
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
@@ -38,7 +38,7 @@ def _draw(keys, episodes, which, numbers, drawn):
         episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)
         drawn[k] = mix(episode + _U(3) * GOLDEN)
         for j in range(2):
-            numbers[k, j] = (mix(episode + _U(j + 1) * GOLDEN) >> _U(11)) * (1.0 / (1 << 53))
+            numbers[k, j] = uniform64(mix(episode + _U(j + 1) * GOLDEN))
 
 
 class Episodes:
