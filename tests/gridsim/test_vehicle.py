@@ -7,6 +7,7 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
 
 from gridsim.car.vehicle import Action, act, advance, path_curvature
 from gridsim.config import Constants, EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
@@ -64,17 +65,11 @@ def test_20_mps_for_2_s_is_40_m():
     assert car.speed == 20.0
 
 
-def test_uniform_acceleration():
+def test_uniform_acceleration_up_to_the_top_speed():
     car = Driver().do(Action.ACCELERATE, 40)  # 4 s at 3 m/s2
     assert car.speed == pytest.approx(12.0, abs=1e-4)
     assert car.x[-1] == pytest.approx(0.5 * 3.0 * 4.0**2, abs=1e-3)
-
-
-def test_top_speed_is_reached_and_kept():
-    car = Driver().do(Action.ACCELERATE, 150)
-    assert max(car.speeds) == 30.0
-    assert car.speeds[99] == pytest.approx(29.7, abs=1e-3)
-    assert car.speeds[101:] == [30.0] * 50
+    assert car.do(Action.ACCELERATE, 70).speeds[-5:] == [30.0] * 5
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.8, 5.0, 12.0, 20.0, 30.0])
@@ -139,25 +134,6 @@ def test_steering_is_rate_limited_and_returns(action, sign):
     assert angles == pytest.approx([sign * a for a in (6, 12, 18, 24, 27, 27, 21, 15, 9, 3, 0, 0)], abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("action", "acceleration", "steering"),
-    [
-        (Action.ACCELERATE, 3.0, 0.0),
-        (Action.LEFT, 0.0, 6.0),
-        (Action.RIGHT, 0.0, -6.0),
-        (Action.BRAKE, -8.0, 0.0),
-        (Action.NONE, 0.0, 0.0),
-        (Action.ACCELERATE_LEFT, 3.0, 6.0),
-        (Action.ACCELERATE_RIGHT, 3.0, -6.0),
-        (Action.REVERSE, -3.0, 0.0),
-    ],
-)
-def test_the_eight_actions_are_the_papers(action, acceleration, steering):
-    got = act(K, int(action), F(10.0), F(0.0))
-    assert float(got[0]) == pytest.approx(acceleration)
-    assert math.degrees(got[1]) == pytest.approx(steering, abs=1e-4)
-
-
 @given(action=actions, speed=speeds, steering=steerings)
 def test_act_is_the_oracles(action, speed, steering):
     acceleration, angle = act(K, int(action), F(speed), steering)
@@ -182,52 +158,28 @@ def test_circle_radius(side):
     assert math.hypot(car.x[-1], car.y[-1]) < 0.5 * speed * DT + 1e-3  # round once
 
 
-def test_too_fast_the_car_runs_wide():
-    speed = 14.0
-    car = Driver(speed=speed, steering=math.radians(27.0))
-    for _ in range(60):
-        car.step(0.0)
-    turned = np.diff(np.unwrap(car.heading))
-    assert speed * DT / turned == pytest.approx(np.full(60, speed**2 / 4.9), rel=1e-3)
+def kong(_t: float, state: np.ndarray, steering: float, acceleration: float) -> list[float]:
+    """Kong et al. 2015, equations 1: derivatives of x, y, psi, v."""
+    _, _, psi, v = state
+    beta = math.atan(1.25 / 2.5 * math.tan(steering))
+    return [v * math.cos(psi + beta), v * math.sin(psi + beta), v / 1.25 * math.sin(beta), acceleration]
+
+
+@settings(max_examples=50)
+@given(speed=st.floats(0.0, 29.5, width=32), steering=steerings, acceleration=st.sampled_from([0.0, 3.0]))
+def test_without_a_grip_limit_advance_solves_kongs_equations(speed, steering, acceleration):
+    start, drive = [0.0, 0.0, 0.0, speed], (float(steering), acceleration)
+    state = solve_ivp(kong, (0.0, DT), start, args=drive, rtol=1e-9, atol=1e-9).y[:, -1]
+    car = Driver(speed, steering, k=constants(SimConfig(vehicle=VehicleConfig(lateral_grip=math.inf))))
+    car.step(acceleration)
+    assert (car.x[-1], car.y[-1], car.heading[-1], car.speed) == pytest.approx(tuple(state), abs=2e-5)
 
 
 @given(speed=speeds, steering=steerings)
 def test_lateral_acceleration_is_bounded(speed, steering):
     kappa = float(path_curvature(K, F(speed), steering))
     assert float(speed) ** 2 * abs(kappa) <= 4.9 * (1 + 1e-6)
-    assert abs(kappa) <= 1 / R_SHARP + 1e-6
-    assert kappa * float(steering) >= 0.0
     assert kappa == pytest.approx(oracle.curvature(CONFIG, float(speed), float(steering)), abs=1e-6)
-
-
-@given(speed=speeds, steering=steerings)
-def test_without_a_grip_limit_it_is_the_pure_model(speed, steering):
-    pure = constants(SimConfig(vehicle=VehicleConfig(lateral_grip=math.inf)))
-    beta = math.atan(1.25 / 2.5 * math.tan(float(steering)))
-    assert float(path_curvature(pure, F(speed), steering)) == pytest.approx(math.sin(beta) / 1.25, abs=1e-6)
-
-
-def kong(state: np.ndarray, steering: float, acceleration: float) -> np.ndarray:
-    """Kong et al. 2015, equations 1: derivatives of x, y, psi, v."""
-    _, _, psi, v = state
-    beta = math.atan(1.25 / 2.5 * math.tan(steering))
-    return np.array([v * math.cos(psi + beta), v * math.sin(psi + beta), v / 1.25 * math.sin(beta), acceleration])
-
-
-@settings(max_examples=50)
-@given(speed=st.floats(0.0, 29.5, width=32), steering=steerings, acceleration=st.sampled_from([0.0, 3.0]))
-def test_advance_solves_kongs_equations(speed, steering, acceleration):
-    state, h = np.array([0.0, 0.0, 0.0, float(speed)]), DT / 20
-    for _ in range(20):  # Runge and Kutta's fourth order
-        k1 = kong(state, steering, acceleration)
-        k2 = kong(state + h / 2 * k1, steering, acceleration)
-        k3 = kong(state + h / 2 * k2, steering, acceleration)
-        k4 = kong(state + h * k3, steering, acceleration)
-        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    pure = constants(SimConfig(vehicle=VehicleConfig(lateral_grip=math.inf)))
-    car = Driver(speed=speed, steering=steering, k=pure)
-    car.step(acceleration)
-    assert (car.x[-1], car.y[-1], car.heading[-1], car.speed) == pytest.approx(tuple(state), abs=2e-5)
 
 
 @given(speed=speeds, steering=steerings, heading=st.floats(-math.pi, math.pi), action=actions)
@@ -247,25 +199,6 @@ def test_a_period_is_the_oracles(speed, steering, heading, action):
     assert float(after) == pytest.approx(expected.speed, abs=1e-5)
     turn = math.remainder(math.atan2(sine, cosine) - looks[-1, 2], 2 * math.pi)
     assert abs(turn) < tolerance
-
-
-@given(speed=speeds, steering=steerings, parts=st.integers(2, 6))
-def test_one_period_is_as_many_parts_as_one_likes(speed, steering, parts):
-    kappa = path_curvature(K, F(speed), steering)
-    state: tuple[np.float32, ...] = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
-    whole = advance(K, *state, F(0.0), kappa, K.dt)[:5]
-    for _ in range(parts):
-        state = tuple(map(F, advance(K, *state, F(0.0), kappa, F(K.dt / parts))[:5]))
-    assert np.array(state) == pytest.approx(np.array(whole, dtype=F), abs=1e-5)
-
-
-@given(speed=st.floats(-3.0, 3.0, width=32), steering=steerings)
-def test_there_and_back_is_where_it_was(speed, steering):
-    kappa = path_curvature(K, F(speed), steering)
-    state = (F(1.0), F(2.0), F(0.6), F(0.8), F(speed))
-    x, y, cosine, sine, *_ = advance(K, *state, F(0.0), kappa, K.dt)
-    back = advance(K, F(x), F(y), F(cosine), F(sine), F(-speed), F(0.0), kappa, K.dt)
-    assert np.array(back[:4]) == pytest.approx(np.array(state[:4]), abs=2e-6)
 
 
 @given(taken=st.lists(actions, min_size=1, max_size=40), speed=speeds)
