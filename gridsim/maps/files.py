@@ -65,27 +65,17 @@ SHORTEST_SIDE = 16  # m
 
 @dataclass(frozen=True)
 class MapFile:
-    """The contents of a map file.
-
-    Attributes:
-        image: the picture's path.
-        resolution: m a pixel.
-        origin: x, y (m) of the picture's lower left corner in the file's own coordinates.
-        negate: whether dark pixels are road.
-        free_thresh: darkness, 0 to 1, below which a pixel is road.
-        starts: rows of x, y (m, the file's coordinates), heading (rad, NaN: along the road); empty: chosen by us.
-        torus: whether leaving on one side means entering on the other.
-        speed: m/s, the speed interval.
-    """
+    """The contents of a map file."""
 
     image: Path
-    resolution: float = 1.0 / PIXELS_PER_M
-    origin: tuple[float, float] = (0.0, 0.0)
-    negate: bool = False
-    free_thresh: float = 0.5
+    resolution: float = 1.0 / PIXELS_PER_M  # m a pixel
+    origin: tuple[float, float] = (0.0, 0.0)  # m, the picture's lower left corner in the file's own coordinates
+    negate: bool = False  # whether dark pixels are road
+    free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
+    # x, y (m, the file's coordinates), heading (rad, NaN: along the road); without any, starts are chosen by us.
     starts: tuple[tuple[float, float, float], ...] = ()
-    torus: bool = False
-    speed: tuple[float, float] = FILE_SPEEDS
+    torus: bool = False  # whether leaving on one side means entering on the other
+    speed: tuple[float, float] = FILE_SPEEDS  # m/s, the speed interval
 
 
 def load_map(name: str, config: SimConfig | None = None) -> Map:

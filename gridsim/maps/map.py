@@ -27,26 +27,16 @@ from gridsim.maps.roads import (
 
 @dataclass(frozen=True)
 class Map:
-    """One map.
+    """One map."""
 
-    Attributes:
-        name: its scenario's name, or a file's path.
-        seed: the seed it was built from.
-        road: the drivable area as kernels read it.
-        lanes: directed polylines, for starts, traffic and drivers.
-        strips: the exact drivable area, for pictures and tests.
-        network: the lanes as traffic's kernels read them.
-        torus: whether leaving on one side means entering on the other.
-        starts: float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
-    """
-
-    name: str
-    seed: int
+    name: str  # its scenario's, or a file's path
+    seed: int  # that it was built from
     road: Road
-    lanes: Lanes
-    strips: Strips
-    network: Network
-    torus: bool = True
+    lanes: Lanes  # for starts, traffic and drivers
+    strips: Strips  # the exact drivable area, for pictures and tests
+    network: Network  # the lanes as traffic's kernels read them
+    torus: bool = True  # whether leaving on one side means entering on the other
+    # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
 
     @cached_property
