@@ -115,9 +115,8 @@ def _sample(paths: Sequence[Path], steps: np.ndarray, offsets: np.ndarray) -> tu
     return _sample_pieces(starts, pieces, np.cumsum([0, *(len(path.pieces) for path in paths)]), steps, offsets)
 
 
-def _away(one: np.ndarray, other: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """From each of points [n, 2] to each of points [m, 2], the short way on the torus: [n, m, 2]."""
-    away = other - one[:, None]
+def _wrapped(away: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """Differences [..., 2] of points, the short way on the torus."""
     return away - np.round(away / sides) * sides
 
 
@@ -150,8 +149,12 @@ def _crossings(points: np.ndarray, offsets: np.ndarray, related: np.ndarray, sid
     middle = points[(offsets[:-1] + offsets[1:]) // 2]
     distance = np.hypot(*(points - np.repeat(middle, np.diff(offsets), axis=0)).T)
     radius = np.maximum.reduceat(distance, offsets[:-1])
-    apart = np.hypot(*np.moveaxis(_away(middle, middle, sides), 2, 0)) - radius - radius[:, None]
+    away = _wrapped(middle - middle[:, None], sides)
+    apart = np.hypot(away[..., 0], away[..., 1]) - radius - radius[:, None]
     one, other = np.nonzero(np.triu(~related & (apart < CROSSING_GAP + _SAME)))
+    first = points[offsets[:-1]]
+    fork = (np.abs(_wrapped(first[other] - first[one], sides)) < _SAME).all(axis=1)
+    one, other = one[~fork], other[~fork]
     cross = np.zeros_like(related)
     cross[one, other] = _near_pairs(points, offsets, one, other, *sides)
     return cross | cross.T
@@ -175,16 +178,15 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(n, 3)
     turn = starts[:, 2] - ends[:, None, 2]
     same_way = np.abs(turn - np.round(turn / (2 * math.pi)) * (2 * math.pi)) < _SAME
-    follows = same_way & (np.abs(_away(ends[:, :2], starts[:, :2], sides)) < _SAME).all(axis=2)
+    follows = same_way & (np.abs(_wrapped(starts[:, :2] - ends[:, None, :2], sides)) < _SAME).all(axis=2)
     if not follows.any(axis=1).all():
         raise ValueError("a lane must end where another begins")
     successors = np.full((n, FORKS), -1, dtype=np.int32)
     one, other = np.nonzero(follows)
     successors[one, np.arange(len(one)) - np.searchsorted(one, one)] = other
     index = np.arange(n, dtype=np.int32)
-    fork = (np.abs(_away(starts[:, :2], starts[:, :2], sides)) < _SAME).all(axis=2)
     neighbours = index[:, None] // abreast == index // abreast
-    cross = _crossings(points, offsets, fork | neighbours | follows | follows.T, sides)
+    cross = _crossings(points, offsets, neighbours | follows | follows.T, sides)
     return Lanes(
         points=points,
         offsets=offsets,

@@ -187,9 +187,9 @@ def _clearance_nodes(lines, arcs, columns, rows):
 def _pack(nodes: np.ndarray) -> np.ndarray:
     """Pack clearance (m) [rows, columns] into the four-corner words that `clearance` reads."""
     units = (nodes - _F(FIELD_FLOOR)) * _F(FIELD_UNITS) + _F(0.5)
-    here = np.clip(units, 0.0, 255.0).astype(np.uint32)
-    above = np.roll(here, -1, axis=0)
-    return (here | np.roll(here, -1, axis=1) << 8 | above << 16 | np.roll(above, -1, axis=1) << 24).ravel()
+    here = np.clip(units, 0.0, 255.0).astype(np.uint8)
+    right, above = np.roll(here, -1, axis=1), np.roll(here, -1, axis=0)
+    return np.stack([here, right, above, np.roll(right, -1, axis=0)], axis=-1).view("<u4").ravel()
 
 
 def _rows_on_road(nodes: np.ndarray) -> np.ndarray:

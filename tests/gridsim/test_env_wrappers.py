@@ -27,7 +27,7 @@ from gridsim.view.render import NoDisplayError
 
 F = np.float32
 KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing._reward, grid._fill_grids]
-KERNELS += [episodes._draw, map._starts_at]
+KERNELS += [grid._push_frames, episodes._draw, map._starts_at]
 
 
 # --- pictures

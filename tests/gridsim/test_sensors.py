@@ -111,16 +111,6 @@ def strip_road(lines=(), arcs=(), side=64.0):
     return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), REACH), oracle.ExactRoad(strips, side, side)
 
 
-def test_rays_on_a_ring():
-    road, exact = strip_road(arcs=[[32, 32, 16, 0.0, 2 * math.pi, 4.0]])
-    angle = np.linspace(0.0, 2 * math.pi, 50)
-    points = np.stack([32 + 17 * np.cos(angle), 32 + 17 * np.sin(angle)], axis=1).astype(F)
-    headings = angle + math.pi / 2
-    true = exact.cast(points, headings[:, None] + RAYS, REACH)
-    assert np.ptp(true, axis=0).max() < 1e-4  # it looks the same from everywhere, save for rounding of the point
-    assert np.quantile(np.abs(look(road, points, headings) - true), 0.99) < 0.1
-
-
 @pytest.mark.parametrize(
     ("half", "wall", "thin"),
     [
