@@ -47,12 +47,6 @@ def same(run, reference):
     return True
 
 
-def test_network_is_the_same_on_workers(reference, tmp_path):
-    done = dqn("--workers", "2", "--name", "w", *SMALL, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert same(tmp_path / "runs/w", reference)
-
-
 def test_killed_workers_and_a_killed_process_change_nothing(reference, tmp_path):
     run = tmp_path / "runs/k"
     process = start("gridsim-dqn", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)

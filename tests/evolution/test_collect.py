@@ -287,6 +287,7 @@ def test_an_episode_depends_on_itself_alone(scenarios: list[Map], driver: np.nda
     changed = [to_bytes(a) != to_bytes(b) for a, b in zip(cut_up(whole), cut_up(others), strict=True)]
     assert not changed[0], "nothing is drawn for epsilon 0"
     assert all(changed[3:])
+    assert [len(array) for array in (*collect(*of.only([]))[0], collect(*of.only([]))[1])] == [0] * 5
 
 
 # --- What is refused -------------------------------------------------------------------------------------------------
@@ -301,8 +302,3 @@ def test_what_does_not_fit_is_refused(scenarios: list[Map], driver: np.ndarray) 
     ):
         with pytest.raises(ValueError, match=text):
             collect(*of._replace(**change))
-
-
-def test_no_episodes_no_rows(scenarios: list[Map], driver: np.ndarray) -> None:
-    experience, results = collect(*asked("mlp:6,7", scenarios, driver, 4, 0.5, 0).only([]))
-    assert len(results) == len(experience.actions) == 0
