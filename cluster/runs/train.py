@@ -146,6 +146,8 @@ def train(
             session.finish(workers.number)
         status = "FINISHED"
         return session
+    except SystemError as error:  # what Ray makes of a signal where it waits
+        raise error.__cause__ or error from None
     except Exception:
         status = "FAILED"
         raise
