@@ -60,7 +60,7 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("mlflow")
     begun = Tracker(Identity(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {}))
-    begun.wait_ready(60)
+    begun.wait_ready(300)
     assert begun.close("FINISHED") is None
     assert os.listdir(folder) == ["mlflow.db"]
     return folder / "mlflow.db"

@@ -1,0 +1,77 @@
+"""A run's lifecycle: how it ends in MLflow, and what its caller is shown."""
+
+import pytest
+from tracked import client, steps
+
+from cluster.runs import train
+from cluster.runs.run import new_run, open_run, read_config
+from cluster.runs.settings import EvolveSettings
+from cluster.tracking.address import check_uri
+
+SETTINGS = EvolveSettings("curved", policy="mlp:4", population=8, generations=2)
+
+
+class Notes(train.Reporter):
+    """Keeps what it is shown."""
+
+    def __init__(self):
+        self.seen = []
+
+    def row(self, steps, row):
+        self.seen.append(steps)
+
+    def stopping(self):
+        self.seen.append("stopping")
+
+    def unsent(self, text, finished):
+        self.seen.append("finished" if finished else text)
+
+
+def interrupted_ray():
+    raise SystemError from KeyboardInterrupt()
+
+
+def end(error):
+    def finish(session, workers):
+        if isinstance(error, type):
+            raise error
+        if error:
+            error()
+
+    return finish
+
+
+@pytest.mark.parametrize(
+    ("error", "raised", "status", "shown"),
+    [
+        (None, None, "FINISHED", []),
+        (KeyboardInterrupt, KeyboardInterrupt, "KILLED", ["stopping"]),
+        (interrupted_ray, KeyboardInterrupt, "KILLED", ["stopping"]),
+        (MemoryError, MemoryError, "FAILED", []),
+    ],
+)
+def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raised, status, shown):
+    monkeypatch.setattr(train.Session, "finish", end(error))
+    run, notes = new_run(tmp_path, "r", SETTINGS), Notes()
+    workers = train.Workers(0, None, 0.0, "r")
+    if raised:
+        with pytest.raises(raised):
+            train.train(run, workers, uri, "driving", notes)
+    else:
+        assert train.train(run, workers, uri, "driving", notes).learning.steps == 2
+    assert notes.seen == [1, 2, *shown]
+    assert read_config(run.path / "config.json")[0] == SETTINGS
+    (found,) = client(uri).search_runs([client(uri).get_experiment_by_name("driving").experiment_id])
+    assert found.info.status == status
+    assert steps(uri, found.info.run_id, ["leader/success_rate"]) == [0, 1]
+    assert open_run(run.path).tracking_key == found.data.tags["gridsim.key"]
+
+
+def test_what_could_not_be_sent_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(train.Session, "finish", end(None))
+    (tmp_path / "text.db").touch()
+    notes = Notes()
+    uri = check_uri(f"sqlite:///{tmp_path}/text.db")
+    (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
+    train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0, "r"), uri, "driving", notes)
+    assert notes.seen == [1, 2, "finished"]
