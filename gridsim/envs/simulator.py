@@ -73,7 +73,7 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
     Cars are taken in `order`; runs int64 [maps, 3] says which map of the atlas a stretch of it is on: row, from, to.
     seen: ranges and closing speeds [n, rays], speeds [n] and progress [n], to be filled.
     """
-    constants = physics.constants
+    constants, drivers = physics.constants, physics.drivers
     ranges, closing, speeds, progress = seen
     beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
@@ -88,9 +88,8 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 else:
                     acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
                 ends[i] = step_car(
-                    road, network, constants, physics.drivers, car, visits[i], world, acceleration, steering, target,
-                    max_steps,
-                )  # fmt: skip
+                    road, network, constants, drivers, car, visits[i], world, acceleration, steering, target, max_steps
+                )
             progress[i] = car[DISTANCE] - before
             look(road, constants, physics.fan, car, world, beams, ranges[i], closing[i])
             speeds[i] = car[SPEED]
@@ -201,10 +200,8 @@ class Simulator:
         state = self.state
         if traffic is not None:
             state.worlds[cars] = traffic
-        _place_all(
-            self._kernel_physics(), *_by_map(rows), cars, starts, state.cars, state.visits, self._kernel_worlds(),
-            ranges, self.closing,
-        )  # fmt: skip
+        physics, around = self._kernel_physics(), self._kernel_worlds()
+        _place_all(physics, *_by_map(rows), cars, starts, state.cars, state.visits, around, ranges, self.closing)
         state.maps[cars] = maps
         state.ends[cars] = End.RUNNING
         if (self._rows[cars] != rows).any():
@@ -269,10 +266,11 @@ class Simulator:
         actions = checked_actions(actions, n)
         ranges = np.empty_like(self.closing)
         speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)
+        physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
+        seen = ranges, self.closing, speeds, progress
         _control_all(
-            self._kernel_physics(), *self._groups, actions, np.float32(self.target), self.max_steps, state.cars,
-            state.visits, self._kernel_worlds(), state.ends, (ranges, self.closing, speeds, progress),
-        )  # fmt: skip
+            physics, *self._groups, actions, target, self.max_steps, state.cars, state.visits, around, state.ends, seen
+        )
         return ranges, speeds, progress, state.ends.copy()
 
 

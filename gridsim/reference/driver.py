@@ -218,8 +218,7 @@ def drive_reference(
     own = traffic._replace(acceleration=_F(ACCELERATION), comfort=_F(BRAKING), headway=_F(_HEADWAY))
     poses, arc = np.empty((max_steps, 5), np.float32), np.empty(max_steps, np.float32)
     actions = np.empty(max_steps, np.int64)
-    car, steps, end = _drive(
-        road_map.road, road_map.network, constants(sim), traffic, own, route, np.asarray(start, dtype=np.float32),
-        np.float32(target), max_steps, np.array(world, dtype=np.float32), poses, arc, actions,
-    )  # fmt: skip
+    start, world, limit = np.asarray(start, dtype=np.float32), np.array(world, dtype=np.float32), np.float32(target)
+    road, network, k = road_map.road, road_map.network, constants(sim)
+    car, steps, end = _drive(road, network, k, traffic, own, route, start, limit, max_steps, world, poses, arc, actions)
     return ReferenceDrive(poses[:steps], arc[:steps], actions[:steps], car, End(end), route)

@@ -93,10 +93,12 @@ def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_pa
     env: Any
     if vector:
         env = gymnasium.make_vec("GridSim/Highway-v0", num_envs=2, **options)
-        env = wrappers.RecordVideo(env, str(tmp_path), video_aspect_ratio=(2, 1), episode_trigger=lambda _: True)
+        env = wrappers.RecordVideo(
+            env, str(tmp_path / "films"), video_aspect_ratio=(2, 1), episode_trigger=lambda _: True
+        )
     else:
         env = gymnasium.make("GridSim/Highway-v0", **options)
-        env = RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True)
+        env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
     env.reset(seed=0)
     for step in range(6 + 1 + 4):  # an episode, the step or reset that begins the next one, and some of that one
         if step == 6 and not vector:
@@ -105,7 +107,7 @@ def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_pa
             env.step(np.full(2, Action.ACCELERATE) if vector else int(Action.ACCELERATE))
     env.close()
     films = []
-    for path in sorted(tmp_path.glob("*.mp4")):
+    for path in sorted((tmp_path / "films").glob("*.mp4")):
         reader = imageio_ffmpeg.read_frames(str(path))
         films.append((next(reader)["fps"], imageio_ffmpeg.count_frames_and_secs(str(path))[0]))
         reader.close()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import oracle
 import pytest
+from pictures import crashed
 
 from gridsim.car.ego import (
     COS,
@@ -21,7 +22,6 @@ from gridsim.car.ego import (
     End,
     X,
     Y,
-    collides,
     drive,
     look,
     place,
@@ -209,7 +209,8 @@ def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
     points = rng.uniform(0.0, SIDE, (40_000, 2))
     points = points[exact[seed].clearance(points) > 0.8][:5000]
     poses = np.column_stack([points, rng.uniform(-math.pi, math.pi, len(points))]).astype(F).astype(float)
-    hit = np.array([collides(scenarios[seed].road, K, F(x), F(y), F(math.cos(h)), F(math.sin(h))) for x, y, h in poses])
+    hit = np.empty(len(poses), dtype=np.bool_)
+    crashed(scenarios[seed].road, K, poses.astype(F), hit)
     assert 0.1 < hit.mean() < 0.5
 
     def on_road(margin):
