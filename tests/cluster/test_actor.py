@@ -47,7 +47,7 @@ def test_the_store_keeps_a_bounded_number_of_maps_and_a_worker_gets_each_once() 
         assert len(refs) == 1 + len(new)
 
 
-def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps() -> None:
+def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_are_gone() -> None:
     task, maps = drive_task()
     recipes = make_recipes(20)
     wanted = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes).results
@@ -59,6 +59,8 @@ def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps() -> None:
     first = run(1, slice(0, 8), MAPS, (), task, *(each.arrays() for each in maps))
     assert np.concatenate([first, run(1, slice(8, 20))]).tobytes() == wanted.tobytes()
     assert run(2, slice(0, 20), (), (), task).tobytes() == wanted.tobytes()
+    with pytest.raises(KeyError):  # it forgets maps when it is to
+        run(3, slice(0, 20), (), MAPS, task)
 
 
 def test_a_chunk_of_another_task_is_refused() -> None:
