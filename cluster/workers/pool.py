@@ -25,7 +25,8 @@ Progress = Callable[[int, int], None]  # (members done, members in all), or epis
 Meanwhile = Callable[[], bool | None]  # called while workers are busy, again and again until it returns a false value
 
 SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
-METRE_S = 3e-5  # seconds that a metre of an episode takes, before it is measured: a large network's, on the safe side
+METRE_S = 1e-6  # seconds that a metre of an episode takes a small network
+UNMEASURED_METRE_S = 3e-5  # what Ray's workers are taken to need before it is measured: large networks are slower
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to receive its results
 CHUNK_S = 0.0004  # of the coordinator's time, for a chunk and its results: many workers get larger chunks
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker

@@ -29,7 +29,7 @@ import numpy as np
 from cluster.workers.actor import Actor, Name, Shared
 from cluster.workers.dispatch import MAX_KILLS, Dispatch
 from cluster.workers.pool import (
-    METRE_S,
+    UNMEASURED_METRE_S,
     BuildMap,
     Chunk,
     Collected,
@@ -146,7 +146,9 @@ class RayPool(WorkerPool):
         started = time.perf_counter()
         self._wait_for_ray()
         kind, collecting = (type(task), task.limits), isinstance(task, CollectTask)
-        parts = cut(task, asked, self._asked * (FINER if collecting else 1), self._metre_s.get(kind, METRE_S))
+        parts = cut(
+            task, asked, self._asked * (FINER if collecting else 1), self._metre_s.get(kind, UNMEASURED_METRE_S)
+        )
         dispatch = Dispatch(parts, collecting)
         self._serial += 1
         task_ref, call.broadcast_bytes = self._shared.put(task)

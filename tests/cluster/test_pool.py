@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from cluster.workers.pool import (
     CHUNK_S,
+    UNMEASURED_METRE_S,
     WORTH_SENDING_S,
     Chunk,
     PoolError,
@@ -170,8 +171,8 @@ def test_chunks_let_no_worker_wait_for_the_slowest(workers: int, n: int, episode
 def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
     """Of a large network, 1 ms a metre, before any of it is measured."""
     task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for part in cut(task, rectangle(10_000, 2), 2)) * 1e-3 < 20
-    assert len(cut(task, rectangle(512, 2), 2)) < 40, "as few as a small network needs"
+    assert max(metres(task, part) for part in cut(task, rectangle(10_000, 2), 2, UNMEASURED_METRE_S)) * 1e-3 < 20
+    assert len(cut(task, rectangle(512, 2), 2, UNMEASURED_METRE_S)) < 40, "as few as a small network needs"
 
 
 def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
