@@ -12,10 +12,9 @@ import numpy as np
 
 from cluster.runs.champion import Champion, evaluate, load_champion
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
-from cluster.runs.train import new_learning
+from cluster.runs.train import Workers, new_learning
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
-from cluster.workers.pool import SerialPool, WorkerPool
 from gridsim.config import SimConfig
 
 __all__ = ["Champion", "DqnSettings", "EvolveSettings", "evaluate", "evolve", "load_champion", "train_dqn"]
@@ -68,15 +67,9 @@ def train_dqn(
 def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:
     settings.check()
     maps = Maps(settings.scenario, SimConfig())
-    pool: WorkerPool
-    if workers:
-        from cluster.workers.ray_pool import RayPool
-
-        pool = RayPool(workers, maps.build)
-    else:
-        pool = SerialPool(maps.build)
+    team = Workers(workers, address=None, patience_s=0.0)
     try:
-        learning = new_learning(settings, pool, maps)
+        learning = new_learning(settings, team.open(maps), maps)
         if fitness is not None and isinstance(learning, Evolution):
             learning.score = fitness
         while not learning.done():
@@ -89,5 +82,5 @@ def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness:
         champion = Champion(genome, settings.policy, settings.scenario, learning.sim, settings.traffic)
         return champion, learning.history
     finally:
-        pool.close()
+        team.close()
         maps.close()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
+import json
 import os
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import tyro
@@ -21,16 +21,19 @@ from cluster.commands.common import (
     FAILED,
     INTERRUPTED,
     TERMINATED,
+    RoadFlags,
     Stopped,
     UsageError,
+    WorkFlags,
     called,
-    cores,
+    check_unchanged,
     fail,
     main,
     parse,
     stoppable,
     typed,
     warn_of_crowd,
+    wrong_use,
 )
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
 from gridsim.errors import GridSimError
@@ -40,32 +43,11 @@ if TYPE_CHECKING:
     from cluster.runs.run import RunFolder
     from cluster.runs.train import Session
 
-REMOVED = {
-    "islands": "a run has one population; use --recombination all, the default, which needs no others",
-    "island-car-steps": "a run has one population; use --car-steps for its budget",
-    "parents": "the mating pool of --recombination two has a fixed size; use --tournament for selection pressure",
-    "crossover": "all children of --recombination two have two parents; use --recombination",
-    "bump-rate": "mutation is Gaussian; use --sigma for its size",
-    "ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
-}
-"""Flags of gridsim-evolve that version 0.1 had, and what takes their place."""
-REMOVED_FROM_DQN = {
-    "prioritised": "transitions are drawn uniformly; drawing them by their errors gained nothing",
-    "double": "the DQN is always a double DQN",
-    "n-step": "targets have one step of rewards; more gained nothing",
-}
-REMOVED_FROM_DQN |= {f"no-{flag}": REMOVED_FROM_DQN[flag] for flag in ("prioritised", "double")}
-"""Flags of gridsim-dqn that version 0.2 had, and why they went."""
-
 
 @dataclass(frozen=True)
-class RunFlags:
-    """Where a learner's run is computed, kept and logged."""
+class RunFlags(WorkFlags):
+    """Which run it is, and where it is computed, kept and logged."""
 
-    workers: int = field(default_factory=cores)
-    """Worker processes; 0 evaluates in this process."""
-    output: str = "runs"
-    """Folder in which the run's folder is made."""
     name: str = ""
     """Name of the run; by default made of scenario, algorithm, seed and time."""
     resume: str = ""
@@ -74,14 +56,6 @@ class RunFlags:
     """A run's config.json: repeat that run; flags beside it change it."""
     init: str = ""
     """A champion.npz, or a run's folder, to start from in place of random networks."""
-    address: str = ""
-    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
-    patience: float = 0.0
-    """Seconds to wait for workers when there are none; 0: 300 on a cluster, else 60. Then it stops, to be resumed."""
-    tracking_uri: str = ""
-    """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
-    experiment: str = "gridsim"
-    """MLflow's experiment."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +65,16 @@ class EvolveFlags(RunFlags, EvolveSettings):
     The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
     curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
+
+    #: Flags that version 0.1 had, and what takes their place.
+    removed: ClassVar[dict[str, str]] = {
+        "--islands": "a run has one population; use --recombination all, the default, which needs no others",
+        "--island-car-steps": "a run has one population; use --car-steps for its budget",
+        "--parents": "the mating pool of --recombination two has a fixed size; use --tournament for selection pressure",
+        "--crossover": "all children of --recombination two have two parents; use --recombination",
+        "--bump-rate": "mutation is Gaussian; use --sigma for its size",
+        "--ranking": "members are ranked by their fitness alone; from Python, give a fitness of your own",
+    }
 
 
 @dataclass(frozen=True)
@@ -102,24 +86,25 @@ class DqnFlags(RunFlags, DqnSettings):
     depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
+    #: Flags that version 0.2 had, and why they went.
+    removed: ClassVar[dict[str, str]] = {
+        **dict.fromkeys(("--prioritised", "--no-prioritised"), "transitions are drawn uniformly, which does as well"),
+        **dict.fromkeys(("--double", "--no-double"), "the DQN is always a double DQN"),
+        "--n-step": "targets have one step of rewards; more gained nothing",
+    }
+
 
 Flags = EvolveFlags | DqnFlags
 
 
 @dataclass(frozen=True)
-class EvaluateFlags:
+class EvaluateFlags(RoadFlags):
     """Drive a champion through episodes on maps it never saw, and say how good it is."""
 
     champion: tyro.conf.Positional[str]
     """A champion.npz, or a run's folder."""
-    scenario: str = ""
-    """Road to drive on; by default the one it learned on."""
-    traffic: int = -1
-    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
     episodes: int = 64
     """How many; the default 64 are the held-out episodes of every run."""
-    seed: int = 2_000_000
-    """Seed of the first map; those of held-out maps begin at 2,000,000."""
     errors: bool = False
     """Also its velocity and steering errors against the reference driver."""
     reference: str = ""
@@ -131,15 +116,10 @@ class EvaluateFlags:
 def process_age_s() -> float:
     """Seconds since this process was started (0 where the system does not tell)."""
     try:
-        with open("/proc/self/stat", encoding="ascii") as file:
-            ticks = float(file.read().rsplit(")", 1)[1].split()[19])
-        with open("/proc/uptime", encoding="ascii") as file:
-            return max(0.0, float(file.read().split()[0]) - ticks / os.sysconf("SC_CLK_TCK"))
-    except (OSError, ValueError, IndexError):
+        ticks = Path("/proc/self/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[19]
+        return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - float(ticks) / os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, IndexError, AttributeError):
         return 0.0
-
-
-# ------------------------------------------------------------------------------------------------------------- learn
 
 
 def evolve_main() -> None:
@@ -157,44 +137,24 @@ def _learn_main(kind: type[Flags]) -> None:
     main(kind.command, lambda: _learn(kind, sys.argv[1:], started))
 
 
-def _given(arguments: Sequence[str], flag: str) -> str:
-    """A flag's value, looked up before the real parsing (whose defaults depend on it)."""
-    value = ""
-    for k, argument in enumerate(arguments):
-        if argument == flag and k + 1 < len(arguments):
-            value = arguments[k + 1]
-        elif argument.startswith(flag + "="):
-            value = argument[len(flag) + 1 :]
-    return value
-
-
 def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
-    """Flags and the run's folder, checked; nothing is written yet. Raises UsageError, SettingsError."""
+    """Flags and the run's folder, checked; nothing is written yet. Raises GridSimError."""
     from cluster.runs import run as runs
     from cluster.runs.champion import load_champion
-    from cluster.runs.checkpoint import CheckpointError
     from evolution.networks.policy import PolicySpec
 
     prog = kind.command
-    removed = REMOVED if kind is EvolveFlags else REMOVED_FROM_DQN
-    for argument in arguments:
-        flag = argument.partition("=")[0].removeprefix("--").replace("_", "-")
-        if argument.startswith("--") and flag in removed:
-            raise UsageError(f"--{flag} was removed: {removed[flag]}")
-    resume, config = _given(arguments, "--resume"), _given(arguments, "--config")
-    if {"-h", "--help"} & set(arguments) or not (resume or config):
-        flags = parse(kind, prog, arguments)
-    elif resume and config:
+    base: Flags | None = None
+    flags = parse(kind, prog, arguments)
+    resume, config = flags.resume, flags.config
+    if resume and config:
         raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
-    else:
-        try:
-            if resume:
-                run = runs.open_run(Path(resume))
-                settings, init = run.settings, run.init
-            else:
-                settings, init = runs.read_config(Path(config))
-        except runs.RunError as error:
-            raise UsageError(str(error)) from error
+    if resume:
+        run = runs.open_run(Path(resume))
+        settings, init = run.settings, run.init
+    elif config:
+        settings, init = runs.read_config(Path(config))
+    if resume or config:  # they are the defaults
         if settings.command != prog:
             raise UsageError(f"{resume or config} is a run of {settings.command}; give it to that command")
         base = kind(**dataclasses.asdict(settings), init=init)
@@ -205,42 +165,25 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
         return _prepare(kind, [*arguments, "--traffic", "0"])
     check_workers(flags.workers, flags.address, flags.patience)
-    if resume:
+    if base and resume:
         flags = flags.extending(base)
-        for f in dataclasses.fields(kind):
-            if f.name in ("workers", "address", "patience", "tracking_uri", "experiment"):
-                continue
-            now, then = getattr(flags, f.name), getattr(base, f.name)
-            if f.name in kind.unbound and (now or math.inf) >= (then or math.inf):  # 0: any number
-                continue
-            if f.name == "output":
-                now, then = Path(now).resolve(), Path(then).resolve()
-            if now != then:
-                raise UsageError(
-                    f"--{f.name.replace('_', '-')} {now} contradicts the run's {then}; leave it out, or start a new run"
-                )
-        run.settings = settings_of(flags)
-        run.settings.check()
-        _check_device(flags)
-        return flags, run
+        free = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"}
+        check_unchanged(flags, base, free, kind.unbound, "run")
     settings = settings_of(flags)
     settings.check()
     _check_device(flags)
+    if resume:
+        run.settings = settings
+        return flags, run
     digest = ""
     if flags.init:
-        try:
-            champion = load_champion(flags.init)
-        except CheckpointError as error:
-            raise UsageError(f"--init {error}") from error
+        champion = load_champion(flags.init)
         if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
             raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
         if not np.isfinite(champion.genome).all():
             raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
         digest = champion.sha256
-    try:
-        return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
-    except runs.RunError as error:
-        raise UsageError(str(error)) from error
+    return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
 
 
 def _check_device(flags: Flags) -> None:
@@ -251,11 +194,8 @@ def _check_device(flags: Flags) -> None:
         try:
             device_of(flags.device)
         except ValueError as error:
-            if flags.resume:
-                raise UsageError(
-                    f"{flags.resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
-                ) from error
-            raise UsageError(f"--device {flags.device}: {error}") from error
+            there = f"{flags.resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
+            raise UsageError(there if flags.resume else f"--device {flags.device}: {error}") from error
 
 
 def settings_of(flags: Flags) -> RunSettings:
@@ -267,33 +207,30 @@ def settings_of(flags: Flags) -> RunSettings:
 def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
     prog = kind.command
     console = Console()
-    try:
-        flags, run = _prepare(kind, arguments)
-        from cluster.commands.progress import Progress
-        from cluster.runs.champion import load_champion
-        from cluster.runs.run import is_finished
-        from cluster.runs.train import Workers, send_missing, train, undisturbed
-        from cluster.tracking.address import check_uri
-        from cluster.workers.ray_session import check_address
+    flags, run = _prepare(kind, arguments)
+    from cluster.commands.progress import Progress
+    from cluster.runs.champion import load_champion
+    from cluster.runs.run import is_finished
+    from cluster.runs.train import Workers, send_missing, train, undisturbed
+    from cluster.tracking.address import check_uri
+    from cluster.workers.ray_session import check_address
 
-        if is_finished(run):
-            first = kind.counts[0]
-            sent, lost = send_missing(run, flags.tracking_uri, flags.experiment)
-            sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
-            console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
-            if lost:
-                print(f"{prog}: warning: {lost}", file=sys.stderr)
-            return 0
-        saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
-        uri = check_uri(flags.tracking_uri or saved or None)
-        address = flags.address or os.environ.get("RAY_ADDRESS") or None
-        if address and flags.workers:
-            address = check_address(address)
-    except GridSimError as error:
-        fail(prog, str(error))
+    if is_finished(run):
+        first = kind.counts[0]
+        sent, lost = send_missing(run, flags.tracking_uri, flags.experiment)
+        sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
+        console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
+        if lost:
+            print(f"{prog}: warning: {lost}", file=sys.stderr)
+        return 0
+    saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
+    uri = check_uri(flags.tracking_uri or saved or None)
+    address = flags.address or os.environ.get("RAY_ADDRESS") or None
+    if address and flags.workers:
+        address = check_address(address)
 
     warn_of_crowd(prog, flags.workers, flags.address)
-    made = _make_folder(prog, run)
+    made = _make_folder(run)
     workers = Workers(flags.workers, address, flags.patience)
     resume = f"{called(prog)} --resume {typed(run.path)}"
     again = f"continue with: {resume}"
@@ -342,15 +279,12 @@ def _show_end(console: Console, session: Session) -> None:
     )
 
 
-def _make_folder(prog: str, run: RunFolder) -> list[Path]:
+def _make_folder(run: RunFolder) -> list[Path]:
     """Make a run's folder and lock it. Returns the folders that were made for it, the innermost first."""
-    from cluster.runs.run import RunError, lock
+    from cluster.runs.run import lock
 
     made = [path for path in (run.path, *run.path.parents) if not path.exists()]
-    try:
-        lock(run.path)
-    except RunError as error:
-        fail(prog, str(error))
+    lock(run.path)
     return made
 
 
@@ -363,39 +297,32 @@ def _discard(made: list[Path]) -> None:
             path.rmdir()
 
 
-# ---------------------------------------------------------------------------------------------------------- evaluate
-
-
 def evaluate_main() -> None:
     """Entry point of `gridsim-evaluate`."""
-    prog = "gridsim-evaluate"
-    try:
-        flags = parse(EvaluateFlags, prog, sys.argv[1:])
-        from cluster.comparison.errors import errors
-        from cluster.runs.champion import evaluate, load_champion
-        from cluster.runs.checkpoint import CheckpointError
+    main("gridsim-evaluate", _evaluate)
 
-        try:
-            champion = load_champion(flags.champion)
-            traffic = None if flags.traffic == -1 else flags.traffic
-            chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
-            missed = None
-            if flags.errors or flags.reference:  # first: a wrong --reference is told at once
-                missed = errors(champion, *chosen, flags.reference or None).figures()
-            figures = evaluate(champion, *chosen)
-        except (CheckpointError, ValueError) as error:
-            fail(prog, str(error))
-        if flags.json:
-            import json
 
-            print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
-        else:
-            from cluster.report.pictures import errors_table, held_out_table
+def _evaluate() -> int:
+    flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
+    from cluster.comparison.errors import series
+    from cluster.report.pictures import errors_table, held_out_table
+    from cluster.runs.champion import evaluate, load_champion
+    from gridsim.reference.errors import combine
 
-            title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
-            Console().print(held_out_table(title, figures))
-            if missed is not None:
-                Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
-    except KeyboardInterrupt:
-        print(f"{prog}: stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    champion = load_champion(flags.champion)
+    traffic = None if flags.traffic == -1 else flags.traffic
+    chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
+    missed = None
+    with wrong_use():
+        if flags.errors or flags.reference:  # first, as a wrong --reference is found at once
+            parts = series(champion, *chosen, flags.reference or None)
+            missed = combine([part.errors(champion.sim.vehicle) for part in parts]).figures()
+        figures = evaluate(champion, *chosen)
+    if flags.json:
+        print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
+        return 0
+    title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
+    Console().print(held_out_table(title, figures))
+    if missed is not None:
+        Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
+    return 0

@@ -1,4 +1,4 @@
-"""What the commands share: reading the command line, failing in one clear line, stopping when told to."""
+"""What the commands share: reading the command line, failing in one clear line, stopping on Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ import difflib
 import gc
 import inspect
 import io
+import math
 import os
 import re
 import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 from docstring_parser import attrdoc
 
 from gridsim.errors import GridSimError
+from gridsim.maps.scenarios import HELD_OUT_SEED
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-CROWDED = 4  # workers to a core that are more than anybody means
+CROWDED = 4  # workers a core beyond which there is a warning
 
-# tyro wraps a docstring as a whole only where its lines are not indented, as those of fields are.
+# tyro wraps a field's docstring as a whole only where its lines are not indented.
 _constant = attrdoc.ast_get_constant_value
 attrdoc.ast_get_constant_value = lambda node: (
     " ".join(value.split()) if isinstance(value := _constant(node), str) else value
@@ -39,18 +41,61 @@ class UsageError(GridSimError):
     """Wrong use; the message is shown in one line."""
 
 
+class Failed(GridSimError):
+    """A failure of a command that was used rightly, which ends with 1; `hint` is a second line."""
+
+    def __init__(self, message: str, hint: str = ""):
+        super().__init__(message)
+        self.hint = hint
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class WorkFlags:
+    """Where runs are computed, kept and logged."""
+
+    workers: int = field(default_factory=cores)
+    """Worker processes; 0 evaluates in this process."""
+    output: str = "runs"
+    """Folder in which the new folder is made."""
+    address: str = ""
+    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
+    patience: float = 0.0
+    """Seconds to wait for workers when there are none; 0: 300 on a cluster, else 60. Then it stops, to be resumed."""
+    tracking_uri: str = ""
+    """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
+    experiment: str = "gridsim"
+    """MLflow's experiment."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoadFlags:
+    """Which road a champion drives on."""
+
+    scenario: str = ""
+    """Road to drive on; by default the one it learned on."""
+    traffic: int = -1
+    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
+    seed: int = HELD_OUT_SEED
+    """Seed of the first map; those of held-out maps begin at 2,000,000."""
+
+
 def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:
     """Read the command line. Ends the process: 0 after --help, 2 with a clear line for wrong use."""
     _check_flags(kind, prog, arguments)
     config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
-    read = partial(tyro.cli, kind, prog=prog, description=_about(kind), args=arguments, config=config)
+    given: dict[str, Any] = {} if default is None else {"default": default}
     printed = io.StringIO()
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.redirect_stderr(printed))
         if not {"-h", "--help"} & set(arguments):  # no terminal: tyro draws no box then, and uses no colours
             stack.enter_context(contextlib.redirect_stdout(printed))
         try:
-            return read() if default is None else read(default=default)
+            return tyro.cli(kind, prog=prog, description=_about(kind), args=arguments, config=config, **given)
         except SystemExit as stop:
             if not stop.code:
                 raise
@@ -60,15 +105,23 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
-    """Fail where a flag is none, with the one that is most like it."""
+    """Fail where a flag is unknown, with the one that is most like it, or what takes the place of a removed one."""
     fields = dataclasses.fields(kind)
-    known = [f"--{f.name.replace('_', '-')}" for f in fields if "Positional" not in str(f.type)]
+    known = [as_flag(f.name) for f in fields if "Positional" not in str(f.type)]
     for argument in arguments:
-        flag = argument.partition("=")[0].replace("_", "-")
-        if flag.startswith("--") and not {flag, flag.replace("--no-", "--")} & {"--", "--help", *known}:
-            like = difflib.get_close_matches(flag, known, 1)
-            meant = f"; did you mean {like[0]}?" if like else ""
-            fail(prog, f"unrecognized {flag}{meant}", f"see {called(prog)} --help")
+        flag = as_flag(argument.partition("=")[0].removeprefix("--"))
+        if not argument.startswith("--") or {flag, flag.replace("--no-", "--")} & {"--", "--help", *known}:
+            continue
+        if instead := getattr(kind, "removed", {}).get(flag):
+            raise UsageError(f"{flag} was removed: {instead}")
+        like = difflib.get_close_matches(flag, known, 1)
+        meant = f"; did you mean {like[0]}?" if like else ""
+        fail(prog, f"unrecognized {flag}{meant}", f"see {called(prog)} --help")
+
+
+def as_flag(name: str) -> str:
+    """A field's name as the command line has it."""
+    return f"--{name.replace('_', '-')}"
 
 
 def _about(kind: type) -> str:
@@ -76,6 +129,32 @@ def _about(kind: type) -> str:
     paragraphs = [*inspect.cleandoc(kind.__doc__ or "").split("\n\n"), "--version prints GridSim's version."]
     width = shutil.get_terminal_size().columns
     return "\n".join(textwrap.fill(text, width, initial_indent=" ", subsequent_indent=" ") for text in paragraphs)
+
+
+def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Collection[str], what: str) -> None:
+    """Raises UsageError where flags contradict what was asked of a run or comparison (`what`) that is continued.
+
+    Args: the fields that may differ, and those that may be greater, where 0 is any number.
+    """
+    for f in dataclasses.fields(before):
+        now, then = getattr(flags, f.name), getattr(before, f.name)
+        if f.name == "output":
+            now, then = Path(now).resolve(), Path(then).resolve()
+        if now == then or f.name in free or (f.name in may_grow and (now or math.inf) >= (then or math.inf)):
+            continue
+        now, then = (" ".join(value) if isinstance(value, tuple) else value for value in (now, then))
+        raise UsageError(
+            f"{as_flag(f.name)} {now} contradicts the {what}'s {then}; leave it out, or start a new {what}"
+        )
+
+
+@contextlib.contextmanager
+def wrong_use(flag: str = "") -> Iterator[None]:
+    """Take a ValueError of the simulator (of a map, its name, a number of episodes) for wrong use, of a flag."""
+    try:
+        yield
+    except ValueError as error:
+        raise UsageError(f"{flag} {error}".strip()) from error
 
 
 def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
@@ -97,11 +176,6 @@ def called(prog: str) -> str:
     folder = Path(sys.argv[0]).parent
     on_path = folder.resolve() in (Path(name).resolve() for name in os.get_exec_path())
     return prog if on_path or not (folder / prog).is_file() else typed(folder / prog)
-
-
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def warn_of_crowd(prog: str, workers: int, address: str) -> None:
@@ -134,8 +208,11 @@ def stoppable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def main(prog: str, body: Callable[[], int]) -> NoReturn:
-    """Run a command, which Ctrl-C and SIGTERM stop, and end this process with the code that `body` returns."""
+def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
+    """Run a command, which Ctrl-C and SIGTERM stop, and end this process with the code that `body` returns.
+
+    Errors for the user are shown in one line, and a second one if there is a hint for their kind.
+    """
     try:
         with stoppable():
             code = body()
@@ -144,6 +221,10 @@ def main(prog: str, body: Callable[[], int]) -> NoReturn:
         code = INTERRUPTED
     except Stopped:
         code = TERMINATED
+    except Failed as error:
+        fail(prog, str(error), error.hint, FAILED)
+    except GridSimError as error:
+        fail(prog, str(error), (hints or {}).get(type(error), ""))
     if code in (INTERRUPTED, TERMINATED):  # without waiting for threads that are still compiling, or starting Ray
         sys.stdout.flush()
         sys.stderr.flush()

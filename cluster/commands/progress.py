@@ -1,4 +1,4 @@
-"""Live progress of a run: a line on a terminal, plain lines elsewhere."""
+"""Live progress: a line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import sys
 import time
 from collections import deque
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
-from rich.progress import Progress as Live
-from rich.progress import ProgressColumn, Task
+from rich.live import Live
 from rich.text import Text
 
 from cluster.runs.train import Reporter
@@ -24,30 +23,50 @@ WINDOW_S = 10.0  # that the ETA is taken from, at least
 BAR = 10  # characters
 
 
-class Line(ProgressColumn):
-    """One line of the fields `head`, `facts` and `rest`. A terminal that is too narrow cuts off the rest first.
+class Line:
+    """A line on a terminal: `head`, `facts`, a bar and the time if there is a share done, and `rest`.
 
-    A bar and the time stand between facts and rest where the task has a total.
+    A terminal that is too narrow cuts off the rest first.
     """
 
-    def render(self, task: Task) -> Text:
-        line = Text(no_wrap=True, overflow="ellipsis").append(task.fields["head"], "bold")
-        line.append(f"  {task.fields['facts']}  ")
-        if task.total:
-            done = round(BAR * min(task.completed / task.total, 1.0))
+    def __init__(self, console: Console):
+        self.console = console
+        self.head = self.facts = self.rest = ""
+        self.share: float | None = None
+        self._started = time.perf_counter()
+        self._live = Live(get_renderable=self.text, console=console, transient=True)
+
+    def __enter__(self) -> Self:
+        if self.console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def text(self) -> Text:
+        """The line as it is now."""
+        line = Text(no_wrap=True, overflow="ellipsis").append(self.head, "bold").append(f"  {self.facts}  ")
+        if self.share is not None:
+            done = round(BAR * min(self.share, 1.0))
             line.append("━" * done, "bar.complete").append("━" * (BAR - done), "bar.back")
-            line.append(f"  {clock(task.elapsed or 0.0)}  ", "progress.elapsed")
-        return line.append(task.fields["rest"])
+            line.append(f"  {clock(time.perf_counter() - self._started)}  ", "progress.elapsed")
+        return line.append(self.rest)
 
 
-class Progress(Reporter):
+class Progress(Reporter, Line):
     """Shows how far a run is, its success and ETA, then distance, speed and car-steps per second.
 
     Args: the console; the command's name; the run's folder and how to resume it, as the user would type these.
     """
 
     def __init__(self, console: Console, prog: str, folder: str, resume: str):
-        self._console, self._prog, self._folder, self._resume = console, prog, folder, resume
+        super().__init__(console)
+        self._prog, self._folder, self._resume = prog, folder, resume
+        self._steps: deque[tuple[float, float, float]] = deque()  # when each ended, how far the run was, car-steps
+        self._printed = 0.0
+        self._text = ""
+        self.facts, self.rest = "success 0%  ETA -:--", "starting the workers"
 
     def warn(self, text: str) -> None:
         print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
@@ -56,54 +75,42 @@ class Progress(Reporter):
         self.warn(f"{text}; send it later with: {self._resume}" if finished else text)
 
     def compiling(self) -> AbstractContextManager[object]:
-        return self._console.status("compiling the simulator for this machine, once (some 10 s)")
+        return self.console.status("compiling the simulator for this machine, once (some 10 s)")
 
     def stopping(self) -> None:
         Console(stderr=True).print("stopping; a moment ...", style="dim")
 
-    def learning(self, session: Session) -> Progress:
-        console, self._learning = self._console, session.learning
-        self._live = console.is_terminal
-        done, total, _ = self._learning.way()
-        self._ends: deque[tuple[float, float, float]] = deque()  # of steps: when, how far, car-steps
-        self._printed = 0.0
-        self._facts, self._text = "success 0%  ETA -:--", ""
-        self._bar = Live(Line(), console=console, disable=not self._live, transient=True)
-        self._task = self._bar.add_task(
-            "learn", total=total or None, completed=int(done), head=way(self._learning), facts=self._facts,
-            rest="starting the workers",
-        )  # fmt: skip
+    def learning(self, session: Session) -> Self:
+        self._learning = session.learning
+        self._advance()
         settings = session.run.settings
-        verb = "continuing" if done else self._learning.verb
+        verb = "continuing" if self._learning.way()[0] else self._learning.verb
         what = f"{settings.policy} on {settings.scenario}, seed {settings.seed}"
-        console.print(f"{verb} {what} -> {self._folder}", soft_wrap=True)
+        self.console.print(f"{verb} {what} -> {self._folder}", soft_wrap=True)
         return self
 
-    def __enter__(self) -> Progress:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+    def _advance(self) -> None:
+        done, total, _ = self._learning.way()
+        self.head = way(self._learning)
+        self.share = int(done) / total if total else None
 
     def row(self, step: int, row: dict[str, float]) -> None:
         """So many steps are done."""
-        self._facts = f"success {row['validation/success_rate']:.0%}  ETA {self._eta(row['car_steps'])}"
-        self._text = f"{self._learning.describe(row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
-        head, now = way(self._learning), time.perf_counter()
-        done = int(self._learning.way()[0])
-        self._bar.update(self._task, completed=done, head=head, facts=self._facts, rest=self._text)
-        if not self._live and (now - self._printed > LINE_S or self._learning.done()):
+        self._advance()
+        self.facts = f"success {row['validation/success_rate']:.0%}  ETA {self._eta(row['car_steps'])}"
+        self.rest = self._text = f"{self._learning.describe(row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
+        now = time.perf_counter()
+        if not self.console.is_terminal and (now - self._printed > LINE_S or self._learning.done()):
             self._printed = now
-            self._console.print(f"{head}  {self._facts}  {self._text}", soft_wrap=True)
+            self.console.print(f"{self.head}  {self.facts}  {self._text}", soft_wrap=True)
 
     def _eta(self, car_steps: float) -> str:
         """When the first of the run's bounds is reached, as the latest steps went. It may be solved before."""
         now, (done, total, _) = time.perf_counter(), self._learning.way()
-        self._ends.append((now, done, car_steps))
-        while len(self._ends) > 2 and now - self._ends[1][0] >= WINDOW_S:
-            self._ends.popleft()
-        begun, *before = self._ends[0]
+        self._steps.append((now, done, car_steps))
+        while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:
+            self._steps.popleft()
+        begun, *before = self._steps[0]
         bounds = zip((total, self._learning.settings.car_steps), (done, car_steps), before, strict=True)
         ends = [(bound - here) / (here - there) for bound, here, there in bounds if bound and here > there]
         if not ends or now - begun < WINDOW_S:
@@ -112,14 +119,13 @@ class Progress(Reporter):
 
     def members(self, stage: str, done: int, total: int) -> None:
         """Part of a step is done."""
-        if self._live:
-            self._bar.update(self._task, rest=f"{stage} {done:{len(str(total))}}/{total}  {self._text}")
+        self.rest = f"{stage} {done:{len(str(total))}}/{total}  {self._text}"
 
     def note(self, text: str) -> None:
         """What happens after the last step."""
-        self._bar.update(self._task, rest=text)
-        if not self._live:
-            self._console.print(text)
+        self.rest = text
+        if not self.console.is_terminal:
+            self.console.print(text)
 
 
 def way(learning: Learning, bound: bool = True) -> str:

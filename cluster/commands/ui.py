@@ -9,7 +9,7 @@ import time
 from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, one_line
 from cluster.tracking.mlflow_run import run_tables
 
-# The server runs no jobs, and nobody is told that it runs.
+# The server runs no jobs.
 _ENVIRONMENT = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"}
 
 

@@ -10,14 +10,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import tyro
 from rich.console import Console
 
-from cluster.commands.common import INTERRUPTED, UsageError, called, fail, parse
-from cluster.report.film import SUFFIXES, Recording, VideoError, frames, others, picture, record, write_video
+from cluster.commands.common import Failed, RoadFlags, UsageError, called, main, parse, wrong_use
+from cluster.report.film import CODING, Recording, VideoError, frames, others, picture, record, write_video
 from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
 from cluster.runs.checkpoint import CheckpointError
@@ -27,18 +28,19 @@ from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
-from gridsim.maps.scenarios import HELD_OUT_SEED, build, check_name, default_traffic, label
+from gridsim.maps.scenarios import build, check_name, default_traffic, label
 from gridsim.traffic.world import spawn
-from gridsim.view.drive import DriveError, Recorder, drive, read_drive, replay
+from gridsim.view.drive import Recorder, drive, read_drive, replay
 from gridsim.view.render import NoDisplayError, Renderer, Window
 
-FILM_S = 60.0  # s of a film, unless told
+FILM_S = 60.0  # s of a film by default
 FOLLOW_S = 10.0  # s that an elite is watched before a newer one may take its place
 LINGER_S = 1.5  # s that the last picture of a drive stays
+WATCH, DRIVE = "gridsim-watch", "gridsim-drive"
 
 
 @dataclass(frozen=True)
-class WatchFlags:
+class WatchFlags(RoadFlags):
     """Watch a champion drive roads it never saw: in a window, or as a film.
 
     In the window: N goes on to the next road, Esc or Q ends.
@@ -53,12 +55,6 @@ class WatchFlags:
     history.csv and MLflow."""
     follow: bool = False
     """Watch the newest elite, while the run is still going."""
-    scenario: str = ""
-    """Road to drive on; by default the one it learned on."""
-    traffic: int = -1
-    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
-    seed: int = HELD_OUT_SEED
-    """Seed of the first map and of the starts; those of held-out maps begin at 2,000,000."""
     seconds: float = 0.0
     """Seconds of driving to show; by default all of a recorded drive, else 60 in a film and no limit in a window."""
     fps: int = 0
@@ -89,90 +85,79 @@ class DriveFlags:
     """Width x height of the window, in pixels."""
 
 
-@contextlib.contextmanager
-def _as_usage_error() -> Iterator[None]:
-    """What is wrong with a map or its name is the user's to put right."""
-    try:
-        yield
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Read `640x360`. Raises UsageError."""
-    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", text)
-    size = (int(match[1]), int(match[2])) if match else (0, 0)
-    if min(size) < 64 or max(size) > 4096 or size[0] % 2 or size[1] % 2:
-        raise UsageError(f"--size {text}: give width x height, even and from 64 to 4096, as in 640x360")
-    return size
-
-
-def _seconds(value: float) -> float:
-    """Raises UsageError for a time that is none."""
-    if not 0.0 <= value <= 36_000.0:
-        raise UsageError(f"--seconds must be 0 to 36,000, not {value:g}")
-    return value
-
-
-def _traffic(value: int, default: int) -> int:
-    """Raises UsageError for a number of cars that is none."""
-    if not -1 <= value <= MAX_TRAFFIC:
-        raise UsageError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {value}")
-    return default if value == -1 else value
+def _look(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
+    """Width and height in pixels, and seconds, infinite for 0. Raises UsageError for these or --traffic."""
+    match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
+    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not (64 <= min(width, height) <= max(width, height) <= 4096) or width % 2 or height % 2:
+        raise UsageError(f"--size {size}: give width x height, even and from 64 to 4096, as in 640x360")
+    if not 0.0 <= seconds <= 36_000.0:
+        raise UsageError(f"--seconds must be 0 to 36,000, not {seconds:g}")
+    if not -1 <= traffic <= MAX_TRAFFIC:
+        raise UsageError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {traffic}")
+    return (width, height), seconds or math.inf
 
 
 def _map(name: str, seed: int, config: SimConfig) -> tuple[Map, np.ndarray]:
     """A map and a start float32 [5] on it, both of this seed. Raises UsageError."""
-    with _as_usage_error():
+    with wrong_use():
         scenario = build(name, seed, config)
     return scenario, sample_starts(scenario, 1, np.random.default_rng(np.random.SeedSequence([seed, 7])))[0]
 
 
-# ------------------------------------------------------------------------------------------------------------- watch
+def watch_main() -> None:
+    """Entry point of `gridsim-watch`."""
+    hints: dict = {
+        NoDisplayError: "to write a film in place of a window: --output film.mp4",
+        UnfinishedError: "to watch it as it stands: --follow, or --generation N",
+    }
+    main(WATCH, _watch, hints)
 
 
-class Elites:
-    """The elite of each generation, of a DQN the network of each evaluation; of a run that is over, or still going."""
+def _watch() -> int:
+    flags = parse(WatchFlags, WATCH, sys.argv[1:])
+    if not 0 <= flags.fps <= 120:
+        raise UsageError(f"--fps must be 1 to 120, not {flags.fps}")
+    size, seconds = _look(flags.size or ("640x360" if flags.output else "960x640"), flags.seconds, flags.traffic)
+    if flags.scenario:
+        with wrong_use():
+            check_name(flags.scenario)
+    if flags.output:
+        _film(flags, size, seconds)
+    else:
+        _show(flags, size, seconds)
+    return 0
 
-    def __init__(self, folder: Path):
-        """Read the run's settings. Raises RunError."""
-        if not (folder / CONFIG).is_file():
-            raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
-        self.folder = folder
-        self.settings, _ = read_config(folder / CONFIG)
 
-    def changed(self) -> int:
-        """A number that changes with the checkpoint; 0 before there is one."""
-        try:
-            return (self.folder / CHECKPOINT).stat().st_mtime_ns
-        except OSError:
-            return 0
+def changed(run: Path) -> int:
+    """A number that changes with a run's checkpoint; 0 before there is one."""
+    try:
+        return (run / CHECKPOINT).stat().st_mtime_ns
+    except OSError:
+        return 0
 
-    def read(self) -> np.ndarray:
-        """Genomes float32 [generations, genes]. Raises CheckpointError."""
-        path, name = self.folder / CHECKPOINT, "elites"
-        if not path.is_file():
-            path, name = self.folder / ELITES, "genomes"
-        arrays, _ = checkpoint.load(path)
-        genomes = arrays.get(name)
-        genes = PolicySpec.parse(self.settings.policy).size
-        if genomes is None or genomes.dtype != np.float32 or genomes.shape[1:] != (genes,) or not len(genomes):
-            raise CheckpointError(f"{path}: its elites are no {self.settings.policy}")
-        return genomes
 
-    def get(self, generation: int | None) -> tuple[Champion, str]:
-        """The elite of a generation, or the newest, and what it is called. Raises CheckpointError, UsageError."""
-        genomes, settings = self.read(), self.settings
-        step = settings.counts[0]  # generation, or evaluation
-        number = len(genomes) - 1 if generation is None else generation
-        if not 0 <= number < len(genomes):
-            raise UsageError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
-        champion = Champion(genomes[number], settings.policy, settings.scenario, SimConfig(), settings.traffic)
-        return champion, f"elite of {step} {number}"
+def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
+    """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and what it is called.
+
+    Raises: RunError, CheckpointError, UsageError.
+    """
+    settings, _ = read_config(run / CONFIG)
+    path, name = (run / CHECKPOINT, "elites") if changed(run) else (run / ELITES, "genomes")
+    genomes = checkpoint.load(path)[0].get(name)
+    genes = PolicySpec.parse(settings.policy).size
+    if genomes is None or genomes.dtype != np.float32 or genomes.shape[1:] != (genes,) or not len(genomes):
+        raise CheckpointError(f"{path}: its elites are no {settings.policy}")
+    step = settings.counts[0]  # generation, or evaluation
+    number = len(genomes) - 1 if generation is None else generation
+    if not 0 <= number < len(genomes):
+        raise UsageError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
+    champion = Champion(genomes[number], settings.policy, settings.scenario, SimConfig(), settings.traffic)
+    return champion, f"elite of {step} {number}"
 
 
 def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
-    """Who is watched; asked again before each drive. Raises UsageError, RunError, CheckpointError."""
+    """Gives the champion or elite before each drive, with its title. Raises UsageError, RunError, CheckpointError."""
     source = Path(flags.source)
     if flags.generation is not None and flags.follow:
         raise UsageError("--generation and --follow exclude each other")
@@ -185,35 +170,37 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     if flags.generation is None and not flags.follow:
         champion = load_champion(source)
         return lambda: (champion, "champion")
-    elites = Elites(source)
-    if flags.follow and not elites.changed():
-        print(f"waiting for the first {elites.settings.counts[0]} ...", flush=True)
-        while not elites.changed():
-            time.sleep(0.1)
+    if not (source / CONFIG).is_file():
+        raise RunError(f"{source} is no run's folder: it has no {CONFIG}")
     if flags.generation is not None:
-        found = elites.get(flags.generation)
+        found = elite(source, flags.generation)
         return lambda: found
-    return lambda: elites.get(None)
-
-
-def _is_recording(flags: WatchFlags) -> bool:
-    return flags.source.lower().endswith(".csv")
+    if not changed(source):
+        print(f"waiting for the first {read_config(source / CONFIG)[0].counts[0]} ...", flush=True)
+        while not changed(source):
+            time.sleep(0.1)
+    return partial(elite, source, None)
 
 
 def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
-    """Drives to show, without an end but for a recorded one, and what they are. Raises as `_driver`, DriveError."""
+    """Drives to show, without an end unless it is a recorded one, and what they are. Raises GridSimError."""
     if _is_recording(flags):
         yield from _recorded(flags)
         return
     driver = _driver(flags)
-    for k in range(1 << 30):
+    for seed in itertools.count(flags.seed):
         champion, name = driver()
         road = flags.scenario or champion.scenario
-        scenario, start = _map(road, flags.seed + k, champion.sim)
-        traffic = _traffic(flags.traffic, champion.traffic if road == champion.scenario else default_traffic(road))
+        scenario, start = _map(road, seed, champion.sim)
+        traffic = champion.traffic if road == champion.scenario else default_traffic(road)
+        if flags.traffic != -1:
+            traffic = flags.traffic
         world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim.traffic)[0]
-        drive = record(champion, scenario, start, seconds, world)
-        yield drive, f"{name}    {label(road)}, map {scenario.seed:,}"
+        yield record(champion, scenario, start, seconds, world), f"{name}    {label(road)}, map {scenario.seed:,}"
+
+
+def _is_recording(flags: WatchFlags) -> bool:
+    return flags.source.lower().endswith(".csv")
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
@@ -234,25 +221,27 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
         yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
 
 
-def _film(flags: WatchFlags, console: Console) -> str:
-    """Write --output. Returns the closing words."""
+def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
+    """Write --output."""
     output = Path(flags.output)
-    if output.suffix.lower() not in SUFFIXES:
+    suffix = output.suffix.lower()
+    if suffix not in CODING:
         raise UsageError(f"--output {output}: a film is written as .mp4 or .gif")
     if not output.parent.is_dir():
         raise UsageError(f"--output {output}: there is no folder {output.parent}")
-    gif = output.suffix.lower() == ".gif"
-    fps = flags.fps or (10 if gif else 20)
-    if gif and 100 % fps:
+    fps = flags.fps or (10 if suffix == ".gif" else 20)
+    if suffix == ".gif" and 100 % fps:
         raise UsageError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
-    size = _size(flags.size or "640x360")
-    recorded = _is_recording(flags)
-    limit = _seconds(flags.seconds) or (math.inf if recorded else FILM_S)
-    drives = list(_recorded(flags)) if recorded else [next(_drives(flags, limit))]
+    if _is_recording(flags):
+        drives = list(_recorded(flags))
+    else:
+        limit = limit if flags.seconds else FILM_S
+        drives = [next(_drives(flags, limit))]
     seconds = min(limit, sum(drive.seconds for drive, _ in drives))
     total = max(1, round(seconds * fps))
     renderer = Renderer(drives[0][0].scenario, size)
     pictures = itertools.chain.from_iterable(frames(renderer, drive, fps, title) for drive, title in drives)
+    console = Console()
     with console.status(f"filming {seconds:.0f} s of driving") as status:
 
         def counted() -> Iterator[np.ndarray]:
@@ -260,24 +249,26 @@ def _film(flags: WatchFlags, console: Console) -> str:
                 status.update(f"filming {seconds:.0f} s of driving: picture {k} of {total}")
                 yield image
 
-        count = write_video(output, counted(), size, fps)
+        try:
+            count = write_video(output, counted(), size, fps)
+        except VideoError as error:
+            raise Failed(str(error)) from error
     end = drives[0][0].end
     how = "" if end == End.RUNNING else f", to its end: {end.name.lower()}"
-    return f"{output}: {seconds:.1f} s{how}, {count} pictures, {output.stat().st_size / 1e6:.1f} MB"
+    size_mb = output.stat().st_size / 1e6
+    console.print(f"{output}: {seconds:.1f} s{how}, {count} pictures, {size_mb:.1f} MB", soft_wrap=True)
 
 
-def _show(flags: WatchFlags) -> None:
+def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     """Show drives in a window until it is closed."""
     fps = flags.fps or 30
-    limit = _seconds(flags.seconds) or math.inf
-    size = _size(flags.size or "960x640")
+    run = Path(flags.source)
     drives = _drives(flags, SimConfig().episode.time_limit)
-    coming = next(drives, None)  # what is wrong is said before there is a window
-    elites = Elites(Path(flags.source)) if flags.follow else None
+    coming = next(drives, None)  # errors come before the window
     shown = 0.0
     with Window(size, f"GridSim: {flags.source}") as window:
         while coming is not None and not window.closed and shown < limit:
-            seen = elites.changed() if elites else 0
+            seen = changed(run)
             drive, title = coming
             renderer = Renderer(drive.scenario, size)
             end = round((drive.seconds + LINGER_S) * fps)
@@ -289,75 +280,38 @@ def _show(flags: WatchFlags) -> None:
                 pressed, _ = window.keys()
                 if window.closed or pressed & {"escape", "q"}:
                     return
-                newer = elites is not None and k / fps >= FOLLOW_S and elites.changed() != seen
+                newer = flags.follow and k / fps >= FOLLOW_S and changed(run) != seen
                 if "n" in pressed or newer:
                     break
             coming = next(drives, None) if shown < limit else None
 
 
-def watch_main() -> None:
-    """Entry point of `gridsim-watch`."""
-    prog = "gridsim-watch"
-    try:
-        flags = parse(WatchFlags, prog, sys.argv[1:])
-        try:
-            if not 0 <= flags.fps <= 120:
-                raise UsageError(f"--fps must be 1 to 120, not {flags.fps}")
-            _traffic(flags.traffic, 0)
-            if flags.scenario:
-                with _as_usage_error():
-                    check_name(flags.scenario)
-            if flags.output:
-                console = Console()
-                console.print(_film(flags, console), soft_wrap=True)
-            else:
-                _show(flags)
-        except NoDisplayError as error:
-            fail(prog, str(error), "to write a film in place of a window: --output film.mp4")
-        except UnfinishedError as error:
-            fail(prog, str(error), "to watch it as it stands: --follow, or --generation N")
-        except (UsageError, RunError, CheckpointError, DriveError) as error:
-            fail(prog, str(error))
-        except VideoError as error:
-            fail(prog, str(error), code=1)
-    except KeyboardInterrupt:
-        print(f"{prog}: stopped", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-
-
-# ------------------------------------------------------------------------------------------------------------- drive
-
-
 def drive_main() -> None:
     """Entry point of `gridsim-drive`."""
-    prog = "gridsim-drive"
+    main(DRIVE, _drive)
+
+
+def _drive() -> int:
+    flags = parse(DriveFlags, DRIVE, sys.argv[1:])
+    size, seconds = _look(flags.size, flags.seconds, flags.traffic)
+    config = SimConfig()
+    scenario, start = _map(flags.scenario, flags.seed, config)
+    traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic
     recorder: Recorder | None = None
-    try:
-        flags = parse(DriveFlags, prog, sys.argv[1:])
-        try:
-            size, seconds = _size(flags.size), _seconds(flags.seconds) or math.inf
-            config = SimConfig()
-            scenario, start = _map(flags.scenario, flags.seed, config)
-            traffic = _traffic(flags.traffic, default_traffic(flags.scenario))
-            with contextlib.ExitStack() as stack:
-                window = stack.enter_context(Window(size, f"GridSim: {flags.scenario}"))
-                if flags.record:
-                    period = config.episode.control_period
-                    recorder = stack.enter_context(Recorder(flags.record, scenario, period, traffic))
-                view = Renderer(scenario, size)
-                done = drive(scenario, start, window, view, recorder, config, seconds, traffic)
-            print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
-        except NoDisplayError as error:
-            fail(prog, str(error))
-        except (UsageError, DriveError) as error:
-            fail(prog, str(error))
-        _kept(recorder)
-    except KeyboardInterrupt:
-        print(f"{prog}: stopped", file=sys.stderr)
-        _kept(recorder)
-        sys.exit(INTERRUPTED)
+    with contextlib.ExitStack() as stack:
+        window = stack.enter_context(Window(size, f"GridSim: {flags.scenario}"))
+        if flags.record:
+            period = config.episode.control_period
+            recorder = stack.enter_context(Recorder(flags.record, scenario, period, traffic))
+            stack.callback(_say_kept, recorder)  # also where the drive is interrupted
+        done = drive(scenario, start, window, Renderer(scenario, size), recorder, config, seconds, traffic)
+        print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
+    return 0
 
 
-def _kept(recorder: Recorder | None) -> None:
-    if recorder is not None:
-        print(f"kept {recorder.rows} steps; watch them: {called('gridsim-watch')} {recorder.path}")
+def _say_kept(recorder: Recorder) -> None:
+    print(f"kept {recorder.rows} steps; watch them: {called(WATCH)} {recorder.path}")
+
+
+if __name__ == "__main__":
+    watch_main()

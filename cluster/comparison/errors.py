@@ -16,9 +16,7 @@ from gridsim.maps.scenarios import HELD_OUT_SEED
 from gridsim.reference.errors import (
     TURN,
     Driven,
-    Errors,
     Series,
-    combine,
     driven,
     error_series,
     error_series_beside,
@@ -30,24 +28,6 @@ _STRETCH = 1.0  # m of a recording that are worth another start
 _DRIFT = 0.5  # m by which a drive, replayed, may miss what was recorded
 
 
-def errors(
-    champion: Champion,
-    scenario: str | None = None,
-    episodes: int = 64,
-    seed: int = HELD_OUT_SEED,
-    traffic: int | None = None,
-    reference: str | os.PathLike[str] | None = None,
-) -> Errors:
-    """Velocity and steering errors of a champion, as one over all that it drives.
-
-    Args: as `champion.evaluate`'s; or a recorded drive, which brings its own map, start and traffic.
-    Raises: ValueError with one line as `champion.evaluate`, or if nothing can be compared; DriveError (a ValueError)
-    for a file that is no recorded drive, or of another map.
-    """
-    found = series(champion, scenario, episodes, seed, traffic, reference)
-    return combine([part.errors(champion.sim.vehicle) for part in found])
-
-
 def series(
     champion: Champion,
     scenario: str | None = None,
@@ -56,10 +36,15 @@ def series(
     traffic: int | None = None,
     reference: str | os.PathLike[str] | None = None,
 ) -> list[Series]:
-    """What `errors` is made of: a champion and the reference along each route, in the order of the episodes.
+    """A champion and its reference along each route, in the order of the episodes; `gridsim.reference.errors.combine`
+    makes one of their errors.
 
     An episode in which it came nowhere has none. Beside a recorded drive there is one for each stretch of it that
     the champion followed.
+
+    Args: as `champion.evaluate`'s; or a recorded drive, which brings its own map, start and traffic.
+    Raises: ValueError with one line as `champion.evaluate`; DriveError (a ValueError) for a file that is no recorded
+    drive, or of another map.
     """
     name = scenario or champion.scenario
     maps = Maps(name, champion.sim)
@@ -129,7 +114,7 @@ def _longest(kept: Drive, road: Map) -> tuple[np.ndarray, Driven]:
     episodes = []
     for episode in range(int(kept.episodes[-1]) + 1):
         rows = np.flatnonzero(kept.episodes == episode)
-        with contextlib.suppress(ValueError):  # who never came forward
+        with contextlib.suppress(ValueError):  # an episode without a metre forward
             episodes.append((rows, driven(kept.poses[rows], road)))
     if not episodes:
         raise DriveError("nothing was driven in the recording that could be compared with")

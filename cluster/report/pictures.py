@@ -130,7 +130,7 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
             hatch = "//" if group.observation == "grid" and len({view for _, _, view in names}) > 1 else None
             axis.bar(
                 place, found.median, 0.92 * width, color=_LEARNERS[group.learner], alpha=0.75, yerr=whiskers, capsize=3,
-                hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2,
+                hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2, label=group.name,
             )  # fmt: skip
             seeds = [value for value in group.values(name) if np.isfinite(value)]
             beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
@@ -142,11 +142,9 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
         axis.set_ylim(bottom=0.0)
         axis.grid(axis="y", alpha=0.25, zorder=0)
         axis.spines[["top", "right"]].set_visible(False)
-    from matplotlib.patches import Patch
-
-    patches = [Patch(color=_LEARNERS[learner], alpha=0.75, label=name) for name, learner, _ in names]
+    bars = {bar.get_label(): bar for bar in axes[-1].containers if hasattr(bar, "patches")}
     figure.legend(
-        handles=patches, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
+        bars.values(), bars, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
         title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
     )  # fmt: skip
     figure.savefig(Path(path), dpi=100)
@@ -154,13 +152,19 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
 
 def along_route(
     drives: Mapping[str, Sequence[Series]], names: Mapping[str, str], metres: float, path: str | os.PathLike[str],
-    title: str,
+    missing: Sequence[str] = (),
 ) -> None:  # fmt: skip
-    """Draw velocity and steering error along a route to a PNG.
+    """Draw velocity and steering error along the seamless road to a PNG.
 
     Args: for each learner its seeds' drives from the same start, the one to be drawn as a line first, the others as
-    the band from the smallest to the largest error; what learners are called; how far along the route.
+    the band from the smallest to the largest error; what learners are called; how far along the route; the names of
+    learners that were compared there and have no drive.
     """
+    title = "Errors along the seamless road, from the same start on a held-out map"
+    if max(len(found) for found in drives.values()) > 1:
+        title += "\nlines: the seed whose mean error is the median; bands: all seeds; crosses: crashed"
+    if missing:
+        title += f"\nnot drawn: {', '.join(missing)}"
     figure, axes = _figure(12.0, 6.2, rows=2)
     for axis, name, unit in zip(axes, ("velocity_error", "steering_error"), ("m/s", "degrees"), strict=True):
         axis.axhline(0.0, color="#212529", linewidth=1.2, label="reference", zorder=3)

@@ -28,7 +28,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.files import map_digest
 from gridsim.maps.scenarios import is_map_file
 
-HISTORY, ELITES, SUMMARY, VIDEO = "history.csv", "elites.npz", "summary.json", "champion.mp4"
+HISTORY, ELITES, SUMMARY, PAGE = "history.csv", "elites.npz", "summary.json", "drive.html"
 CONFIG_FORMAT = 2
 OLD_FORMATS = (1,)  # GridSim 0.1: other searches, other parameters
 
@@ -166,6 +166,11 @@ def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init
         name = f"{description.what(settings)}-{stamp}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
+    return RunFolder(new_folder(output, name), settings, init, init_sha256, _map_sha256(settings))
+
+
+def new_folder(output: Path, name: str) -> Path:
+    """The folder of a new run or comparison, checked but not yet made. Raises RunError."""
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name
@@ -176,7 +181,7 @@ def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise RunError(f"--output {output}: cannot be written; choose another folder")
-    return RunFolder(path.absolute(), settings, init, init_sha256, _map_sha256(settings))
+    return path.absolute()
 
 
 def is_finished(run: RunFolder) -> bool:

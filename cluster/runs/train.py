@@ -8,6 +8,7 @@ process, the folder holds a whole step, the last or the one before, and a resume
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import signal
@@ -23,7 +24,7 @@ import numpy as np
 from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CheckpointError
-from cluster.runs.run import ELITES, HISTORY, SUMMARY, VIDEO, RunError, RunFolder, lock, write_summary
+from cluster.runs.run import ELITES, HISTORY, PAGE, SUMMARY, RunError, RunFolder, lock, write_summary
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
 from cluster.tracking.address import TrackingError, check_uri
@@ -34,13 +35,14 @@ from cluster.training.trainer import Learning, Maps, held_out_episodes, now
 from cluster.workers import kernels
 from cluster.workers.pool import SerialPool, WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS
-from evolution.episodes.rollout import trajectory as drive_trajectory
+from gridsim.car.ego import DISTANCE
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.files import short_lap
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
 
+ELITES_SHOWN = 12  # on the page, beside the champion
 NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
@@ -114,7 +116,7 @@ class Workers:
 
 def train(
     run: RunFolder, workers: Workers, uri: str, experiment: str, reporter: Reporter, started: float | None = None,
-    *, initial: np.ndarray | None = None, parent_id: str = "", film: bool = True, wall_limit_s: float = math.inf,
+    *, initial: np.ndarray | None = None, parent_id: str = "", wall_limit_s: float = math.inf,
 ) -> Session:  # fmt: skip
     """Train a run to its end, finish it, and send it to MLflow.
 
@@ -130,7 +132,7 @@ def train(
     try:
         session = Session(
             run, workers.open(maps), maps, uri, experiment, reporter, now() if started is None else started, initial,
-            parent_id, film, wall_limit_s,
+            parent_id, wall_limit_s,
         )  # fmt: skip
         if warming.processes:
             with reporter.compiling():
@@ -197,7 +199,6 @@ class Session:
         started: time.perf_counter() from which the run's time counts.
         initial: a genome to start from, float32 [genes].
         parent_id: MLflow's run that this one belongs to, or "".
-        film: whether the champion is filmed.
         wall_limit_s: seconds of learning, with those before a resumption, after which no step but the first is begun.
         summary: what summary.json holds, once it is finished.
     """
@@ -211,7 +212,6 @@ class Session:
     started: float = field(default_factory=now)
     initial: np.ndarray | None = None
     parent_id: str = ""
-    film: bool = True
     wall_limit_s: float = math.inf
     summary: dict[str, Any] = field(default_factory=dict)
     learning: Learning = field(init=False)
@@ -285,9 +285,9 @@ class Session:
 
     def finish(self, workers: int) -> None:
         """Measure the champion on held-out drives, write what is left to the folder, and hand it to the tracker."""
-        from cluster.report import pictures
+        from cluster.report import film, page, pictures
 
-        self.reporter.note(f"measuring {'and filming ' if self.film else ''}the champion on held-out drives")
+        self.reporter.note("measuring the champion on held-out drives")
         learning, path, settings = self.learning, self.run.path, self.run.settings
         learning.conclude()
         assert learning.champion is not None
@@ -298,16 +298,19 @@ class Session:
         checkpoint.save(path / ELITES, {"genomes": np.array(learning.elites)}, {"policy": settings.policy})
         episodes = held_out_episodes(self.maps, settings.traffic)
         seed = episodes.maps[int(episodes.rows[0]["map"])]
-        scenario, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
-        with self._filmed(seed, start, world, f"{champion.scenario}, held-out map {scenario.seed:,}"):
-            figures = learning.held_out()
-            self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # while it is drawn
-            pictures.curves(learning.history, path / "curves.png", learning.step_name)
-            result, states, _ = drive_trajectory(
-                learning.spec, champion.genome, scenario, start, learning.curriculum.goal_limits(), learning.sim, world
-            )
-            title = f"{label(settings.scenario)}, held-out map {scenario.seed}: {float(result['distance']):,.0f} m"
-            pictures.trajectory(scenario, states, path / "trajectory.png", title)
+        road_map, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
+        figures = learning.held_out()
+        self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # meanwhile, in its thread
+        pictures.curves(learning.history, path / "curves.png", learning.step_name)
+        drive = film.record(champion, road_map, start, learning.sim.episode.time_limit, world)
+        title = f"{label(settings.scenario)}, held-out map {road_map.seed}: {drive.cars[-1, DISTANCE]:,.0f} m"
+        pictures.trajectory(road_map, drive.cars, path / "trajectory.png", title)
+        shown = [page.Shown("champion", "champion", drive)]
+        for k in np.unique(np.linspace(0, learning.steps - 1, ELITES_SHOWN).astype(int))[::-1].tolist():
+            elite = dataclasses.replace(champion, genome=learning.elites[k])
+            drive = film.record(elite, road_map, start, learning.sim.episode.time_limit, world)
+            shown.insert(0, page.Shown(f"elite of {learning.step_name} {k}", str(k), drive, stride=2))
+        page.write_page(path / PAGE, f"GridSim: {self.run.name}, {title}", shown, learning.sim)
         wall = self._wall_s()
         best = learning.history[learning.champion.step]
         self.summary = {
@@ -342,25 +345,6 @@ class Session:
             if meta.pop("replay", None):
                 kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
                 checkpoint.save(path, kept, meta)
-
-    @contextlib.contextmanager
-    def _filmed(self, seed: int, start: np.ndarray, world: np.ndarray, title: str) -> Iterator[None]:
-        """Film the champion's drive meanwhile. Without a film there is a warning, and the run goes on."""
-        if not self.film:
-            yield
-            return
-        from cluster.report.film import Filming, VideoError
-
-        path = self.run.path
-        film = Filming(path / CHAMPION, seed, start, world, path / VIDEO, title)
-        try:
-            yield
-            film.wait(self.learning.on_progress)
-        except VideoError as error:
-            (path / VIDEO).unlink(missing_ok=True)
-            self.reporter.warn(f"no {VIDEO}: {error}")
-        finally:
-            film.stop()
 
 
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:

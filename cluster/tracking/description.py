@@ -105,7 +105,7 @@ def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
         f"{summary['wall_s']:,.0f} s. On {held_out['episodes']} held-out drives the champion succeeds in "
         f"**{held_out['success_rate']:.1%}**, drives {held_out['distance_m']:,.0f} m at {held_out['speed_mps']:.2f} "
         f"m/s, and collides in {held_out['collision_rate']:.1%}.",
-        "Watch it: `champion.mp4` among the artifacts, or",
+        "Watch it: `drive.html` among the artifacts, or",
         f"    gridsim-watch {folder}",
         f"Load it, a torch model of the environment's observations, float32 [n, {inputs}], which is registered as "
         f"`{model_name(settings)}`:",

@@ -27,11 +27,11 @@ from evolution.episodes.rollout import EPISODE, Limits, trajectory
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import recipes
 from evolution.search.breeding import Kind, Mutation
-from gridsim.car.ego import FIELDS
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import views
 from gridsim.jit import CACHE_FOLDER, CONFIG
 from gridsim.maps.map import Map, blank, sample_starts
+from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.traffic.world import spawn
 
@@ -107,15 +107,13 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
         Worker().answer(collecting, [road], made, 0, 1)
 
 
-def compile_film(policy: str, traffic: int) -> None:
-    """The same for pictures and films of a drive."""
-    from gridsim.view.render import Renderer
-
+def compile_drive(policy: str, traffic: int) -> None:
+    """The same for recording a drive, and drawing it."""
     config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
     start = episodes["start"][0]
     _, cars, others = trajectory(PolicySpec.parse(policy), genome, road, start, limits, config, worlds[0])
-    ranges = views(road, cars, others, config)
-    Renderer(road, (64, 64)).draw(np.zeros(FIELDS, dtype=np.float32), ranges=ranges[0], path=cars[:, :2], text="0")
+    views(road, cars, others, config)
+    clearances(road.road, freeze(cars[:, :2]))
 
 
 def compile_roads(scenario: str, traffic: int) -> None:
@@ -141,7 +139,7 @@ def compile_everything() -> None:
     for settings in everything_by_default():
         compile_kernels(settings.policy, settings.traffic, settings.command)
         compile_roads(settings.scenario, settings.traffic)
-        compile_film(settings.policy, settings.traffic)
+        compile_drive(settings.policy, settings.traffic)
         _marker(settings).touch()
         print(_marker(settings).name, flush=True)
 
@@ -158,7 +156,7 @@ def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", comma
         compile_roads(scenario, traffic)
         print("ready", flush=True)
         os.nice(10)
-        compile_film(policy, traffic)
+        compile_drive(policy, traffic)
 
 
 if __name__ == "__main__":

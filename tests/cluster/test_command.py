@@ -4,18 +4,19 @@ import itertools
 import re
 import shlex
 import sys
-from importlib.metadata import version
+from importlib.metadata import entry_points, version
 
 import pytest
-from commands import finish
 
 from cluster.commands import common as command
+from cluster.commands import entry, watch
 from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
-from cluster.commands.common import called, parse, warn_of_crowd
+from cluster.commands.common import Failed, UsageError, called, main, parse, warn_of_crowd
 from cluster.commands.compare import CompareFlags
 from cluster.commands.watch import DriveFlags, WatchFlags
 from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError
+from gridsim.view.render import NoDisplayError
 
 FLAGS = {
     "gridsim-evolve": EvolveFlags,
@@ -27,18 +28,16 @@ FLAGS = {
 }
 
 
-def printed_help(prog, columns, monkeypatch, capsys):
+@pytest.mark.parametrize("columns", [80, 120])
+@pytest.mark.parametrize("prog", FLAGS)
+def test_help_fills_its_lines(prog, columns, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", str(columns))
     with pytest.raises(SystemExit) as ended:
         parse(FLAGS[prog], prog, ["--help"])
     assert not ended.value.code
-    return capsys.readouterr().out
-
-
-@pytest.mark.parametrize("columns", [80, 120])
-@pytest.mark.parametrize("prog", FLAGS)
-def test_help_fills_its_lines(prog, columns, monkeypatch, capsys):
-    lines = printed_help(prog, columns, monkeypatch, capsys).splitlines()
+    lines = capsys.readouterr().out.splitlines()
+    without_flag = {"gridsim-watch": " SOURCE", "gridsim-evaluate": " CHAMPION", "gridsim-compare": " [RUNS]"}
+    assert lines[0] == f"usage: {prog} [-h] [OPTIONS]{without_flag.get(prog, '')}"
     assert max(map(len, lines)) <= columns
     width = max(map(len, lines)) - 2  # without the box, which is there where a terminal can show it
     texts = [line.strip("│").rstrip() for line in lines]
@@ -46,14 +45,6 @@ def test_help_fills_its_lines(prog, columns, monkeypatch, capsys):
         if line.startswith(" " * 10) and after.startswith(" " * 10):
             word = re.split(r"[ ,]", after.strip())[0]
             assert len(line) + 1 + len(word) > width - 1, f"{line!r} has room for {word!r}"
-
-
-@pytest.mark.parametrize(
-    ("prog", "name"), [("gridsim-watch", "SOURCE"), ("gridsim-evaluate", "CHAMPION"), ("gridsim-compare", "[RUNS]")]
-)
-def test_what_is_given_without_a_flag_has_a_name(prog, name, monkeypatch, capsys):
-    lines = printed_help(prog, 80, monkeypatch, capsys).splitlines()
-    assert lines[0] == f"usage: {prog} [-h] [OPTIONS] {name}"
 
 
 def refused(prog, line, capsys):
@@ -106,9 +97,43 @@ def test_a_command_is_called_as_this_one_was(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("prog", FLAGS)
-def test_each_command_tells_its_version(prog, tmp_path):
-    done = finish(prog, "--version", cwd=tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"gridsim {version('gridsim')}\n", "")
+def test_each_command_tells_its_version(prog, monkeypatch, capsys):
+    (script,) = entry_points(group="console_scripts", name=prog)
+    monkeypatch.setattr(sys, "argv", [prog, "--version"])
+    script.load()()
+    assert capsys.readouterr() == (f"gridsim {version('gridsim')}\n", "")
+
+
+def test_a_command_is_entered_and_ctrl_c_is_quiet_while_its_libraries_load(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["gridsim-watch"])
+    monkeypatch.setattr(watch, "watch_main", lambda: sys.exit(7))
+    with pytest.raises(SystemExit, match="7"):
+        entry.watch_main()
+
+    def interrupted(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(entry, "import_module", interrupted)
+    with pytest.raises(SystemExit, match="130"):
+        entry.watch_main()
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "lines"),
+    [
+        (UsageError("no such\nroad"), 2, ["p: error: no such road"]),
+        (NoDisplayError("no display"), 2, ["p: error: no display", "film it"]),
+        (Failed("the disk is full", "go on"), 1, ["p: error: the disk is full", "go on"]),
+    ],
+)
+def test_an_error_for_the_user_is_one_line_and_perhaps_a_hint(error, code, lines, capsys):
+    def body():
+        raise error
+
+    with pytest.raises(SystemExit) as ended:
+        main("p", body, {NoDisplayError: "film it"})
+    assert ended.value.code == code
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monkeypatch, capsys):

@@ -1,38 +1,30 @@
-"""The command gridsim-compare: wrong use, a kill, Ctrl-C."""
+"""The command gridsim-compare: wrong use, what is never trained again, a kill and Ctrl-C."""
 
 import csv
-import io
+import json
 import os
 import signal
-import subprocess
 import sys
-import time
 
 import pytest
 import tracked
+from commands import finish, start, wait_until
 from finished_runs import make_run
 
 from cluster.commands import compare
-from cluster.comparison.plan import Budget, ComparisonFolder, Plan
-from gridsim.maps.scenarios import REGISTRY
+from cluster.comparison import cells, results
+from cluster.comparison.plan import ComparisonFolder, Plan
+from cluster.workers.pool import PoolError
 
-ALL = tuple(REGISTRY)
-PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, Budget(car_steps=1000))
-
-
-CODE = "from cluster.commands.entry import compare_main; compare_main()"
+PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
 
-def refused(monkeypatch, capsys, *arguments):
-    """What the command says when it is used wrongly."""
+def run(monkeypatch, *arguments):
+    """The command in this process. Returns its exit code."""
     monkeypatch.setattr(sys, "argv", ["gridsim-compare", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
         compare.compare_main()
-    said = capsys.readouterr().err
-    assert stop.value.code == 2, said
-    assert said.startswith("gridsim-compare: error: ")
-    assert len(said.splitlines()) <= 3
-    return said
+    return stop.value.code
 
 
 def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
@@ -57,86 +49,105 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
         (["--name", "../a"], "--name"),
         (["--tracking-uri", "ftp://x"], "not a tracking address"),
     ]:
-        assert said in refused(monkeypatch, capsys, *arguments)
+        assert run(monkeypatch, *arguments) == 2
+        first, *more = capsys.readouterr().err.splitlines()
+        assert first.startswith("gridsim-compare: error: ")
+        assert said in first
+        assert len(more) <= 1
     assert sorted(os.listdir(tmp_path)) == ["a", "comparison.json"]
 
 
-def begin(folder, *arguments):
-    """The command, started in a folder."""
-    return subprocess.Popen(
-        [sys.executable, "-c", CODE, *arguments],
-        cwd=folder, env=tracked.with_path(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
+class Untracked:
+    """In place of MLflow's parent run."""
+
+    def __getattr__(self, name):
+        return lambda *_, **__: ""
+
+    def close(self, *_, **__):
+        return None
 
 
-def wait_until(condition, timeout_s=240.0):
-    end = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.05)
+def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, monkeypatch, capsys):
+    trained: list[str] = []
+    broken = {"seamless-evolution-s0"}
+
+    def train(self, cell):
+        trained.append(cell.name)
+        if cell.name in broken:
+            raise PoolError("the workers are gone")
+        make_run(cell.folder, settings=cell.settings)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cells.Cells, "__call__", train)
+    monkeypatch.setattr(results, "errors_of", lambda run, reference: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(compare, "_tracker", lambda *_: Untracked())
+    asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
+    assert run(monkeypatch, *asked, "--name", "c", "--seeds", 1) == 1
+    err = capsys.readouterr().err
+    names = [cell.name for cell in PLAN.cells(tmp_path)]
+    assert trained == names[:4]
+    assert "gridsim-compare: seamless-evolution-s0 failed: the workers are gone" in err
+    assert "gridsim-compare: error: 1 of 4 runs failed" in err
+    assert err.splitlines()[-1].endswith("--resume runs/c")
+    broken.clear()
+    assert run(monkeypatch, "--resume", "runs/c", "--seeds", 2, "--budget", "1,000", "--workers", 0) == 0
+    assert "comparing 8 runs, 3 of them finished" in capsys.readouterr().out
+    assert trained[4:] == ["seamless-evolution-s0", *names[4:]]
+    assert run(monkeypatch, "--resume", "runs/c", "--workers", 0) == 0
+    assert len(trained) == 9
+    assert {"table.md", "table.csv", "comparison.png", "errors.json"} <= set(os.listdir("runs/c"))
+    assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
+    assert run(monkeypatch, "runs/c", "--name", "again") == 0
+    rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))
+    assert len(rows) == 8
+    assert {row["velocity_error_percent"] for row in rows} == {"2.5"}
 
 
-def content(folder):
-    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+SMALL = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--population", "32",
+         "--workers", "0", "--name", "c"]  # fmt: skip
 
 
 @pytest.mark.e2e
 def test_a_killed_comparison_goes_on_without_repeating_what_is_finished(tmp_path):
-    asked = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--budget", "100M"]
-    asked += ["--population", "32", "--generations", "3", "--workers", "0", "--name", "c"]
     folder = tmp_path / "runs" / "c"
     first, second = folder / "curved-evolution-s0", folder / "curved-random-s0"
-    process = begin(tmp_path, *asked)
-    try:
-        wait_until(lambda: second.exists() or process.poll() is not None)
-        assert process.poll() is None, process.communicate()
-    finally:
-        process.kill()
-        process.communicate()
-    before = content(first)
+    process = start("gridsim-compare", *SMALL, "--budget", "100M", "--generations", "3", cwd=tmp_path)
+    wait_until(lambda: second.exists() or process.poll() is not None, 240)
+    process.kill()
+    assert process.communicate()
+    before = {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.rglob("*") if path.is_file()}
     assert "summary.json" in before
 
-    process = begin(tmp_path, "--resume", "runs/c", "--workers", "0")
-    said, errors = process.communicate(timeout=240)
-    assert process.returncode == 0, errors
-    assert errors == ""
-    assert content(first) == before
-    rows = list(csv.DictReader(io.StringIO((folder / "table.csv").read_text())))
-    assert [(row["learner"], row["run"]) for row in rows] == [
-        ("evolution", "curved-evolution-s0"),
-        ("random", "curved-random-s0"),
-    ]
+    done = finish("gridsim-compare", "--resume", "runs/c", "--workers", "0", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert before == {
+        path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.rglob("*") if path.is_file()
+    }
+    rows = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
+    assert [(row["learner"], row["run"]) for row in rows] == [("evolution", first.name), ("random", second.name)]
     assert float(rows[0]["velocity_error_percent"]) > 0.0
     assert "| curved | random search | 1 |" in (folder / "table.md").read_text()
     assert (folder / "comparison.png").stat().st_size > 10_000
 
     found = {logged.info.run_name: logged for logged in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db")}
     assert set(found) == {"c", first.name, second.name}
-    assert len(tracked.runs(f"sqlite:///{tmp_path}/mlflow.db")) == 3
     parent = found["c"].info.run_id
     assert all(found[path.name].data.tags["mlflow.parentRunId"] == parent for path in (first, second))
     assert found["c"].info.status == "FINISHED"
     assert found["c"].data.metrics["runs_done"] == 2
 
-    process = begin(tmp_path, "--resume", "runs/c", "--workers", "0")
-    said, errors = process.communicate(timeout=240)
-    assert process.returncode == 0, errors
-    assert "2 of them finished" in said
-
 
 @pytest.mark.e2e
 def test_ctrl_c_keeps_what_is_done(tmp_path):
-    asked = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--budget", "1h"]
-    process = begin(tmp_path, *asked, "--population", "32", "--generations", "2", "--workers", "0", "--name", "c")
+    process = start("gridsim-compare", *SMALL, "--budget", "1h", "--generations", "2", cwd=tmp_path)
     folder = tmp_path / "runs" / "c"
     try:
-        wait_until(lambda: (folder / "curved-random-s0").exists() or process.poll() is not None)
+        wait_until(lambda: (folder / "curved-random-s0").exists() or process.poll() is not None, 240)
         process.send_signal(signal.SIGINT)
         errors = process.communicate(timeout=120)[1]
     finally:
         process.kill()
     assert process.returncode == 130, errors
-    assert "continue with: gridsim-compare --resume runs/c" in errors
+    assert "gridsim-compare --resume runs/c" in errors
     assert "| curved | random search | missing |" in (folder / "table.md").read_text()
     assert "| curved | evolution | 1 |" in (folder / "table.md").read_text()

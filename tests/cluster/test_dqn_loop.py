@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cluster.commands.cli import REMOVED_FROM_DQN, dqn_main
+from cluster.commands.cli import DqnFlags, dqn_main
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.settings import DqnSettings, SettingsError
 from cluster.training import dqn as dqn_loop
@@ -142,12 +142,12 @@ def test_the_default_replay_fits_a_checkpoint(observation):
     DqnSettings(observation=observation).check()
 
 
-@pytest.mark.parametrize("flag", REMOVED_FROM_DQN)
+@pytest.mark.parametrize("flag", DqnFlags.removed)
 def test_a_removed_flag_is_refused_with_the_reason(flag, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["gridsim-dqn", f"--{flag}"])
+    monkeypatch.setattr(sys, "argv", ["gridsim-dqn", flag])
     with pytest.raises(SystemExit, match="2"):
         dqn_main()
-    assert capsys.readouterr().err.startswith(f"gridsim-dqn: error: --{flag} was removed: {REMOVED_FROM_DQN[flag]}\n")
+    assert capsys.readouterr().err.startswith(f"gridsim-dqn: error: {flag} was removed: {DqnFlags.removed[flag]}\n")
 
 
 class Losing(SerialPool):

@@ -84,7 +84,7 @@ def test_ctrl_c_saves(reference, tmp_path):
 
 def test_run_keeps_the_contracts(reference):
     for name in ("config.json", "checkpoint.npz", "champion.npz", "history.csv", "summary.json", "curves.png",
-                 "trajectory.png", "champion.mp4"):  # fmt: skip
+                 "trajectory.png", "drive.html"):  # fmt: skip
         assert (reference / name).stat().st_size > 0
     found = summary(reference)
     assert found["evaluations"] == len(rows(reference)) >= 5

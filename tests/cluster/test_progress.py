@@ -11,7 +11,7 @@ from rich.console import Console
 
 from cluster.commands import compare, progress
 from cluster.commands.progress import Progress
-from cluster.comparison.plan import Budget, Plan
+from cluster.comparison.plan import ComparisonFolder, Plan
 
 ROW = {"validation/success_rate": 0.37, "car_steps_per_s": 1_234_567.0, "car_steps": 12_300_000.0}
 WORDS = "240 generations  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"
@@ -31,13 +31,13 @@ def begun(learner, width, terminal=True):
     return Progress(console, "gridsim-evolve", "runs/x", "gridsim-evolve --resume runs/x").learning(session), console
 
 
-def drawn(bar, width):
+def drawn(shown, width):
     """The live line as such a terminal shows it."""
-    file = io.StringIO()
-    Console(width=width, force_terminal=True, color_system=None, file=file).print(bar.get_renderable())
-    (line,) = file.getvalue().splitlines()
-    assert len(line) <= width
-    return line
+    console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+    (line,) = console.render_lines(shown.text(), pad=False)
+    text = "".join(segment.text for segment in line)
+    assert len(text) <= width
+    return text
 
 
 def after(monkeypatch, seconds):
@@ -54,13 +54,13 @@ def after(monkeypatch, seconds):
 def test_counter_success_and_eta_are_always_there(way, counter, width, monkeypatch):
     learner = learning(way)
     shown, _ = begun(learner, width)
-    assert drawn(shown._bar, width).startswith(f"{counter}  success 0%  ETA -:--  ")
+    assert drawn(shown, width).startswith(f"{counter}  success 0%  ETA -:--  ")
     shown.row(1, ROW)
     learner.way = lambda: (way[0] * 1.5, *way[1:])
     after(monkeypatch, 3700.0)
     shown.row(2, {**ROW, "car_steps": 12_300_000.0 * 1.5})
     shown.members("validate", 3, 128)
-    line = drawn(shown._bar, width)
+    line = drawn(shown, width)
     assert line.startswith(f"{progress.way(learner)}  success 37%  ETA 1:")
     assert " at most  " in line
     assert ("validate   3/128  240 generations" in line) == (width >= 120)
@@ -74,23 +74,30 @@ def test_there_is_no_eta_before_it_means_something(monkeypatch):
     shown.row(1, {**ROW, "car_steps_per_s": 500.0, "car_steps": 300_000.0})
     after(monkeypatch, 1.0)
     shown.row(2, {**ROW, "car_steps": 1_300_000.0})
-    assert "ETA -:--" in drawn(shown._bar, 120)
+    assert "ETA -:--" in drawn(shown, 120)
     after(monkeypatch, 10.5)
     shown.row(3, {**ROW, "car_steps": 4_000_000.0})
-    assert "ETA 1:" in drawn(shown._bar, 120)
+    assert "ETA 1:" in drawn(shown, 120)
     assert "\n12.3/30 M car-steps  success 37%  ETA -:--  240 generations" in console.file.getvalue()
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_comparison_shows_the_same(width):
-    plan = Plan(("roundabout",), ("two-parents",), 3, Budget(wall_s=3700.0))
-    cells = plan.cells(Path("runs/c"))
+    plan = Plan(("roundabout",), ("two-parents",), 3, budget="3700s")
+    (first, *_) = plan.cells(Path("runs/c"))
     console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
-    shown = compare.Progress(console, Path("runs/c"), cells, cells, plan.budget)
-    shown.begin(cells[0])
+    shown = compare.Progress(console, ComparisonFolder(Path("runs/c"), plan), 3, 3)
+    shown.begin(first)
     learner = learning((12, 10**15, "generations"))
     shown.note(f"{progress.way(learner, bound=False)}  success 37%", learner.describe(ROW))
-    line = drawn(shown._bar, width)
+    line = drawn(shown, width)
     assert line.startswith("run 0/3  ETA 3:0")
     assert "  12 generations  success 37%  " in line
     assert ("roundabout-two-parents-s0" in line) == (width >= 80)
+
+
+def test_a_terminal_shows_it_live():
+    file = io.StringIO()
+    with progress.Line(Console(width=40, force_terminal=True, color_system=None, file=file)) as line:
+        line.head, line.facts, line.rest = "12/30 generations", "success 37%", WORDS
+    assert "12/30 generations  success 37%  240 gen…" in file.getvalue()

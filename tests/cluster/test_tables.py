@@ -1,24 +1,48 @@
-"""Tables of a comparison, how far they can be believed, and its pictures."""
+"""Tables of a comparison: medians, bootstrap intervals, what is missing; its pictures."""
 
 import csv
 import io
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 from finished_runs import run
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from cluster.commands.compare import Results, _route_title
+from cluster.commands.compare import Results
 from cluster.comparison import tables
-from cluster.comparison.plan import Budget, Plan
+from cluster.comparison.plan import Plan
+from cluster.comparison.tables import interval, spread
 from cluster.report import pictures
 from cluster.training.evolution import COLUMNS
-from gridsim.maps.scenarios import REGISTRY
 
-ALL = tuple(REGISTRY)
-PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, Budget(car_steps=1000))
+PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
+
+
+@pytest.mark.parametrize("n", [2, 3, 7, 9, 11])
+def test_bootstrap_against_the_exact_distribution_of_a_resamples_median(n):
+    """The median of a resample is at most the k-th value if more than half of n draws are among the first k."""
+
+    def at_most(k):
+        return sum(math.comb(n, j) * (k / n) ** j * (1 - k / n) ** (n - j) for j in range(n // 2 + 1, n + 1))
+
+    values = np.arange(1.0, n + 1)
+    low, high = interval(np.random.default_rng(0).permutation(values))
+    assert low == (next(k for k in values if at_most(k) > 0.025) if n > 5 else values[0])
+    assert high == (next(k for k in values if at_most(k) >= 0.975) if n > 5 else values[-1])
+
+
+@given(st.lists(st.integers(-100, 100), min_size=2, max_size=6))
+def test_medians_lie_between_quartiles_and_within_the_interval(values):
+    n, lower, median, upper = spread([*values, math.nan, math.inf])
+    low, high = interval([*values, math.nan])
+    assert (n, median) == (len(values), np.median(values))
+    assert min(values) <= lower <= median <= upper <= max(values)
+    assert min(values) <= low <= median <= high <= max(values)
 
 
 def rows_of(text):
@@ -31,7 +55,7 @@ def test_tables_show_what_is_missing():
     runs = [run("evolution", "curved", 0, 10.0), run("evolution", "curved", 1, 20.0), run("random", "seamless", 0, 5.0)]
     groups = tables.group(runs, PLAN)
     text = tables.table_md(groups, PLAN).decode()
-    assert "5 of 8 runs are missing" in text
+    assert text.startswith("2 seeds, at most 1k a run, 31 rays, traffic as each road has it by default.\n")
     driving, errors = rows_of(text)[:4], rows_of(text)[4:]
     assert [line[:3] for line in driving] == [
         ["curved", "evolution", "2"],
@@ -55,36 +79,6 @@ def test_runs_of_different_traffic_and_views_are_not_mixed():
     assert len(tables.group(runs)) == 3
 
 
-def experiment_of(seeds, **more):
-    """All roads, with so many seeds of evolution and of the DQN."""
-    return tables.group(
-        [
-            run(learner, scenario, seed, 5.0 + seed, **more.get(learner, {}))
-            for scenario in ALL
-            for learner in ("evolution", "dqn")
-            for seed in range(seeds)
-        ]
-    )
-
-
-def test_few_seeds_allow_no_verdict():
-    for seeds in (1, 2):
-        assert tables.notes(experiment_of(seeds))[1:] == [f"Too few seeds for a verdict ({seeds}; 3 or more)."]
-    few = [run("dqn", "city", 0, 1.0), *(run("evolution", "city", seed, 1.0) for seed in range(3))]
-    assert tables.notes(tables.group(few))[-1] == "Too few seeds for a verdict (1; 3 or more)."
-    (chance,) = tables.notes(experiment_of(3))[1:]
-    assert "in 10 % of comparisons, by chance" in chance
-    assert "holds the true median in 75%" in chance
-
-
-def test_unequal_training_is_told():
-    def told(**dqn):
-        return [note for note in tables.notes(experiment_of(1, dqn=dqn)) if note.startswith("Training")]
-
-    assert told(training_s=20.0) == []  # with as many car-steps
-    assert told(training_s=20.0, car_steps=5.0) == [f"Training took unequal time and car-steps on {', '.join(ALL)}."]
-
-
 @pytest.mark.parametrize("plan", [None, PLAN])
 def test_the_terminal_shows_the_tables(tmp_path, plan):
     results = Results(tmp_path, plan)
@@ -93,7 +87,7 @@ def test_the_terminal_shows_the_tables(tmp_path, plan):
     results.show(Console(width=80, file=shown))
     text = shown.getvalue()
     assert max(map(len, text.splitlines()[:-1])) <= 80
-    for word in ("evolution", "90", "12.5", "Too few seeds for a verdict (1; 3 or more)."):
+    for word in ("evolution", "90", "12.5", "Fewer than 3 seeds are too few for a verdict."):
         assert word in text
 
 
@@ -103,19 +97,12 @@ def test_picture_shows_who_was_compared(tmp_path):
         wanted = 0.75 * np.array(colour) + 0.25 * 255
         return (np.abs(pixels - wanted).max(axis=2) < 6).sum() > 500
 
-    groups = experiment_of(2)
+    groups = tables.group([run(learner, "city", seed, 5.0) for learner in ("evolution", "dqn") for seed in range(2)])
     pictures.comparison(groups, tmp_path / "two.png")
     pictures.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
-    assert has(tmp_path / "two.png", evolution)
-    assert has(tmp_path / "two.png", dqn)
-    assert has(tmp_path / "one.png", evolution)
-    assert not has(tmp_path / "one.png", dqn)
-
-
-def test_the_route_tells_who_is_not_drawn():
-    assert _route_title({"evolution": [None]}, ["DQN"]).endswith("\nnot drawn: DQN")
-    assert "not drawn" not in _route_title({"evolution": [None], "dqn": [None]}, [])
+    assert [has(tmp_path / "two.png", colour) for colour in (evolution, dqn)] == [True, True]
+    assert [has(tmp_path / "one.png", colour) for colour in (evolution, dqn)] == [True, False]
 
 
 def test_curves_call_each_figure_by_one_name(tmp_path, monkeypatch):

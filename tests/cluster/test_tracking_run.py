@@ -78,6 +78,6 @@ def test_the_description_says_what_came_of_it_and_how_to_watch_it(tmp_path):
     assert begun.splitlines()[0] == done.splitlines()[0]
     assert begun.startswith("Evolution of a `mlp:64+motion+steering` driver on **curved**, among 2 cars, seed 3.")
     for words in ("48 generations, 96.3 million car-steps and 57 s", "**98.4%**", "7.61 m/s", "collides in 1.6%",
-                  f"gridsim-watch {tmp_path}/mine", "champion.mp4", "float32 [n, 64]", "gridsim-curved-evolution",
+                  f"gridsim-watch {tmp_path}/mine", "drive.html", "float32 [n, 64]", "gridsim-curved-evolution",
                   'load_model("runs:/{run_id}/model")'):  # fmt: skip
         assert words in done

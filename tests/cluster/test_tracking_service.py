@@ -96,7 +96,7 @@ def check_complete(served, name):
 
     stored = served.cwd / "served" / run.info.experiment_id / run_id / "artifacts"
     files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
-    assert {"champion.mp4", "curves.png", "trajectory.png", "model/MLmodel"} <= {path.as_posix() for path in files}
+    assert {"drive.html", "curves.png", "trajectory.png", "model/MLmodel"} <= {path.as_posix() for path in files}
     for path in files:
         assert (stored / path).read_bytes() == (folder / path).read_bytes()
     versions = client(served.uri).search_model_versions(f"run_id = '{run_id}'")

@@ -53,7 +53,7 @@ def end(error):
 def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raised, status, shown):
     monkeypatch.setattr(train.Session, "finish", end(error))
     run, notes = new_run(tmp_path, "r", SETTINGS), Notes()
-    workers = train.Workers(0, None, 0.0, "r")
+    workers = train.Workers(0, None, 0.0)
     if raised:
         with pytest.raises(raised):
             train.train(run, workers, uri, "driving", notes)
@@ -73,5 +73,5 @@ def test_what_could_not_be_sent_is_said(tmp_path, monkeypatch):
     notes = Notes()
     uri = check_uri(f"sqlite:///{tmp_path}/text.db")
     (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
-    train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0, "r"), uri, "driving", notes)
+    train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0), uri, "driving", notes)
     assert notes.seen == [1, 2, "finished"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import oracle
 import pytest
-from pictures import crashed
+from pictures import crashes
 
 from gridsim.car.ego import (
     COS,
@@ -209,8 +209,7 @@ def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
     points = rng.uniform(0.0, SIDE, (40_000, 2))
     points = points[exact[seed].clearance(points) > 0.8][:5000]
     poses = np.column_stack([points, rng.uniform(-math.pi, math.pi, len(points))]).astype(F).astype(float)
-    hit = np.empty(len(poses), dtype=np.bool_)
-    crashed(scenarios[seed].road, K, poses.astype(F), hit)
+    hit = crashes(scenarios[seed].road, np.pad(poses.astype(F), ((0, 0), (0, 2))))
     assert 0.1 < hit.mean() < 0.5
 
     def on_road(margin):

@@ -72,32 +72,20 @@ def duration_s(run):
 
 
 def descendants(pid):
-    """Processes below a process, by /proc."""
-    parents = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                parents[int(entry.name)] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            except (OSError, IndexError):
-                continue
-    found, queue = [], [pid]
-    while queue:
-        here = queue.pop()
-        children = [p for p, parent in parents.items() if parent == here]
-        found += children
-        queue += children
-    return found
+    """Processes below a process."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return [child.pid for child in psutil.Process(pid).children(recursive=True)]
+    return []
 
 
 def ray_workers(pid):
     """Actor processes that belong to a command."""
-    names = {}
+    found = []
     for child in descendants(pid):
-        try:
-            names[child] = Path(f"/proc/{child}/cmdline").read_bytes()
-        except OSError:
-            continue
-    return [child for child, name in names.items() if name.startswith(b"ray::Actor")]
+        with contextlib.suppress(OSError):
+            if Path(f"/proc/{child}/cmdline").read_bytes().startswith(b"ray::Actor"):
+                found.append(child)
+    return found
 
 
 def wait_until(condition, timeout=120.0, pause=0.02):

@@ -5,34 +5,27 @@ from pathlib import Path
 
 import numpy as np
 
+from cluster.comparison.plan import Plan
 from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
 from cluster.runs.champion import Champion
 from cluster.runs.run import RunFolder
-from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
-HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 900.0, "speed_mps": 7.0, "collision_rate": 0.5}
+HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 90.0, "speed_mps": 7.0, "collision_rate": 0.5}
 
 
-def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, **more):
-    """A finished run's folder, as small as one can be. Returns its summary."""
+def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, settings=None, **more):
+    """A finished run's folder, as small as one can be; `settings` in place of what a comparison asks for."""
     folder.mkdir(parents=True)
-    genes = PolicySpec.parse("mlp:6,7").size
-    rng = np.random.default_rng(np.random.SeedSequence(list(f"{learner} {scenario} {seed}".encode())))
-    genome = rng.standard_normal(genes).astype(np.float32)
-    champion = Champion(genome, "mlp:6,7", scenario, SimConfig(), traffic)
+    settings = settings or Plan(traffic=traffic).settings(scenario, learner, seed)
+    rng = np.random.default_rng(np.random.SeedSequence(list(f"{folder.name} {settings.seed}".encode())))
+    genome = rng.standard_normal(PolicySpec.parse(settings.policy).size).astype(np.float32)
+    champion = Champion(genome, settings.policy, settings.scenario, SimConfig(), settings.traffic)
     champion.save(folder / "champion.npz")
-    settings: RunSettings = DqnSettings(scenario, traffic, seed, policy="mlp:6,7")
-    if learner != "dqn":
-        settings = EvolveSettings(
-            scenario, traffic, seed, policy="mlp:6,7", population=512,
-            search="random" if learner == "random" else "evolution",
-            recombination="two" if learner == "two-parents" else "all",
-        )  # fmt: skip
     summary = {
-        "scenario": scenario, "seed": seed, "car_steps": 5000, "wall_s": 12.5, "champion_generation": 1,
-        "training_s": 6.0, "best_car_steps": 3000.0, "best_wall_s": 4.0,
+        "scenario": settings.scenario, "seed": settings.seed, "car_steps": 5000, "wall_s": 12.5,
+        "champion_generation": 1, "training_s": 6.0, "best_car_steps": 3000.0, "best_wall_s": 4.0,
         "champion_sha256": champion.sha256, "held_out": HELD_OUT, **more,
     }  # fmt: skip
     RunFolder(folder, settings).write_config()
