@@ -58,7 +58,7 @@ class RunSettings:
     """Network; by default one that suits the observation."""
     car_steps: int = 0
     """Car-steps at most, checked after each generation; 0: any number."""
-    until: float = 0.985
+    until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 
     pace: float = 0.0

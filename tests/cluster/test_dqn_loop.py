@@ -77,7 +77,7 @@ def test_large_values_can_be_saved_and_taken_up_again(loop):
     again.restore(*learning.state())
     assert again.counts() == learning.counts()
     for other in (loop(policy="mlp:5"), loop(replay=3999)):
-        with pytest.raises(ValueError, match="^a saved |^its "):
+        with pytest.raises(ValueError, match=r"^a saved |^its "):
             other.restore(*learning.state())
 
 
