@@ -35,9 +35,10 @@ from cluster.commands.common import (
     warn_of_crowd,
     wrong_use,
 )
+from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import is_map_file
+from gridsim.maps.scenarios import default_traffic, is_map_file, label
 
 if TYPE_CHECKING:
     from cluster.runs.run import RunFolder
@@ -266,12 +267,14 @@ def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
 def _show_end(console: Console, session: Session) -> None:
     """The closing words of a finished run."""
     from cluster.report import pictures
+    from cluster.tracking.tracker import count
 
     summary, name, path = session.summary, session.learning.step_name, session.run.path
     console.print(pictures.held_out_table("The champion on held-out drives", summary["held_out"]))
+    steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "the best so far"
     console.print(
-        f"{'solved' if summary['solved'] else 'the best so far'} after {summary[name + 's']} {name}s, "
-        f"{summary['car_steps'] / 1e6:,.1f} million car-steps, {summary['wall_s']:.0f} s\n"
+        f"{how} ({summary['validation_success_rate']:.0%} of validation) "
+        f"after {steps}, {summary['car_steps'] / 1e6:,.1f} million car-steps, {summary['wall_s']:.0f} s\n"
         f"run: {typed(path)}   champion: {typed(path / 'champion.npz')}\n"
         f"watch it: {called('gridsim-watch')} {typed(path)}\n"
         f"compare: {session.tracker.where()}",
@@ -299,7 +302,7 @@ def _discard(made: list[Path]) -> None:
 
 def evaluate_main() -> None:
     """Entry point of `gridsim-evaluate`."""
-    main("gridsim-evaluate", _evaluate)
+    main("gridsim-evaluate", _evaluate, {CheckpointError: "give a run's folder or a champion.npz"})
 
 
 def _evaluate() -> int:
@@ -321,7 +324,11 @@ def _evaluate() -> int:
     if flags.json:
         print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         return 0
-    title = f"{flags.champion} on {flags.scenario or champion.scenario}, maps from seed {flags.seed:,}"
+    road, cars = flags.scenario or champion.scenario, flags.traffic
+    if cars == -1:
+        cars = champion.traffic if road == champion.scenario else default_traffic(road)
+    title = f"{flags.champion} on {label(road)}" + (f", {cars} cars" if cars else "")
+    title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     Console().print(held_out_table(title, figures))
     if missed is not None:
         Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))

@@ -101,7 +101,9 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
                 raise
     # A title, what is wrong, and where to read more, with rules in between.
     parts = re.split(r"-{9,}", printed.getvalue())
-    fail(prog, parts[1] if len(parts) > 1 else "cannot read these flags", f"see {called(prog)} --help")
+    reason = parts[1] if len(parts) > 1 else "cannot read these flags"
+    reason = re.sub(r"invalid literal for int\(\) with base 10: ('[^']*')", r"\1 is no whole number", reason)
+    fail(prog, reason, f"see {called(prog)} --help")
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
@@ -159,7 +161,7 @@ def wrong_use(flag: str = "") -> Iterator[None]:
 
 def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
     """End with one clear line, and perhaps a second one that says what to do."""
-    line = " ".join(message.split())
+    line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: called(name[0]), " ".join(message.split()))
     print(f"{prog}: error: {line}", *([hint] if hint else []), sep="\n", file=sys.stderr, flush=True)
     raise SystemExit(code)
 

@@ -1,6 +1,7 @@
 """`make ui`: MLflow's UI on loopback, and the links to the run tables in it once it answers."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -25,6 +26,7 @@ def main(port: str) -> None:
         sys.exit(f"make ui: port {port} is in use or none; choose another with make ui PORT=...")
     except Exception as error:  # a database of another MLflow
         sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]
     server = subprocess.Popen(
         [sys.executable, "-m", "mlflow", *command, "--uvicorn-opts", "--log-level warning"],
@@ -43,6 +45,8 @@ def main(port: str) -> None:
         sys.exit(server.wait())
     except KeyboardInterrupt:
         server.wait()
+    finally:
+        server.terminate()
 
 
 def _answers(address: str) -> bool:

@@ -1,8 +1,9 @@
-"""gridsim-watch and gridsim-drive: a window on a drive, or a film of it."""
+"""gridsim-watch and gridsim-drive: a window on a drive, a film or a page of it."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import math
 import re
@@ -19,6 +20,7 @@ from rich.console import Console
 
 from cluster.commands.common import Failed, RoadFlags, UsageError, called, main, parse, wrong_use
 from cluster.report.film import CODING, Recording, VideoError, frames, others, picture, record, write_video
+from cluster.report.page import Shown, write_page
 from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
 from cluster.runs.checkpoint import CheckpointError
@@ -41,15 +43,17 @@ WATCH, DRIVE = "gridsim-watch", "gridsim-drive"
 
 @dataclass(frozen=True)
 class WatchFlags(RoadFlags):
-    """Watch a champion drive roads it never saw: in a window, or as a film.
+    """Watch a champion drive roads it never saw: in a window, as a film, or on a page for any browser.
 
     In the window: N goes on to the next road, Esc or Q ends.
     """
 
     source: tyro.conf.Positional[str]
     """A run's folder, a champion.npz, or a recorded drive.csv."""
+    beside: tyro.conf.Positional[tuple[str, ...]] = ()
+    """More of them, to be shown on one page on the same road: --output drive.html."""
     output: str = ""
-    """Write a film, .mp4 or .gif, in place of the window."""
+    """Write a film, .mp4 or .gif, or a page, .html, in place of the window."""
     generation: int | None = None
     """Watch this generation's elite (of a DQN: this evaluation's network), not the champion; 0 is the first, as in
     history.csv and MLflow."""
@@ -110,6 +114,7 @@ def watch_main() -> None:
     hints: dict = {
         NoDisplayError: "to write a film in place of a window: --output film.mp4",
         UnfinishedError: "to watch it as it stands: --follow, or --generation N",
+        CheckpointError: "give a run's folder, a champion.npz or a recorded drive.csv",
     }
     main(WATCH, _watch, hints)
 
@@ -122,7 +127,11 @@ def _watch() -> int:
     if flags.scenario:
         with wrong_use():
             check_name(flags.scenario)
-    if flags.output:
+    if flags.beside and not flags.output.lower().endswith(".html"):
+        raise UsageError("several champions are shown on a page alone: --output drive.html")
+    if flags.output.lower().endswith(".html"):
+        _page(flags, seconds)
+    elif flags.output:
         _film(flags, size, seconds)
     else:
         _show(flags, size, seconds)
@@ -221,14 +230,39 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
         yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
 
 
-def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
-    """Write --output."""
+def _output(flags: WatchFlags) -> Path:
+    """Where to write. Raises UsageError if that cannot be."""
     output = Path(flags.output)
-    suffix = output.suffix.lower()
-    if suffix not in CODING:
-        raise UsageError(f"--output {output}: a film is written as .mp4 or .gif")
+    if output.suffix.lower() not in (*CODING, ".html"):
+        raise UsageError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
     if not output.parent.is_dir():
         raise UsageError(f"--output {output}: there is no folder {output.parent}")
+    return output
+
+
+def _page(flags: WatchFlags, limit: float) -> None:
+    """Write --output as a page: drives of all sources from the same start, on the same road."""
+    output = _output(flags)
+    shown: list[Shown] = []
+    for source in (flags.source, *flags.beside):
+        one = dataclasses.replace(flags, source=source)
+        recorded = _is_recording(one)
+        for found, title in _recorded(one) if recorded else [next(_drives(one, limit))]:
+            label = title if recorded else f"{title.partition('    ')[0]} of {source}"
+            shown.append(Shown(label, str(len(shown)), found))
+            if not recorded:  # the others drive on its road, among as many cars
+                flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
+    if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
+        raise UsageError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
+    title = f"GridSim: {', '.join((flags.source, *flags.beside))} on {shown[0].drive.scenario.name}"
+    write_page(output, title, shown, SimConfig())
+    print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
+
+
+def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
+    """Write --output as a film."""
+    output = _output(flags)
+    suffix = output.suffix.lower()
     fps = flags.fps or (10 if suffix == ".gif" else 20)
     if suffix == ".gif" and 100 % fps:
         raise UsageError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")

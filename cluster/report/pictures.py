@@ -80,6 +80,10 @@ def draw_map(axis: Any, scenario: Map) -> None:
     axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
     axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
     axis.set(xlim=(0, width), ylim=(0, height), aspect="equal", xlabel="x, m", ylabel="y, m")
+    if not scenario.torus:  # its sides are rounded up to powers of two; beyond the road all is wall
+        y, x = np.nonzero(nodes > 0.0)
+        left, right, low, high = (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width).tolist()
+        axis.set(xlim=(left - 5.0, right + 5.0), ylim=(low - 5.0, high + 5.0))
 
 
 def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
@@ -203,6 +207,7 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
     table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
     table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
     table.add_row("collisions", f"{figures['collision_rate']:.1%}")
+    table.add_row("stopped, or out of time", f"{1.0 - figures['success_rate'] - figures['collision_rate']:.1%}")
     return table
 
 

@@ -133,6 +133,8 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         _check_finished(path)
         path /= CHAMPION
     arrays, meta = checkpoint.load(path)
+    if "genome" not in arrays:
+        raise CheckpointError(f"{path} holds no champion")
     try:
         genome, sim = arrays["genome"], meta["sim"]
         spec = PolicySpec.parse(meta["policy"])

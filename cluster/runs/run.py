@@ -111,7 +111,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise RunError(f"{path}: not a run's {CONFIG}: {type(error).__name__}") from error
+        raise RunError(f"{path}: not a run's {CONFIG}") from error
 
 
 def _map_sha256(settings: RunSettings) -> str:

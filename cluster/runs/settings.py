@@ -57,7 +57,8 @@ class RunSettings:
     policy: str = ""
     """Network; by default one that suits the observation."""
     car_steps: int = 0
-    """Car-steps at most, checked after each generation; 0: any number."""
+    """Car-steps at most, checked after each generation; 0: 30 million, in traffic 90, and any number if generations are
+    given."""
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
 

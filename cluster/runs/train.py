@@ -303,7 +303,8 @@ class Session:
         self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # meanwhile, in its thread
         pictures.curves(learning.history, path / "curves.png", learning.step_name)
         drive = film.record(champion, road_map, start, learning.sim.episode.time_limit, world)
-        title = f"{label(settings.scenario)}, held-out map {road_map.seed}: {drive.cars[-1, DISTANCE]:,.0f} m"
+        where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"
+        title = f"{label(settings.scenario)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
         pictures.trajectory(road_map, drive.cars, path / "trajectory.png", title)
         shown = [page.Shown("champion", "champion", drive)]
         for k in np.unique(np.linspace(0, learning.steps - 1, ELITES_SHOWN).astype(int))[::-1].tolist():

@@ -326,7 +326,7 @@ class Window:
         except pygame.error as error:
             pygame.display.quit()
             raise NoDisplayError(
-                f"no window can be opened ({error}): set DISPLAY to a running display, or do without the window"
+                f"no window can be opened ({error}): set DISPLAY to a running display, or use what needs no window"
             ) from error
         pygame.display.set_caption(caption)
         self._due = 0.0
