@@ -132,7 +132,8 @@ class Plan:
     def settings(self, scenario: str, learner: Learner, seed: int) -> RunSettings:
         """What one run is asked to do."""
         car_steps, _ = limits(self.budget)
-        common: dict[str, Any] = {"scenario": scenario, "traffic": self.traffic, "seed": seed}
+        # Equal budgets: a run ends earlier only if its champion succeeds in every validation drive.
+        common: dict[str, Any] = {"scenario": scenario, "traffic": self.traffic, "seed": seed, "until": 1.0}
         if learner == "dqn":
             steps = car_steps or UNBOUND
             usual = DqnSettings.suited[self.observation]["evaluate_every"]

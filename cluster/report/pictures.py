@@ -120,7 +120,7 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
     figure, axes = _figure(max(9.0, 3.0 + 2.2 * len(roads)), 4.6, 2)
     panels = (
         ("velocity_error_percent", "velocity error, % of the reference's speed"),
-        ("training_s", "training time, s"),
+        ("best_wall_s", "time to the champion, s"),
     )
     for axis, (name, title) in zip(axes, panels, strict=True):
         for group in groups:

@@ -1,8 +1,8 @@
 """A training run, new or resumed, from its start to its end, for commands and comparisons alike.
 
-A step is a generation or an evaluation. The order of saving after each: the checkpoint (which holds the history),
-history.csv made from it, the MLflow row. It is saved while the workers are busy with the next one. Whatever kills the
-process, the folder holds a whole step, the last or the one before, and a resumed run gives the same champion.
+A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: the
+checkpoint (which holds the history), history.csv made from it, the MLflow rows, in this order. Whatever kills the
+process, the folder holds a whole step, of a second ago or the one before, and a resumed run gives the same champion.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
-from cluster.training.trainer import Learning, Maps, held_out_episodes, now
+from cluster.training.trainer import Learning, Maps, State, held_out_episodes, now
 from cluster.workers import kernels
 from cluster.workers.pool import SerialPool, WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS
@@ -216,12 +216,14 @@ class Session:
     summary: dict[str, Any] = field(default_factory=dict)
     learning: Learning = field(init=False)
     tracker: Tracker = field(init=False)
-    _unsaved: bool = False  # whether the last step is in memory alone
+    _state: State = field(init=False)  # after the last whole step
+    _saved_steps: int = 0  # steps that are in the folder
+    _saved_at: float = -math.inf
 
     def __post_init__(self) -> None:
         self.learning = learning = new_learning(self.run.settings, self.pool, self.maps, self.initial)
         learning.warn, learning.on_progress = self.reporter.warn, self.reporter.members
-        learning.meanwhile, learning.out_of_time = self._save_last, self._out_of_time
+        learning.meanwhile, learning.out_of_time = self._save_now_and_then, self._out_of_time
         self._digest = self.run.digest()
         if self.run.saved is not None:
             try:
@@ -234,11 +236,12 @@ class Session:
         )
 
     def learn(self) -> None:
-        """Learn to the end, saving after every step."""
+        """Learn to the end, saving once a second and at the end."""
         learning, scenario = self.learning, self.run.settings.scenario
         if is_map_file(scenario) and (problem := short_lap(scenario, learning.sim)):
             learning.warn(problem)
         log_rows(self.tracker, learning.history)
+        self._state, self._saved_steps = learning.state(), learning.steps
         if learning.history:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
         try:
@@ -246,13 +249,11 @@ class Session:
                 row = learning.step()
                 self.maps.ahead(HELD_OUT_SEEDS, later=True)  # `finish` needs them
                 learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
-                self._unsaved = True
+                self._state = learning.state()
                 self.reporter.row(learning.steps, row)
-            self._save_last()
-        except CheckpointError:
-            raise
+            self.save()
         except BaseException:
-            self._save_last()  # the state is whole until the next step changes it
+            self.save()
             raise
 
     def _wall_s(self) -> float:
@@ -262,26 +263,28 @@ class Session:
     def _out_of_time(self) -> bool:
         return self._wall_s() >= self.wall_limit_s
 
-    def _save_last(self) -> None:
-        """Save and log the last step, if that was not done."""
-        if self._unsaved:
+    def _save_now_and_then(self) -> None:
+        if self._saved_steps < self.learning.steps and now() - self._saved_at >= self.learning.save_every_s:
             self.save()
-            self._unsaved = False
-            log_rows(self.tracker, self.learning.history[-1:], self.learning.steps - 1)
 
     def save(self) -> None:
-        """Write the checkpoint, then history.csv from it. Raises CheckpointError; the ones before are kept."""
-        arrays, meta = self.learning.state()
-        meta |= {
-            "digest": self._digest,
-            "init_sha256": self.run.init_sha256,
-            "tracking": {"uri": self.tracker.uri, "key": self.run.tracking_key},
-        }
-        checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
-        self._write_history()
+        """Write the last whole step's checkpoint, then history.csv from it, and log its rows, unless that is done.
+
+        Raises: CheckpointError; the files before are kept.
+        """
+        learning, (arrays, meta), saved = self.learning, self._state, self._saved_steps
+        steps = len(arrays["history"])
+        if steps > saved:
+            tracking = {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key}
+            meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, "tracking": tracking}
+            checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
+            self._saved_steps, self._saved_at = steps, now()
+            self._write_history()
+            log_rows(self.tracker, learning.history[saved:steps], saved)
 
     def _write_history(self) -> None:
-        checkpoint.write_atomic(self.run.path / HISTORY, self.learning.history_csv(), durable=False)
+        content = self.learning.history_csv(self._saved_steps)
+        checkpoint.write_atomic(self.run.path / HISTORY, content, durable=False)
 
     def finish(self, workers: int) -> None:
         """Measure the champion on held-out drives, write what is left to the folder, and hand it to the tracker."""

@@ -40,6 +40,7 @@ class Evolution(Learning):
     columns: ClassVar[tuple[str, ...]] = COLUMNS
     step_name: ClassVar[str] = "generation"
     verb: ClassVar[str] = "evolving"
+    save_every_s: ClassVar[float] = 1.0
 
     settings: EvolveSettings
     score: Callable[[np.ndarray, np.ndarray | float], np.ndarray] = fitness.scalar  # (RESULT [n, e], targets m) -> [n]

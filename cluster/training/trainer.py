@@ -46,6 +46,9 @@ MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
 
 
+State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
+
+
 class Maps:
     """Builds maps, each once, and ahead of their use in a thread; keeps the latest."""
 
@@ -123,6 +126,7 @@ class Learning(ABC):
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
     step_name: ClassVar[str]  # what a step is called
     verb: ClassVar[str]  # what is done to a network
+    save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved at the next step's beginning, which changes it
 
     settings: RunSettings
     pool: WorkerPool
@@ -275,7 +279,7 @@ class Learning(ABC):
 
     # ------------------------------------------------------------------------------------------------------- state
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    def state(self) -> State:
         """All that an exact resume needs: arrays and plain numbers."""
         rows = [[row[name] for name in self.columns] for row in self.history]
         champion = self.champion
@@ -305,12 +309,12 @@ class Learning(ABC):
             self.champion = Champion(arrays["champion"], *meta["champion"])
         self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
 
-    def history_csv(self) -> bytes:
-        """history.csv: a row a step."""
+    def history_csv(self, steps: int) -> bytes:
+        """history.csv: a row for each of the first steps."""
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
         writer.writerow([self.step_name, *self.columns])
-        for k, row in enumerate(self.history):
+        for k, row in enumerate(self.history[:steps]):
             writer.writerow([k, *(repr(row[name]) for name in self.columns)])
         return text.getvalue().encode()
 
