@@ -19,8 +19,8 @@ from torch import nn
 
 import gridsim  # noqa: F401, registers the environments
 
-CARS, STEPS = 256, 64  # of a batch
-EPOCHS, MINIBATCH = 4, 4096
+CARS, STEPS = 1024, 32  # of a batch
+EPOCHS, MINIBATCH = 4, 8192
 LEARNING_RATE, DISCOUNT, LAMBDA = 1e-3, 0.99, 0.95
 CLIP, ENTROPY, VALUE = 0.2, 0.003, 0.5
 
@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     torch.manual_seed(options.seed)
+    torch.set_num_threads(1)  # for networks as small as these, threads cost more than they gain
 
     env = gymnasium.make_vec(
         f"GridSim/{options.scenario.capitalize()}-v0", num_envs=CARS, steering=True, traffic=options.traffic,
@@ -58,9 +59,6 @@ def main() -> None:
     parameters = [*actor.parameters(), *critic.parameters()]
     optimiser = torch.optim.Adam(parameters, LEARNING_RATE, eps=1e-5)
 
-    def values(observations: np.ndarray) -> torch.Tensor:
-        return critic(torch.as_tensor(observations)).squeeze(-1)
-
     observation, _ = env.reset(seed=options.seed)
     started, car_steps, succeeded = time.perf_counter(), 0, []
     while (share := (time.perf_counter() - started) / (60 * options.minutes)) < 1.0:
@@ -69,7 +67,7 @@ def main() -> None:
         # Collect a batch.
         o_t = torch.empty(STEPS, CARS, inputs)
         a_t = torch.empty(STEPS, CARS, dtype=torch.long)
-        logp_t, r_t, v_t, v_tp1, go_on_t = (torch.empty(STEPS, CARS) for _ in range(5))
+        logp_t, r_t, v_t, go_on_t, v_after_t = (torch.zeros(STEPS, CARS) for _ in range(5))
         with torch.no_grad():
             for t in range(STEPS):
                 o_t[t] = torch.as_tensor(observation)
@@ -78,17 +76,18 @@ def main() -> None:
                 logp_t[t], v_t[t] = policy.log_prob(a_t[t]), critic(o_t[t]).squeeze(-1)
                 observation, reward, terminated, truncated, info = env.step(a_t[t].numpy())
                 r_t[t], go_on_t[t] = torch.as_tensor(reward), torch.as_tensor(~(terminated | truncated)).float()
-                v_tp1[t] = values(observation)
-                v_tp1[t][terminated] = 0.0
                 if truncated.any():  # the episode would have gone on: what follows its last observation still counts
-                    v_tp1[t][truncated] = values(np.stack(info["final_obs"][truncated]))
+                    last = torch.as_tensor(np.stack(info["final_obs"][truncated]))
+                    v_after_t[t, torch.as_tensor(truncated)] = critic(last).squeeze(-1)
                 over = terminated | truncated
                 if over.any():
                     succeeded += info["final_info"]["is_success"][over].tolist()
-            advantage, last = torch.empty(STEPS, CARS), torch.zeros(CARS)
+            advantage, ahead = torch.empty(STEPS, CARS), torch.zeros(CARS)
+            v_tp1 = critic(torch.as_tensor(observation)).squeeze(-1)
             for t in reversed(range(STEPS)):
-                delta = r_t[t] + DISCOUNT * v_tp1[t] - v_t[t]
-                advantage[t] = last = delta + DISCOUNT * LAMBDA * go_on_t[t] * last
+                delta = r_t[t] + DISCOUNT * (go_on_t[t] * v_tp1 + v_after_t[t]) - v_t[t]
+                advantage[t] = ahead = delta + DISCOUNT * LAMBDA * go_on_t[t] * ahead
+                v_tp1 = v_t[t]
         car_steps += STEPS * CARS
 
         # Learn from it.
