@@ -294,6 +294,7 @@ class Learning(ABC):
             "lost_chunks": self.lost_chunks,
             "validation_steps": self.validation_steps,
             **self.counts(),
+            "columns": list(self.columns),  # of the history, which is also read without its learner
             "champion": champion and [champion.score, champion.success_rate, champion.distance_m, champion.step],
         }
         return arrays, meta
