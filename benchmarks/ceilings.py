@@ -270,7 +270,7 @@ def coordinate(population: int, generations: int = 16) -> dict[str, float]:
         curriculum.config = dataclasses.replace(curriculum.config, first_target=curriculum.config.last_target)
         curriculum.target = curriculum.config.last_target
         broadcast: list[int] = []
-        this.on_row = lambda step, row: broadcast.append(this.learning.outcomes[0].broadcast_bytes)
+        this.reporter.row = lambda step, row: broadcast.append(this.learning.outcomes[0].broadcast_bytes)
         begun = time.perf_counter()
         learn(this)
         maps.close()

@@ -109,7 +109,7 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> State:
         if sys.stderr.isatty():
             print(f"\rdefault run: generation {generation} ", end="", file=sys.stderr, flush=True)
 
-    this.on_row = keep
+    this.reporter.row = keep
     learn(this)
     for seed in (*this.learning.curriculum.map_seeds, *VALIDATION_SEEDS, *HELD_OUT_SEEDS):
         maps.get(seed)  # a short run ends before all are built, and nothing else is to be built beside what is measured
@@ -145,7 +145,7 @@ def last_generations(
         learning.solved = len(figures["wall"]) > LAST
         begun = time.perf_counter()
 
-    this.on_row = measure
+    this.reporter.row = measure
     begun = time.perf_counter()
     learn(this)
     n, goals = settings.population, targets(pool.task.episodes, pool.task.limits)

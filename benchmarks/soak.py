@@ -85,7 +85,7 @@ def soak(generations: int, workers: int) -> dict[str, list[int]]:
             if sys.stderr.isatty():
                 print(f"\rgeneration {generation} ", end="", file=sys.stderr, flush=True)
 
-        this.on_row = look
+        this.reporter.row = look
         learn(this)
         maps.close()
     return seen

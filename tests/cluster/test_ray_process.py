@@ -30,7 +30,8 @@ pytestmark = pytest.mark.e2e
 SCRIPT = """
     import ctypes
     import sys
-    from cluster.commands.common import main, undisturbed
+    from cluster.commands.common import main
+    from cluster.runs.train import undisturbed
     from cluster.workers.ray_pool import RayPool
     from test_pool import make_recipes, make_task, never_built
     from test_ray_process import Slow
