@@ -36,7 +36,7 @@ def test_help_fills_its_lines(prog, columns, monkeypatch, capsys):
         parse(FLAGS[prog], prog, ["--help"])
     assert not ended.value.code
     lines = capsys.readouterr().out.splitlines()
-    without_flag = {"gridsim-watch": " SOURCE", "gridsim-evaluate": " CHAMPION", "gridsim-compare": " [RUNS]"}
+    without_flag = {"gridsim-watch": " SOURCE [BESIDE]", "gridsim-evaluate": " CHAMPION", "gridsim-compare": " [RUNS]"}
     assert lines[0] == f"usage: {prog} [-h] [OPTIONS]{without_flag.get(prog, '')}"
     assert max(map(len, lines)) <= columns
     width = max(map(len, lines)) - 2  # without the box, which is there where a terminal can show it
