@@ -94,7 +94,7 @@ class Call:
         )  # fmt: skip
         asked = self.asked or [Chunk(slice(0, n), slice(0, e))]
         whole = sum(metres(task, part) for part in asked)
-        return cut(task, asked, self.workers, max(self.drives.sum() / whole, 1e-12))
+        return cut(task, asked, self.workers, [max(self.drives.sum() / whole, 1e-12)] * len(asked))
 
     def run(self) -> float:
         """Seconds from its begin to its end."""

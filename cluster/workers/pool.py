@@ -31,7 +31,6 @@ WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a 
 CHUNK_S = 0.0004  # of the coordinator's time, for a chunk and its results: many workers get larger chunks
 LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
 LARGER = 4  # times what is worth sending, where that is more
-WHOLE = 0.6  # of a member's metres: a larger share is not cut
 SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
 
 
@@ -62,6 +61,7 @@ class Call:
         asked: episodes of members that were asked for.
         wall_s: seconds from call to return.
         busy_s: seconds that each worker (by its number) was at work. A replaced worker's number goes on counting.
+        episode_s: seconds of that which each episode took, of all members together, float64 [episodes].
         retries: chunks that were sent again because their worker died.
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
@@ -72,6 +72,7 @@ class Call:
     results: np.ndarray
     lost: np.ndarray
     asked: int
+    episode_s: np.ndarray
     wall_s: float = 0.0
     busy_s: dict[int, float] = field(default_factory=dict)
     retries: int = 0
@@ -92,6 +93,7 @@ class Call:
 
     def _count(self, worker: int, chunk: Chunk, seconds: float) -> None:
         self.done += size(chunk)
+        self.episode_s[chunk.columns] += seconds / (chunk.columns.stop - chunk.columns.start)
         self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
 
 
@@ -159,6 +161,7 @@ def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outc
         results=np.zeros((n, e), RESULT),
         lost=np.zeros(n, bool),
         asked=sum(map(size, asked)),
+        episode_s=np.zeros(e),
         rewound=np.zeros((e, 5), np.float32),
         worlds=np.zeros_like(task.worlds),
     )
@@ -167,7 +170,13 @@ def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outc
 def new_collected(task: CollectTask) -> Collected:
     """A collection to be filled."""
     n = len(task.episodes)
-    return Collected(results=np.zeros(n, RESULT), lost=np.zeros(n, bool), asked=n, policy=PolicySpec.parse(task.policy))
+    return Collected(
+        results=np.zeros(n, RESULT),
+        lost=np.zeros(n, bool),
+        asked=n,
+        episode_s=np.zeros(n),
+        policy=PolicySpec.parse(task.policy),
+    )
 
 
 def rectangle(rows: int, columns: int) -> list[Chunk]:
@@ -272,38 +281,44 @@ def metres(task: Task | CollectTask, chunk: Chunk) -> float:
     return float(targets(task.episodes[chunk.columns], task.limits).sum()) * (chunk.rows.stop - chunk.rows.start)
 
 
-def cut(task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s: float = METRE_S) -> list[Chunk]:
-    """Cut what is asked for into chunks, by the metres to be driven: large ones first, small ones last.
+def cut(
+    task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None
+) -> list[Chunk]:  # fmt: skip
+    """Cut what is asked for into chunks, by the seconds that it may take: large ones first, small ones last.
 
     Each takes most of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
     little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one's
     episodes where that is enough, so that every worker has its share even of one member. Depends on the arguments
     alone, and no result depends on it.
+
+    Args:
+        metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
     """
+    rates = [METRE_S] * len(asked) if metre_s is None else metre_s
     chunks: list[Chunk] = []
-    left = sum(metres(task, block) for block in asked)
+    left = sum(rate * metres(task, block) for rate, block in zip(rates, asked, strict=True))
     worth_s = max(WORTH_SENDING_S, CHUNK_S * workers)  # while one is at its chunk, all others get theirs
-    least = min(worth_s / metre_s, left / (2 * workers))  # where nothing costs anything, everybody has some
-    largest = max(LARGEST_S, LARGER * worth_s) / metre_s
+    least = min(worth_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    largest = max(LARGEST_S, LARGER * worth_s)
     goals = targets(task.episodes, task.limits)
-    for rows, columns in asked:
-        mileage = np.concatenate([[0.0], np.cumsum(goals[columns])])  # m, of one member
+    for rate, (rows, columns) in zip(rates, asked, strict=True):
+        seconds = rate * np.concatenate([[0.0], np.cumsum(goals[columns])])  # of one member, up to each episode
         row, column = rows.start, 0
         while row < rows.stop and columns.stop > columns.start:
             share = min(max(SHARE * left / workers, least), largest)
-            if column == 0 and share >= WHOLE * mileage[-1]:
-                stop = min(row + max(int(share / mileage[-1]), 1), rows.stop)
+            if column == 0 and share >= seconds[-1]:
+                stop = min(row + max(int(share / seconds[-1]), 1), rows.stop)
                 chunks.append(Chunk(slice(row, stop), columns))
-                left -= (stop - row) * mileage[-1]
+                left -= (stop - row) * seconds[-1]
                 row = stop
             else:
-                rest = mileage[-1] - mileage[column]
+                rest = seconds[-1] - seconds[column]
                 share = rest / math.ceil(rest / share)  # pieces as even as may be: a small one costs as much to send
-                stop = int(np.searchsorted(mileage, mileage[column] + share * (1.0 + 1e-9), side="right")) - 1
-                stop = min(max(stop, column + 1), len(mileage) - 1)
+                stop = int(np.searchsorted(seconds, seconds[column] + share * (1.0 + 1e-9), side="right")) - 1
+                stop = min(max(stop, column + 1), len(seconds) - 1)
                 chunks.append(Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)))
-                left -= mileage[stop] - mileage[column]
-                row, column = (row + 1, 0) if stop == len(mileage) - 1 else (row, stop)
+                left -= seconds[stop] - seconds[column]
+                row, column = (row + 1, 0) if stop == len(seconds) - 1 else (row, stop)
     return chunks
 
 

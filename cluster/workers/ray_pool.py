@@ -19,7 +19,7 @@ import pickle
 import shutil
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -95,6 +95,14 @@ class _Job:
     call: Outcome | Collected
 
 
+_Kind = tuple[type, Limits, bool]
+
+
+def _kind(task: Task | CollectTask, part: Chunk) -> _Kind:
+    """Of parts with about the same time for a metre: a single member drives on where many others crash early."""
+    return type(task), task.limits, part.rows.stop - part.rows.start == 1
+
+
 class RayPool(WorkerPool):
     """Workers as Ray actors of one CPU each. One pool at a time in a process.
 
@@ -123,7 +131,7 @@ class RayPool(WorkerPool):
         self._slots: list[_Slot] = []
         self._serial = 0
         self._failed_starts, self._last_failure = 0, ""
-        self._metre_s: dict[tuple[type, Limits], float] = {}  # what a metre of such tasks took the last time
+        self._metre_s: dict[_Kind, float] = {}  # what a metre of such a part took the last time
         self._logs = ""  # where they are, in words
         self._session: str | None = None  # folder of our own Ray's logs
         self._failure: BaseException | None = None
@@ -145,10 +153,9 @@ class RayPool(WorkerPool):
     ) -> None:  # fmt: skip
         started = time.perf_counter()
         self._wait_for_ray()
-        kind, collecting = (type(task), task.limits), isinstance(task, CollectTask)
-        parts = cut(
-            task, asked, self._asked * (FINER if collecting else 1), self._metre_s.get(kind, UNMEASURED_METRE_S)
-        )
+        collecting = isinstance(task, CollectTask)
+        metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in asked]
+        parts = cut(task, asked, self._asked * (FINER if collecting else 1), metre_s)
         dispatch = Dispatch(parts, collecting)
         self._serial += 1
         task_ref, call.broadcast_bytes = self._shared.put(task)
@@ -179,9 +186,17 @@ class RayPool(WorkerPool):
                 why = capacity() + self._last_failure
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
-        if whole := sum(metres(task, block) for block in asked):
-            self._metre_s[kind] = max(sum(call.busy_s.values()) / whole, 1e-9)
+        self._measure(task, asked, call)
         call.wall_s = time.perf_counter() - started
+
+    def _measure(self, task: Task | CollectTask, asked: Sequence[Chunk], call: Outcome | Collected) -> None:
+        """Remember what a metre took."""
+        seconds: Counter[_Kind] = Counter()
+        whole: Counter[_Kind] = Counter()
+        for part in asked:
+            seconds[_kind(task, part)] += call.episode_s[part.columns].sum()
+            whole[_kind(task, part)] += metres(task, part)
+        self._metre_s |= {kind: max(seconds[kind] / whole[kind], 1e-9) for kind in seconds if whole[kind]}
 
     def _ready(self, refs: list[Any], timeout_s: float) -> list[Any]:
         """All answers that have come; where none has, wait for the next one for so long."""

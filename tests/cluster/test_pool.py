@@ -160,7 +160,7 @@ def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[flo
 def test_chunks_let_no_worker_wait_for_the_slowest(workers: int, n: int, episodes: int, target: float) -> None:
     """Simulated with equal metres: from the first worker that runs out to the last, one small chunk passes."""
     task, metre_s = make_task(episodes=goals(*[target] * episodes)), 1e-6
-    parts = cut(task, rectangle(n, episodes), workers, metre_s)
+    parts = cut(task, rectangle(n, episodes), workers, [metre_s])
     busy = [0.0] * workers
     for part in parts:
         busy[busy.index(min(busy))] += metres(task, part)
@@ -168,11 +168,21 @@ def test_chunks_let_no_worker_wait_for_the_slowest(workers: int, n: int, episode
     assert len(parts) <= 16 * workers, "as few as that needs"
 
 
+def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers() -> None:
+    """Validation drives its 2,000 m; most members crash early, so a metre of theirs takes less time."""
+    task = make_task(episodes=goals(*[2000.0] * 256, 400.0, 400.0))
+    asked, metre_s = [Chunk(slice(0, 1), slice(0, 256)), Chunk(slice(1, 511), slice(256, 258))], [1e-6, 2e-7]
+    busy = [0.0, 0.0]
+    for part in cut(task, asked, 2, metre_s):
+        busy[busy.index(min(busy))] += metre_s[part.columns.start // 256] * metres(task, part)
+    assert abs(busy[0] - busy[1]) <= WORTH_SENDING_S
+
+
 def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
     """Of a large network, 1 ms a metre, before any of it is measured."""
     task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for part in cut(task, rectangle(10_000, 2), 2, UNMEASURED_METRE_S)) * 1e-3 < 20
-    assert len(cut(task, rectangle(512, 2), 2, UNMEASURED_METRE_S)) < 40, "as few as a small network needs"
+    assert max(metres(task, part) for part in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
+    assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
 
 
 def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
