@@ -76,7 +76,7 @@ def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness:
             row = learning.step()
             if on_step:
                 on_step(learning.steps, row)
-        learning.conclude()
+        learning.validate_last()
         assert learning.champion is not None
         genome = learning.champion.genome
         champion = Champion(genome, settings.policy, settings.scenario, learning.sim, settings.traffic)

@@ -248,7 +248,9 @@ class Session:
             while not learning.done() and not (learning.steps and self._out_of_time()):
                 row = learning.step()
                 self.maps.ahead(HELD_OUT_SEEDS, later=True)  # `finish` needs them
-                learning.timed(row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None)
+                learning.add_wall_clock(
+                    row, self._wall_s(), learning.history[-2] if len(learning.history) > 1 else None
+                )
                 self._state = learning.state()
                 self.reporter.row(learning.steps, row)
             self.save()
@@ -292,7 +294,7 @@ class Session:
 
         self.reporter.note("measuring the champion on held-out drives")
         learning, path, settings = self.learning, self.run.path, self.run.settings
-        learning.conclude()
+        learning.validate_last()
         assert learning.champion is not None
         champion = Champion(
             learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import DqnSettings
-from cluster.training.trainer import Learning, made_good, some_left, unmodified
+from cluster.training.trainer import Learning, check_any_left, mean_speed, unmodified
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
 from evolution.dqn.replay import Replay
@@ -89,7 +89,7 @@ class Dqn(Learning):
         updates = sum(n for n, _, _ in self._losses)
         row |= {
             "distance_m/mean": float(driven["distance"].mean(dtype=np.float64)),
-            "speed_mps/mean": made_good(driven, self.sim.episode.control_period),
+            "speed_mps/mean": mean_speed(driven, self.sim.episode.control_period),
             "reward/mean": rewards / steps,
             "loss": sum(n * loss for n, loss, _ in self._losses) / max(updates, 1),
             "q/mean": sum(n * q for n, _, q in self._losses) / max(updates, 1),
@@ -128,8 +128,8 @@ class Dqn(Learning):
         progress = self.on_progress
         tell = (lambda done, total: progress("collect", done, total)) if progress else None
         brought = self.pool.collect(task, tell, self._train)
-        self._tell_of_lost("collect", brought)
-        some_left(brought.lost, "collect")
+        self._report_lost("collect", brought)
+        check_any_left(brought.lost, "collect")
         self.replay.add(brought.experience)
         results = brought.results[~brought.lost]
         steps = int(results["steps"].sum())
@@ -170,12 +170,12 @@ class Dqn(Learning):
             "validate", unmodified(network[None]), self.curriculum.validation(), self.curriculum.goal_limits(),
             meanwhile=self._train,
         )  # fmt: skip
-        some_left(driven.lost, "validate")
+        check_any_left(driven.lost, "validate")
         self._judge(network, driven.results, self.steps)
         results = driven.results[0]
         return {
             "distance_m/best": float(results["distance"].mean()),
-            "speed_mps/best": made_good(results, self.sim.episode.control_period),
+            "speed_mps/best": mean_speed(results, self.sim.episode.control_period),
             "network/success_rate": float(success_rate(results[None])[0]),
         }
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import EvolveSettings
-from cluster.training.trainer import Bred, Learning, made_good, some_left
+from cluster.training.trainer import Bred, Learning, check_any_left, mean_speed
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import targets
@@ -88,7 +88,7 @@ class Evolution(Learning):
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
         driven = self._evaluate("evolve", call.bred, call.episodes, limits, call.asked, self.meanwhile)
-        some_left(driven.lost[:n], "evolve")
+        check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
 
@@ -114,7 +114,7 @@ class Evolution(Learning):
             "fitness/std": float(finite.std()) if finite.size else 0.0,
             "distance_m/best": float(led["distance"].mean()),
             "distance_m/mean": float(results["distance"].mean()),
-            "speed_mps/best": made_good(led, period),
+            "speed_mps/best": mean_speed(led, period),
             "speed_mps/mean": float((results["distance"].sum(axis=1) / np.maximum(seconds, 1e-9)).mean()),
             "target_m": limits.target,
             "leader/success_rate": float(success_rate(led[None])[0]),

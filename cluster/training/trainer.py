@@ -192,7 +192,7 @@ class Learning(ABC):
     def candidate(self) -> np.ndarray | None:
         """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
-    def conclude(self) -> None:
+    def validate_last(self) -> None:
         """Validate the last candidate when a run ends.
 
         This is not in the checkpoint: a run that is extended goes on as if it had never ended.
@@ -247,10 +247,10 @@ class Learning(ABC):
         outcome = self.pool.evaluate(task, bred.recipes, tell, asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
-        self._tell_of_lost(stage, outcome)
+        self._report_lost(stage, outcome)
         return outcome
 
-    def _tell_of_lost(self, stage: str, brought: Outcome | Collected) -> None:
+    def _report_lost(self, stage: str, brought: Outcome | Collected) -> None:
         self.lost_chunks += len(brought.warnings)
         for text in brought.warnings:
             self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
@@ -259,7 +259,7 @@ class Learning(ABC):
         """Results [n, e] of given genomes [n, genes]: recipes that are plain copies."""
         return self._evaluate(stage, unmodified(genomes), episodes, limits)
 
-    def timed(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
+    def add_wall_clock(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
         """Add the wall clock's columns to a row."""
         row["wall_s"] = wall_s
         steps, seconds = row["car_steps"], wall_s
@@ -273,7 +273,7 @@ class Learning(ABC):
         before = self.car_steps
         episodes = held_out_episodes(self.maps, self.settings.traffic)
         driven = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
-        some_left(driven.lost, "held out")
+        check_any_left(driven.lost, "held out")
         self.car_steps = before  # not part of learning
         return summarise(driven.results[0], self.sim.episode.control_period)
 
@@ -347,7 +347,7 @@ def unmodified(genomes: np.ndarray) -> Bred:
     return Bred(genomes[:0], recipes(0)).and_copies(genomes)
 
 
-def some_left(lost: np.ndarray, stage: str) -> None:
+def check_any_left(lost: np.ndarray, stage: str) -> None:
     """Raises: PoolError where all of lost, bool [n], are: there is nothing to go on with."""
     if lost.all():
         raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")
@@ -364,12 +364,12 @@ def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
         "episodes": len(results),
         "success_rate": float((results["end"] == End.SUCCESS).mean()),
         "distance_m": float(results["distance"].mean()),
-        "speed_mps": made_good(results, period_s),
+        "speed_mps": mean_speed(results, period_s),
         "collision_rate": float((results["end"] == End.COLLISION).mean()),
     }
 
 
-def made_good(results: np.ndarray, period_s: float) -> float:
+def mean_speed(results: np.ndarray, period_s: float) -> float:
     """Mean over episodes of the speed made good: new ground over time, in m/s."""
     seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
     return float((results["distance"] / seconds).mean())

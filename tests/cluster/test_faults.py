@@ -113,8 +113,8 @@ def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
             warned: list[str] = []
             evolution = Evolution(settings, pool, maps, warn=warned.append)
             for _ in range(settings.generations):
-                evolution.timed(evolution.step(), 1.0, None)
-            evolution.conclude()
+                evolution.add_wall_clock(evolution.step(), 1.0, None)
+            evolution.validate_last()
         assert evolution.champion is not None
         found.append((evolution.champion.genome.tobytes(), {k: v.tobytes() for k, v in evolution.state()[0].items()}))
         if workers:

@@ -49,7 +49,7 @@ def begin(maps, settings=SETTINGS):
 
 def go_on(evolution):
     """One generation more, at a second each."""
-    evolution.timed(evolution.step(), float(evolution.generation), None)
+    evolution.add_wall_clock(evolution.step(), float(evolution.generation), None)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
             go_on(resumed)
         assert state_of(resumed) == state_of(straight)
     for run in (straight, resumed):
-        run.conclude()
+        run.validate_last()
     assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
     assert resumed.champion.score == straight.champion.score
 
@@ -388,7 +388,7 @@ def test_a_candidate_lost_in_validation_is_no_champion(maps):
     evolution = losing(maps, validate=slice(0, None))
     go_on(evolution)
     with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
-        evolution.conclude()
+        evolution.validate_last()
     assert evolution.champion is None
 
 
