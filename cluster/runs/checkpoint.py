@@ -2,7 +2,7 @@
 
 The format is NumPy's `.npz` (an uncompressed zip; `np.load` reads it) with two additions: the member `meta`, JSON as
 uint8, and a zip comment `sha256:<hex>` that covers every byte before the hex digits. So a truncated or edited file is
-told from a whole one before anything in it is parsed. Nothing is ever pickled.
+distinguished from a whole one before anything in it is parsed. Nothing is ever pickled.
 """
 
 import contextlib
@@ -68,8 +68,8 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
         raise CheckpointError(f"{path}: truncated, or not written by GridSim")
     if content[-_DIGEST:] != hashlib.sha256(memoryview(content)[:-_DIGEST]).hexdigest().encode():
         raise CheckpointError(f"{path}: damaged or edited: its content does not match its checksum")
-    # A checksum is no signature: somebody else may have written these bytes. On what is no such archive zipfile, numpy
-    # and json raise a dozen kinds of errors, and each means the same.
+    # A checksum is no signature: somebody else may have written these bytes. zipfile, numpy and json raise a dozen
+    # kinds of errors for such content, and all mean the same.
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             if sum(member.file_size for member in archive.infolist()) > len(content):

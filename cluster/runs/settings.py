@@ -24,7 +24,7 @@ MAX_ELITES = 10_000
 MAX_REPLAY = 10_000_000
 REPLAY_BYTES = 16  # of a row, beside the observation, at most
 REPLAY_SHARE = 0.75  # of the largest checkpoint
-LEAST_GROUP = 16  # members of a group, of whom the best are to be good
+LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default.
@@ -44,7 +44,7 @@ class RunSettings:
     command: ClassVar[str]  # that makes such a run
     default_policies: ClassVar[dict[Observation, str]]
     unbound: ClassVar[tuple[str, ...]]  # what may be greater when a run is resumed: it only ends later
-    counts: ClassVar[tuple[str, ...]]  # what a checkpoint tells of how far a run has come, integers
+    counts: ClassVar[tuple[str, ...]]  # integers in a checkpoint that say how far a run has come
 
     scenario: str = "seamless"
     """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
@@ -85,7 +85,7 @@ class RunSettings:
 
     @property
     def learner(self) -> str:
-        """What a comparison calls it, which tells the two ways of recombination apart."""
+        """Its name in a comparison, which distinguishes the two ways of recombination."""
         return self.algorithm
 
     def curriculum(self) -> CurriculumConfig:
@@ -94,7 +94,7 @@ class RunSettings:
         pace, champion_pace = (low + 0.8, low + 0.3) if self.traffic else (low + 2.0, low + 0.85)
         if self.pace:
             pace, champion_pace = self.pace + 1.15, self.pace
-        # What befalls a car in traffic is chance: it takes more episodes to tell who drives well.
+        # In traffic much is chance: it takes more episodes to see how well a network drives.
         episodes = 3 if self.traffic else 1
         return CurriculumConfig(pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes)
 
@@ -181,7 +181,7 @@ class EvolveSettings(RunSettings):
         return usual.replace("+", "+motion+") if self.traffic and self.observation == "rays" else usual
 
     def default_car_steps(self) -> int:
-        """Where neither generations nor car-steps are given."""
+        """Used if neither generations nor car-steps are given."""
         return CAR_STEPS_IN_TRAFFIC if self.traffic else CAR_STEPS
 
     @property

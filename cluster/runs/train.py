@@ -47,7 +47,7 @@ NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
 class Reporter:
-    """Shows how a run goes; this one shows warnings alone."""
+    """Shows how a run goes; this one shows only warnings."""
 
     def warn(self, text: str) -> None:
         """One line."""
@@ -380,7 +380,7 @@ def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any]
 
 
 def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
-    """Send to MLflow what it lacks of a finished run, with the times of then; what MLflow has is not touched.
+    """Send to MLflow what it lacks of a finished run, with the original times; what MLflow has stays as it is.
 
     Args: the run, opened; the tracking address, or "" for the one that the run has; the experiment.
     Returns: what was sent, in a few words, and one line about what could not be, or None.

@@ -1,8 +1,8 @@
 """What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
 
 A learner is a loop of steps between a pool and a run's files; `coordinator` has the genetic algorithm's, `dqn_loop` the
-DQN's. Everything it decides follows from the seed and from what the workers return; nothing follows from the clock or
-from who returned it.
+DQN's. Everything it decides follows from the seed and from what the workers return; nothing depends on the clock or
+on which worker returned it.
 """
 
 from __future__ import annotations
@@ -113,14 +113,14 @@ class Learning(ABC):
 
     Attributes:
         settings: what the run was asked to do.
-        pool: who evaluates.
-        maps: who builds maps.
+        pool: evaluates members and collects experience.
+        maps: builds maps.
         initial: a genome to start from, float32 [genes].
         history: a row of figures for each step (`columns`).
         elites: the network of each step, float32 [genes].
         validation_steps: car-steps of these that validation took.
         lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
-        warn: told of each of these, in one line.
+        warn: called with one line for each of these.
     """
 
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
@@ -169,11 +169,11 @@ class Learning(ABC):
 
     @abstractmethod
     def summary(self) -> dict[str, Any]:
-        """What summary.json has of this learner alone."""
+        """What summary.json has only for this learner."""
 
     @abstractmethod
     def way(self) -> tuple[float, float, str]:
-        """How far the run is, how far it goes at most (0: nobody knows), and in what unit."""
+        """How far the run is, how far it goes at most (0: unknown), and in what unit."""
 
     @abstractmethod
     def describe(self, row: dict[str, float]) -> str:
@@ -268,7 +268,7 @@ class Learning(ABC):
         row["car_steps_per_s"] = steps / max(seconds, 1e-9)
 
     def held_out(self) -> dict[str, float]:
-        """The champion on roads nobody was trained or chosen on: the same 64 episodes for every run of a scenario."""
+        """The champion on roads never used in training or selection: the same 64 episodes in all runs of a scenario."""
         assert self.champion is not None
         before = self.car_steps
         episodes = held_out_episodes(self.maps, self.settings.traffic)
@@ -300,7 +300,7 @@ class Learning(ABC):
         return arrays, meta
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        """Continue from a `state` of the same settings; that a file holds one is what its checksum and digest say."""
+        """Continue from a `state` of the same settings; its checksum and digest were verified."""
         self.car_steps, self.solved = meta["car_steps"], meta["solved"]
         self.lost_chunks, self.validation_steps = meta["lost_chunks"], meta["validation_steps"]
         self.history = [dict(zip(self.columns, row, strict=True)) for row in arrays["history"].tolist()]
@@ -348,13 +348,13 @@ def unmodified(genomes: np.ndarray) -> Bred:
 
 
 def check_any_left(lost: np.ndarray, stage: str) -> None:
-    """Raises: PoolError where all of lost, bool [n], are: there is nothing to go on with."""
+    """Raises: PoolError if all of lost, bool [n], are true: then there is nothing to continue with."""
     if lost.all():
         raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")
 
 
 def held_out_episodes(maps: Maps, traffic: int) -> Episodes:
-    """The 64 episodes that are reported on and never chosen on."""
+    """The 64 episodes that are reported, and never used for selection."""
     return spread_starts(maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, traffic)
 
 
@@ -370,7 +370,7 @@ def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
 
 
 def mean_speed(results: np.ndarray, period_s: float) -> float:
-    """Mean over episodes of the speed made good: new ground over time, in m/s."""
+    """Mean over episodes of new ground over time, in m/s."""
     seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
     return float((results["distance"] / seconds).mean())
 

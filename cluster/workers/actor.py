@@ -42,7 +42,7 @@ class Actor:
         return os.getpid()
 
     def prepare(self, serial: int, *update: Any) -> int:
-        """Take up a first task and load its kernels with an empty chunk: no member is to blame if that kills."""
+        """Take up a first task and load its kernels with an empty chunk: if that kills it, no member is blamed."""
         self.run(serial, b"", 0, 0, *update)
         return os.getpid()
 

@@ -1,6 +1,6 @@
-"""Which chunk goes to which worker, and what follows from a worker's death: bookkeeping alone, without Ray or a clock.
+"""Which chunk goes to which worker, and what happens when a worker dies. Bookkeeping only: no Ray, no clock.
 
-* The chunks of a worker that died are sent again, each alone, so that the next time it is clear which one killed.
+* The chunks of a worker that died are sent again, one at a time, so that a second death shows which one caused it.
 * A chunk that killed twice is split into its members (of a batch of experience: its episodes). A member that kills
   three workers by itself is lost, with everything that it was asked for. So the same members are lost however many
   workers there are and however the work was cut.
@@ -26,7 +26,7 @@ class Dispatch:
 
     Args:
         parts: the chunks; where one is split, its pieces are added at the end.
-        by_episode: whether an episode is lost alone, and not a member.
+        by_episode: whether single episodes are lost, instead of whole members.
 
     Attributes:
         retries: chunks that were sent again because their worker died; one that is split then counts once.
@@ -121,7 +121,7 @@ class Dispatch:
         return worker, chunk
 
     def _units(self, chunk: int) -> range:
-        """The members of a chunk, or its episodes where these are lost alone."""
+        """The members of a chunk, or its episodes if `by_episode`."""
         rows, columns = self.parts[chunk]
         span = columns if self._by_episode else rows
         return range(span.start, span.stop)
@@ -139,7 +139,7 @@ class Dispatch:
             self._suspects.add(piece)
 
     def _lose(self, chunk: int) -> list[int]:
-        """Give up a chunk of one member and what else that member was asked for, or a chunk of one episode alone."""
+        """Give up a chunk of one member, with everything else asked of that member; or a chunk of one episode."""
         rows = self.parts[chunk].rows
         also = [] if self._by_episode else [k for k, part in enumerate(self.parts) if part.rows == rows and k != chunk]
         lost = [k for k in (chunk, *also) if k in self._open]
@@ -148,7 +148,7 @@ class Dispatch:
         return lost
 
     def _late(self, now: float) -> Iterator[int]:
-        """Chunks that one worker alone holds, and too long, or behind such a one."""
+        """Chunks that only one worker holds, for too long or queued behind one held for too long."""
         limit_s = max(LATE_S, LATE * self._slowest_s)
         for worker in sorted(self._held, key=self._since.__getitem__):
             held = self._held[worker]

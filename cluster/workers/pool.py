@@ -102,9 +102,9 @@ class Outcome(Call):
     """What `evaluate` returned: results RESULT [members, episodes], members in the order of the recipes.
 
     Attributes:
-        rewound: float32 [episodes, 5], of episodes with a `rewind` the state so many steps before the end. One member
-            alone drives such an episode.
-        worlds: float32 [episodes, cars, world.FIELDS], the traffic of then.
+        rewound: float32 [episodes, 5], of episodes with a `rewind` the state so many steps before the end. Only one
+            member drives such an episode.
+        worlds: float32 [episodes, cars, world.FIELDS], the traffic at that time.
     """
 
     rewound: np.ndarray
@@ -286,10 +286,10 @@ def cut(
 ) -> list[Chunk]:  # fmt: skip
     """Cut what is asked for into chunks, by the seconds that it may take: large ones first, small ones last.
 
-    Each takes most of what would be a worker's share of the rest, so that nobody waits long for the slowest and still
-    little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one's
-    episodes where that is enough, so that every worker has its share even of one member. Depends on the arguments
-    alone, and no result depends on it.
+    Each takes most of what would be a worker's share of the rest, so that no worker waits long for the slowest, and
+    little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one
+    member's episodes, so that all workers share even a single member. It depends only on the arguments, and no result
+    depends on it.
 
     Args:
         metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
@@ -298,7 +298,7 @@ def cut(
     chunks: list[Chunk] = []
     left = sum(rate * metres(task, block) for rate, block in zip(rates, asked, strict=True))
     worth_s = max(WORTH_SENDING_S, CHUNK_S * workers)  # while one is at its chunk, all others get theirs
-    least = min(worth_s, left / (2 * workers))  # where nothing costs anything, everybody has some
+    least = min(worth_s, left / (2 * workers))  # every worker gets some, however little it costs
     largest = max(LARGEST_S, LARGER * worth_s)
     goals = targets(task.episodes, task.limits)
     for rate, (rows, columns) in zip(rates, asked, strict=True):

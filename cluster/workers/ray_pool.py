@@ -260,9 +260,9 @@ class RayPool(WorkerPool):
         for part in lost:
             call.lose(part)
         if lost:
-            who = identify(job.task, lost[0], job.recipes)
+            lost_one = identify(job.task, lost[0], job.recipes)
             call.warnings.append(
-                f"{who} killed its worker {MAX_KILLS} times and is lost; the last time {reason}{self._logs}"
+                f"{lost_one} killed its worker {MAX_KILLS} times and is lost; the last time {reason}{self._logs}"
             )
         if dispatch.deaths > max(MAX_DEATHS, MAX_KILLS * self._asked):
             raise PoolError(
