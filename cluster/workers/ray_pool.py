@@ -19,7 +19,7 @@ import pickle
 import shutil
 import threading
 import time
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -191,8 +191,8 @@ class RayPool(WorkerPool):
 
     def _measure(self, task: Task | CollectTask, asked: Sequence[Chunk], call: Outcome | Collected) -> None:
         """Remember what a metre took."""
-        seconds: Counter[_Kind] = Counter()
-        whole: Counter[_Kind] = Counter()
+        seconds: defaultdict[_Kind, float] = defaultdict(float)
+        whole: defaultdict[_Kind, float] = defaultdict(float)
         for part in asked:
             seconds[_kind(task, part)] += call.episode_s[part.columns].sum()
             whole[_kind(task, part)] += metres(task, part)
