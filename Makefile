@@ -16,7 +16,7 @@ PORT   ?= 5000
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help install develop evolve dqn compare test test-slow ui bench pictures lint format
+.PHONY: help install develop evolve dqn compare test test-slow ui bench results pictures lint format
 
 help: ## This list
 	@echo "usage: make TARGET [ARGS=\"...\"]"; echo
@@ -48,6 +48,9 @@ ui: $(STAMP) ## Show the runs in MLflow's UI, on loopback
 bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/scaling.py
+
+results: $(STAMP) ## Measure the tables of docs/results.md again, in an hour and a half; it can be interrupted
+	$(BIN)/python benchmarks/results.py --write $(ARGS)
 
 pictures: $(STAMP) ## Draw docs/'s pictures of the five scenarios again
 	$(BIN)/python docs/pictures.py

@@ -31,7 +31,7 @@ PARTS = {"ceilings.py", "simulation.py"}  # of scaling.py
 
 
 def test_every_script_is_run_here() -> None:
-    assert set(RUNS) | PARTS == {path.name for path in FOLDER.glob("*.py")}
+    assert {"results.py", *RUNS} | PARTS == {path.name for path in FOLDER.glob("*.py")}
 
 
 @pytest.mark.e2e
@@ -50,6 +50,17 @@ def test_script_runs(name: str, tmp_path: Path) -> None:
         assert figures <= set(printed)
         assert all(isinstance(value, int | float) for value in printed.values()), "one flat object of numbers"
     assert list(tmp_path.iterdir()) == [], "nothing is left where it is called"
+
+
+@pytest.mark.e2e
+def test_results_are_measured_once_and_printed_as_a_table(tmp_path: Path) -> None:
+    command = [sys.executable, str(FOLDER / "results.py"), "dqn", "--quick", "--output", str(tmp_path)]
+    first = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert first.returncode == 0, first.stderr
+    assert "| `gridsim-dqn --seed 0 --car-steps 1000` | 0.1 | " in first.stdout
+    runs = sorted(tmp_path.glob("*/summary.json"))
+    again = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert (again.stdout, sorted(tmp_path.glob("*/summary.json"))) == (first.stdout, runs)
 
 
 # ----------------------------------------------------------------------------------------------------- the simulation
