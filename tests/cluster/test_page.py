@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import Browser, needs_chromium
 
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
@@ -35,11 +36,7 @@ def channels(drive):
 
 
 def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
-    champion = load_champion(ROOT / "benchmarks/champion_traffic.npz")
-    road_map = build("seamless", 2_000_000)
-    start = sample_starts(road_map, 1, np.random.default_rng(1))
-    world = spawn(road_map.network, start, 3, np.array([1]), champion.sim.traffic)[0]
-    drive = record(champion, road_map, start[0], 60.0, world)
+    champion, drive, *_ = shown_drives()
     outputs = np.random.default_rng(2).normal(size=(len(drive.cars), 8)).astype(np.float32)
     title = "</script><script>alert(1)</script>"  # a name of the user's own
     shown = [Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive, outputs)]
@@ -63,3 +60,40 @@ def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
     first = 5 + 3 * boxes.shape[1]
     np.testing.assert_allclose(found[first : first + 31].T / 100, drive.ranges, atol=0.006)
     assert (found[first + 31 :].argmax(axis=0) == outputs.argmax(axis=1)).all()
+
+
+def shown_drives():
+    """Ways to show a drive of a minute among 3 cars: as an elite's, and as the champion's."""
+    champion = load_champion(ROOT / "benchmarks/champion_traffic.npz")
+    road_map = build("seamless", 2_000_000)
+    start = sample_starts(road_map, 1, np.random.default_rng(1))
+    world = spawn(road_map.network, start, 3, np.array([1]), champion.sim.traffic)[0]
+    drive = record(champion, road_map, start[0], 60.0, world)
+    return champion, drive, Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive)
+
+
+def text(name):
+    """A script for what an element says."""
+    return f"document.getElementById('{name}').textContent"
+
+
+@pytest.mark.e2e
+@needs_chromium
+def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
+    champion, drive, *shown = shown_drives()
+    path = tmp_path / "drive.html"
+    write_page(path, "two drives", shown, champion.sim)
+    with Browser(f"{path.as_uri()}#t=3.2&paused", tmp_path / "profile") as browser:
+        browser.wait_for(f"{text('clock')} === '0:03.2'")
+        assert browser.run(text("label")) == "champion"
+        assert float(browser.run(text("speed"))) == pytest.approx(drive.cars[32, SPEED], abs=0.06)
+        browser.run("document.getElementById('play').click()")
+        browser.wait_for("at > 4")
+        browser.run("$('which').value = 0; $('which').oninput(); $('all').checked = true; toggle()")
+        browser.wait_for(f"{text('label')} === 'elite'")
+        browser.run("$('time').value = 6; $('time').oninput()")
+        browser.wait_for(f"{text('clock')} === '0:06.0'")
+        ghosts = browser.run("let n = 0; const was = ghost; ghost = (...a) => { n++; was(...a); }; draw(); n")
+        assert ghosts == 1
+        assert browser.faults == []
+        assert {url for url in browser.requests if not url.startswith("data:")} == {path.as_uri()}

@@ -1,11 +1,9 @@
 """MLflow's UI as `make ui` shows it: the link that is printed leads to the runs, their figures and their curves."""
 
 import contextlib
-import html
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +11,10 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from browser import needs_chromium, seen
 from tracked import free_port, row, tracker
 
 from cluster.tracking.mlflow_run import run_tables
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 def logged(uri, name, success_rate):
@@ -67,18 +64,8 @@ def make_ui(root, folder, port):
             os.killpg(ui.pid, signal.SIGINT)
 
 
-def seen(address, profile):
-    """A page as a browser has it after 20 s of its own time, as HTML."""
-    assert CHROMIUM
-    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
-    command += ["--window-size=1900,1000", "--virtual-time-budget=20000", "--dump-dom", address]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    return html.unescape(re.sub(r"<(script|style).*?</\1>", "", done.stdout, flags=re.DOTALL))
-
-
 @pytest.mark.e2e
-@pytest.mark.skipif(not CHROMIUM, reason="there is no chromium")
+@needs_chromium
 def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
     folder = tmp_path / "store"
     logged(uri, "first", 0.875)

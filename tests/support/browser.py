@@ -1,0 +1,99 @@
+"""Chromium, that shows a page as a user's browser would."""
+
+import base64
+import html
+import itertools
+import json
+import os
+import re
+import shutil
+import subprocess
+import time
+
+import pytest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--window-size=1900,1000")
+needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium")
+
+
+def seen(address, profile):
+    """A page as a browser has it after 20 s of its own time, as HTML."""
+    assert CHROMIUM
+    command = [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "--virtual-time-budget=20000", "--dump-dom", address]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    return html.unescape(re.sub(r"<(script|style).*?</\1>", "", done.stdout, flags=re.DOTALL))
+
+
+class Browser:
+    """A browser with one open page, driven by the DevTools protocol over a pipe.
+
+    Attributes:
+        faults: what went wrong on the page: exceptions, console errors, what its policy blocked.
+        requests: addresses that the page asked for.
+    """
+
+    def __init__(self, address, profile):
+        to_browser, self._out = os.pipe()
+        self._in, from_browser = os.pipe()
+        shell = f'exec {CHROMIUM} "$@" 3<&{to_browser} 4>&{from_browser}'
+        command = ["bash", "-c", shell, "chromium", *FLAGS, "--remote-debugging-pipe", f"--user-data-dir={profile}"]
+        self._process = subprocess.Popen(command, pass_fds=(to_browser, from_browser), stderr=subprocess.DEVNULL)
+        os.close(to_browser)
+        os.close(from_browser)
+        self._number, self._buffer, self._session = itertools.count(), b"", {}
+        self.faults, self.requests = [], []
+        target = self._call("Target.createTarget", url="about:blank")["targetId"]
+        self._session = {"sessionId": self._call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]}
+        for domain in ("Runtime", "Log", "Network", "Page"):
+            self._call(f"{domain}.enable")
+        self._call("Page.navigate", url=address)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._process.kill()
+        self._process.wait()
+        os.close(self._out)
+        os.close(self._in)
+
+    def run(self, script):
+        """The value of a script on the page."""
+        return self._call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
+
+    def wait_for(self, script, seconds=30.0):
+        """Wait until a script's value is true."""
+        ends = time.monotonic() + seconds
+        while not self.run(script):
+            assert time.monotonic() < ends, (script, self.faults)
+            time.sleep(0.1)
+
+    def picture(self, path):
+        """Write what the page shows to a PNG file."""
+        path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot")["data"]))
+
+    def _call(self, method, **parameters):
+        number = next(self._number)
+        message = {"id": number, "method": method, "params": parameters, **self._session}
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        while True:
+            while b"\0" not in self._buffer:
+                part = os.read(self._in, 1 << 16)
+                assert part, "the browser is gone"
+                self._buffer += part
+            first, _, self._buffer = self._buffer.partition(b"\0")
+            answer = json.loads(first)
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return answer["result"]
+            self._note(answer.get("method"), answer.get("params"))
+
+    def _note(self, method, parameters):
+        if method == "Network.requestWillBeSent":
+            self.requests.append(parameters["request"]["url"])
+        elif method == "Runtime.exceptionThrown" or (
+            method == "Log.entryAdded" and parameters["entry"]["level"] == "error"
+        ):
+            self.faults.append(parameters)
