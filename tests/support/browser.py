@@ -1,11 +1,9 @@
 """Chromium, that shows a page as a user's browser would."""
 
 import base64
-import html
 import itertools
 import json
 import os
-import re
 import shutil
 import subprocess
 import time
@@ -15,15 +13,6 @@ import pytest
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--window-size=1900,1000")
 needs_chromium = pytest.mark.skipif(not CHROMIUM, reason="there is no chromium")
-
-
-def seen(address, profile):
-    """A page as a browser has it after 20 s of its own time, as HTML."""
-    assert CHROMIUM
-    command = [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "--virtual-time-budget=20000", "--dump-dom", address]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    return html.unescape(re.sub(r"<(script|style).*?</\1>", "", done.stdout, flags=re.DOTALL))
 
 
 class Browser:
@@ -69,6 +58,10 @@ class Browser:
         while not self.run(script):
             assert time.monotonic() < ends, (script, self.faults)
             time.sleep(0.1)
+
+    def wait_for_text(self, text, seconds=60.0):
+        """Wait until the page holds a text, as HTML."""
+        self.wait_for(f"document.documentElement.outerHTML.includes({json.dumps(text)})", seconds)
 
     def picture(self, path):
         """Write what the page shows to a PNG file."""
