@@ -70,7 +70,9 @@ class VehicleConfig:
     reverse_limit: float = 3.0  # m/s backward
     acceleration: float = 3.0  # m/s2, forward and in reverse
     braking: float = 8.0  # m/s2
-    lateral_grip: float = 4.9  # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model
+    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. Together with full braking it
+    # is 9.4 m/s2: less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
+    lateral_grip: float = 4.9
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,8 @@ class Constants(NamedTuple):
     revisit: np.float32  # m
     patience: np.int32  # steps
     courtesy: np.float32  # m
+    contact: np.float32  # m between the middles of two cars, below which they may touch
+    near: np.float32  # m from the car's middle, within which other cars matter to a control step
 
 
 def constants(config: SimConfig) -> Constants:
@@ -173,6 +177,9 @@ def constants(config: SimConfig) -> Constants:
     if not 0.0 < vehicle.rear_axle < vehicle.wheelbase:
         raise ValueError("the centre of mass must lie between the axles")
     view = math.radians(sensors.field_of_view)
+    # In a control step two cars approach each other by `approach` at most; waiting behind a car counts within courtesy.
+    approach = 2.0 * vehicle.speed_limit * episode.control_period
+    near = math.hypot(vehicle.length + config.traffic.courtesy, vehicle.width) + approach
     f = np.float32
     return Constants(
         half_length=f(vehicle.length / 2),
@@ -195,4 +202,6 @@ def constants(config: SimConfig) -> Constants:
         revisit=f(episode.revisit),
         patience=np.int32(episode.patience),
         courtesy=f(config.traffic.courtesy),
+        contact=f(math.hypot(vehicle.length, vehicle.width) * 1.001),  # the factor is for rounding
+        near=f(near),
     )

@@ -12,11 +12,11 @@ from enum import IntEnum
 
 import numpy as np
 
-from gridsim.car.vehicle import act, advance, path_curvature
+from gridsim.car.vehicle import act, advance, front_velocity, path_curvature
 from gridsim.config import REENTRY, SUBSTEP
 from gridsim.jit import leaf
 from gridsim.maps.roads import VISIT_CELL, clearance
-from gridsim.sensing.boxes import cast_boxes, hits_box, nearest_box, stands_ahead
+from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
 from gridsim.sensing.rays import sense
 
 _F, _I = np.float32, np.int32
@@ -113,8 +113,10 @@ def look(road, constants, fan, car, world, beams, ranges, closing):
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
     if world is not None:
-        speed = car[SPEED]
-        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], speed, world, ranges, closing)
+        velocity = (_ZERO, _ZERO)
+        if closing is not None:
+            velocity = front_velocity(constants, car[SPEED], car[STEERING])
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
 
 
 @leaf
@@ -136,8 +138,8 @@ def move(road, constants, car, visits, world, acceleration):
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
     near = False
     if world is not None:
-        nearest, closing = nearest_box(world, road.width, road.height, x, y)
-        near = nearest < _F(20.0)
+        closing = top_speed_near(world, constants.near, road.width, road.height, x, y)
+        near = closing >= _ZERO
         if near:
             fastest += closing
     parts = _I(1) + _I(fastest * constants.dt / SUBSTEP)

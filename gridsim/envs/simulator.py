@@ -86,7 +86,8 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 if actions.ndim == 1:
                     acceleration, steering = act(constants, actions[i], car[SPEED], car[STEERING])
                 else:
-                    acceleration, steering = act_continuous(constants, actions[i, 0], actions[i, 1], car[STEERING])
+                    pedal, wheel = actions[i, 0], actions[i, 1]
+                    acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
                 ends[i] = step_car(
                     road, network, constants, drivers, car, visits[i], world, acceleration, steering, target, max_steps
                 )

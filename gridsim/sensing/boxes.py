@@ -15,11 +15,11 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 
 @leaf
-def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, ranges, closing):
+def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, world, ranges, closing):
     """Shorten ranges (m) to the first box of a world that each ray hits: slab test (Kay and Kajiya 1986).
 
-    Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading and speed (m/s) along it;
-    world of `world`.
+    Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading, and velocity (m/s) along the
+    heading and to the left; world of `world`.
     Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the closing speed (m/s) along the ray of the
     sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
     """
@@ -69,7 +69,8 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, speed, world, 
             if enter <= leave and leave > _ZERO and enter < ranges[r]:
                 ranges[r] = max(enter, _ZERO)
                 if closing is not None:
-                    closing[r] = speed * fan[0, r] - world[j, SPEED] * ux  # the box moves along its heading, its x axis
+                    # The box moves along its heading, its x axis.
+                    closing[r] = velocity[0] * fan[0, r] + velocity[1] * fan[1, r] - world[j, SPEED] * ux
 
 
 @leaf
@@ -89,17 +90,15 @@ def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
 
 
 @leaf
-def nearest_box(world, width, height, x, y):
-    """Distance (m) from a point to the middle of the nearest box, and the top speed (m/s) of boxes within 20 m."""
-    nearest, fastest = _F(1e18), _ZERO
+def top_speed_near(world, reach, width, height, x, y):
+    """Top speed (m/s) of the boxes whose middles are within `reach` m of a point; -1 if there are none."""
+    fastest = -_ONE
     for j in range(world.shape[0]):
         if world[j, LANE] >= _ZERO:
             dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
-            squared = dx * dx + dy * dy
-            nearest = min(nearest, squared)
-            if squared < _F(400.0):
-                fastest = max(fastest, world[j, SPEED])
-    return math.sqrt(nearest), fastest
+            if dx * dx + dy * dy < reach * reach:
+                fastest = max(fastest, abs(world[j, SPEED]))
+    return fastest
 
 
 @leaf
@@ -110,7 +109,7 @@ def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
             behind = back * dt * world[j, SPEED]
             dx = wrapped(world[j, X] - behind * world[j, COS] - x, width)
             dy = wrapped(world[j, Y] - behind * world[j, SIN] - y, height)
-            if dx * dx + dy * dy < _F(25.0) and boxes_touch(
+            if dx * dx + dy * dy < constants.contact * constants.contact and boxes_touch(
                 constants, dx, dy, cosine, sine, world[j, COS], world[j, SIN]
             ):
                 return True

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from gridsim.car.ego import DISTANCE, IDLE, End
 from gridsim.car.vehicle import Action
-from gridsim.config import SimConfig, TrafficConfig, constants
+from gridsim.config import SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, nearest_box, stands_ahead
+from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, stands_ahead, top_speed_near
 from gridsim.sensing.rays import fan
 from gridsim.traffic.world import ALONG, COS, FIELDS, JUNCTION_BEHIND, LANE, PERMIT, SIN, SPEED, SPEED_FACTOR, X, Y
 
@@ -42,12 +42,20 @@ def parked(*poses):
 def _cast(k, rays, side, poses, worlds, ranges):
     for i in range(len(poses)):
         x, y, cosine, sine = poses[i]
-        cast_boxes(k, rays, side, side, x, y, cosine, sine, F(0.0), worlds[i], ranges[i], None)
+        cast_boxes(k, rays, side, side, x, y, cosine, sine, (F(0.0), F(0.0)), worlds[i], ranges[i], None)
 
 
 @njit
 def _closing(k, rays, side, speed, world, ranges, closing):
-    cast_boxes(k, rays, side, side, F(10.0), F(10.0), F(1.0), F(0.0), speed, world, ranges, closing)
+    velocity = speed, F(0.0)
+    cast_boxes(k, rays, side, side, F(10.0), F(10.0), F(1.0), F(0.0), velocity, world, ranges, closing)
+
+
+@njit
+def _hits(k, poses, worlds, hits):
+    for i in range(len(poses)):
+        x, y, cosine, sine = poses[i]
+        hits[i] = hits_box(k, worlds[i], F(0.0), F(0.1), F(SIDE), F(SIDE), x, y, cosine, sine)
 
 
 def cast(poses, worlds, reach=50.0):
@@ -167,12 +175,30 @@ def test_the_oracles_area_is_that_of_closed_forms():
     assert area(20.0, 7.0, 0.5) == 0.0
 
 
-def test_the_nearest_box_is_found_across_the_seam():
+def test_all_contacts_of_a_car_of_other_dimensions_are_found():
+    """100,000 pairs of cars of 6 m x 2.2 m, some across the seam."""
+    config, rng, n = SimConfig(vehicle=VehicleConfig(length=6.0, width=2.2)), np.random.default_rng(4), 100_000
+    away, bearing = rng.uniform(0.0, 7.5, n), rng.uniform(-math.pi, math.pi, n)
+    one = np.column_stack([rng.uniform(0.0, SIDE, (n, 2)), rng.uniform(-math.pi, math.pi, n)]).astype(F)
+    other = one + np.column_stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(-3.0, 3.0, n)])
+    hits = np.zeros(n, dtype=bool)
+    poses = np.column_stack([one[:, :2], np.cos(one[:, 2]), np.sin(one[:, 2])]).astype(F)
+    _hits(constants(config), poses, parked(*np.column_stack([other[:, :2] % SIDE, other[:, 2]]))[:, None], hits)
+    smaller, larger = (
+        oracle.outlines_meet(*(oracle.corners(config, pose.astype(float), margin) for pose in (one, other)))
+        for margin in (-1e-3, 1e-3)
+    )
+    assert hits[smaller].all()
+    assert larger[hits].all()
+    assert (hits & (away > 5.0)).sum() > 3000
+
+
+def test_the_fastest_of_the_near_boxes_is_found_across_the_seam():
     world = parked((250.0, 128.0, 0.0), (20.0, 128.0, 0.0), (128.0, 20.0, 0.0))
     world[:, SPEED] = [3.0, 5.0, 9.0]
-    assert nearest_box(world, F(SIDE), F(SIDE), F(4.0), F(128.0)) == (pytest.approx(10.0), 5.0)
+    assert [top_speed_near(world, F(reach), F(SIDE), F(SIDE), F(4.0), F(128.0)) for reach in (9, 11, 17)] == [-1, 3, 5]
     world[0, LANE] = -1.0
-    assert nearest_box(world, F(SIDE), F(SIDE), F(4.0), F(128.0)) == (pytest.approx(16.0), 5.0)
+    assert top_speed_near(world, F(11.0), F(SIDE), F(SIDE), F(4.0), F(128.0)) == -1.0
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
@@ -252,6 +278,21 @@ def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
             # They met half way; each moves half a metre at most between two looks.
             meeting = 100.0 + (50.0 + phase) / 2 - 2.0
             assert -0.01 <= car[X] - meeting < 0.5
+
+
+@pytest.mark.parametrize(("speed", "steering"), [(8.0, 0.1), (8.0, -0.4), (20.0, 0.3), (-2.0, 0.4)])
+def test_closing_speeds_are_of_the_sensor_which_a_turning_car_moves_sideways(cross, speed, steering):
+    """Of a parked car: how far the middle of the front axle moves along each ray, by finite differences."""
+    simulator = Simulator([cross], 1, CONFIG, traffic=1)
+    start = np.array([[100.0, 128.0, 0.0, speed, steering]], dtype=F)
+    ranges, _ = simulator.reset(start, worlds=on_lane(0, 140.0, 0.0, (SIDE - 140.0, 128.0, math.pi))[None])
+    kappa, step = oracle.curvature(CONFIG, speed, steering), 1e-4
+    poses = [oracle.on_arc(CONFIG, 0.0, 0.0, 0.0, kappa, way) for way in (-step * speed, step * speed)]
+    before, after = (np.array([x + 1.25 * math.cos(turn), y + 1.25 * math.sin(turn)]) for x, y, turn in poses)
+    rays = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+    met = (ranges[0] < 15.0) & (np.abs(ANGLES) < math.radians(9.0))
+    assert met.sum() >= 3
+    assert simulator.closing[0][met] == pytest.approx(rays[met] @ (after - before) / (2 * step), abs=1e-3)
 
 
 @pytest.mark.parametrize("offset", [-2.8, 0.0, 2.8])

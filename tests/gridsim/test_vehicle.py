@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from gridsim.car.vehicle import Action, act, advance, path_curvature
+from gridsim.car.vehicle import Action, act, act_continuous, advance, path_curvature
 from gridsim.config import Constants, EpisodeConfig, SensorConfig, SimConfig, VehicleConfig, constants
 
 CONFIG = SimConfig()
@@ -97,6 +97,25 @@ def test_brake_slows_down_and_never_reverses(speed):
     assert car.x[-1] * speed >= 0.0
 
 
+@pytest.mark.parametrize("pedal", [-1.0, -0.3])
+@pytest.mark.parametrize("speed", [12.3, 0.5, -2.0])
+def test_the_pedal_brakes_to_a_stand_and_not_further(pedal, speed):
+    car = Driver(speed=speed)
+    for _ in range(60):
+        acceleration, _ = act_continuous(K, F(pedal), F(0.0), car.state[4], F(0.0))
+        assert abs(acceleration) <= -8.0 * pedal * (1 + 1e-6)
+        car.step(acceleration)
+    assert abs(car.speed) <= STILL
+    assert car.x[-1] * speed > 0.0
+
+
+def test_braking_in_a_bend_stays_within_the_friction_circle():
+    """Of 1 g, whatever an action asks for at any speed; CommonRoad's cars may have 11.5 m/s2."""
+    for speed in np.linspace(0.0, 30.0, 61):
+        lateral = speed**2 * float(path_curvature(K, F(speed), K.steering_limit))
+        assert max(math.hypot(lateral, float(act(K, a, F(speed), F(0.0))[0])) for a in Action) < 9.81
+
+
 @given(speed=speeds, steering=steerings, taken=st.lists(actions, min_size=1, max_size=60))
 def test_limits_hold_whatever_is_done(speed, steering, taken):
     car = Driver(speed=speed, steering=steering)
@@ -149,6 +168,17 @@ def test_without_a_grip_limit_advance_solves_kongs_equations(speed, steering, ac
     car = Driver(speed, steering, k=constants(SimConfig(vehicle=VehicleConfig(lateral_grip=math.inf))))
     car.step(acceleration)
     assert (car.x[-1], car.y[-1], car.heading[-1], car.speed) == pytest.approx(tuple(state), abs=2e-5)
+
+
+def test_ten_seconds_of_stepwise_steering_are_kongs():
+    """A command acts at the beginning of its period: Kong's equations under the same steps, without a grip limit."""
+    rng, state = np.random.default_rng(0), [0.0, 0.0, 0.0, 8.0]
+    car = Driver(8.0, k=constants(SimConfig(vehicle=VehicleConfig(lateral_grip=math.inf))))
+    for action in rng.choice([Action.LEFT, Action.RIGHT, Action.NONE], 100):
+        car.do(action)
+        drive = (float(car.steering), 0.0)
+        state = list(solve_ivp(kong, (0.0, DT), state, args=drive, rtol=1e-9, atol=1e-9).y[:, -1])
+    assert math.hypot(car.x[-1] - state[0], car.y[-1] - state[1]) < 1e-3
 
 
 @given(speed=speeds, steering=steerings)
