@@ -76,9 +76,9 @@ class CollectTask:
 
 def _freeze_arrays(task: Task | CollectTask) -> None:
     """Make arrays read-only, as those from the object store are: Numba compiles again for writable ones."""
-    for value in vars(task).values():
+    for name, value in vars(task).items():
         if isinstance(value, np.ndarray):
-            freeze(value)
+            object.__setattr__(task, name, freeze(value))
 
 
 class Worker:

@@ -55,7 +55,7 @@ class Map:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Map:
-        """The inverse of `arrays`. The arrays are not copied, and become read-only."""
+        """The inverse of `arrays`. The arrays are not copied; the map has read-only views of them."""
         values: dict[str, Any] = {name: freeze(array) if array.ndim else array[()] for name, array in arrays.items()}
         return cls(
             name=str(values["name"]),

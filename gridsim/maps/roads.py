@@ -48,7 +48,7 @@ class Road(NamedTuple):
 
 
 class _Arrays:
-    """Base of records of arrays, which become read-only."""
+    """Base of records of arrays, which cannot be written to through them."""
 
     def __post_init__(self):
         for name, array in vars(self).items():
@@ -280,10 +280,10 @@ def clearances(road, points):
 
 
 def freeze(array: np.ndarray) -> np.ndarray:
-    """The array as C-contiguous and read-only, the one form for which kernels are compiled."""
-    array = np.ascontiguousarray(array)
-    array.setflags(write=False)
-    return array
+    """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view
 
 
 def power_of_two(n: float) -> int:

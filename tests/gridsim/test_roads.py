@@ -189,9 +189,13 @@ def test_what_kernels_read_is_read_only(scenario):
         assert not array.flags.writeable
 
 
-def test_freeze_copies_only_what_it_must():
+def test_freeze_copies_only_what_it_must_and_the_callers_own_stays_writable():
     whole = np.arange(12.0).reshape(3, 4)
-    assert freeze(whole) is whole
+    assert np.shares_memory(freeze(whole), whole)
+    lines = np.array([[0.0, 0.0, 8.0, 0.0, 2.0]])
+    assert not Strips.of(lines).lines.flags.writeable
+    assert whole.flags.writeable
+    assert lines.flags.writeable
     part = freeze(whole[:, ::2])
     assert part.flags.c_contiguous
     assert not np.shares_memory(part, whole)
