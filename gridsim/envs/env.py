@@ -45,6 +45,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
 from gridsim.sensing.grid import MAX_FRAMES, grids
 from gridsim.traffic.world import LANE
+from gridsim.view.display import has_display
 
 if TYPE_CHECKING:
     from gridsim.view.render import Renderer, Window
@@ -104,7 +105,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             map_seed: seed of the first of them; the others' follow.
             traffic: other cars in each car's world; None is as many as the scenario has by default.
             frames: grids that make an observation, 1 to 8.
-            render_mode: `rgb_array`, or `human`, a window that follows the first car.
+            render_mode: `rgb_array`, or `human`, a window that follows the first car; `metadata["render_modes"]` has
+                it only where there is a display.
             max_episode_steps: time limit in control steps; None is the configuration's.
             autoreset_mode: of `gymnasium.vector`, or its value, as in `SameStep`.
         Raises: ValueError with one line where an argument makes no sense.
@@ -132,7 +134,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             values = ", ".join(mode.value for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode must be one of {values}, not {autoreset_mode!r}") from None
         self.num_envs = num_envs
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"]}
+        if render_mode == "human" or has_display():
+            self.metadata["render_modes"].append("human")
         self.config = config or SimConfig()
         self.scenario = scenario
         self.traffic = default_traffic(scenario) if traffic is None else traffic
@@ -361,6 +365,7 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         options["autoreset_mode"] = AutoresetMode.DISABLED
         self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_modes": self.cars.metadata["render_modes"]}
         self._seeded = False
         self._spec: EnvSpec | None = None
         self.observation_space = self.cars.single_observation_space

@@ -24,6 +24,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.roads import CELLS_PER_M, freeze
 from gridsim.view import paint
+from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
 
 if TYPE_CHECKING:
@@ -315,9 +316,9 @@ class Window:
         chosen, wayland = os.environ.get("SDL_VIDEODRIVER"), os.environ.get("WAYLAND_DISPLAY")
         try:
             # SDL would also try drivers that need no display: they show nothing, and some print errors to stderr.
+            if not has_display():
+                raise pygame.error("no display")
             if sys.platform.startswith("linux") and not (chosen or wayland):
-                if not os.environ.get("DISPLAY"):
-                    raise pygame.error("no display")
                 os.environ["SDL_VIDEODRIVER"] = "x11"
             pygame.display.init()
             if not chosen and pygame.display.get_driver() in ("dummy", "offscreen", "evdev"):

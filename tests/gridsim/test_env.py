@@ -39,23 +39,31 @@ def test_importing_gridsim_registers_and_loads_no_numba() -> None:
     assert done.stdout.split() == ["True", "False"]
 
 
-@pytest.mark.usefixtures("dummy")
+SEES: list[dict[str, Any]] = [{"motion": motion, "steering": steering} for motion in (0, 1) for steering in (0, 1)]
+SEES += [{"observation": observation, "frames": frames} for observation in ("grid", "image") for frames in (1, 4)]
+
+
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
-@pytest.mark.parametrize(
-    ("name", "sees"),
-    [
-        ("highway", {}),
-        ("curved", {"motion": True}),
-        ("seamless", {"motion": True, "steering": True}),
-        ("roundabout", {"observation": "grid", "frames": 4}),
-        ("city", {"observation": "image"}),
-    ],
-)
-def test_gymnasiums_checker_passes(maps: Maps, name: str, sees: dict[str, Any], actions: str) -> None:
-    """It makes the environment in both of its render modes, too."""
+@pytest.mark.parametrize("sees", SEES)
+@pytest.mark.parametrize("name", IDS)
+def test_gymnasiums_checker_passes_without_a_display(
+    maps: Maps, monkeypatch: pytest.MonkeyPatch, name: str, sees: dict[str, Any], actions: str
+) -> None:
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(variable, raising=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env = gymnasium.make(f"GridSim/{name.capitalize()}-v0", maps=maps[name][:1], actions=actions, **sees)
+        env = gymnasium.make(name, maps=maps[ENVIRONMENTS[name]][:1], actions=actions, render_mode="rgb_array", **sees)
+        check_env(env.unwrapped)
+
+
+@pytest.mark.usefixtures("dummy")
+def test_gymnasiums_checker_passes_with_a_display(maps: Maps) -> None:
+    """It makes the environment in both of its render modes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make("GridSim/City-v0", maps=maps["city"][:1])
+        assert env.unwrapped.metadata["render_modes"] == ["rgb_array", "human"]
         check_env(env.unwrapped)
 
 

@@ -1,0 +1,14 @@
+"""Whether there is a display to open a window on."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# What SDL goes by on Linux: a driver that is asked for by name, Wayland or X11.
+_VARIABLES = ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY", "DISPLAY")
+
+
+def has_display() -> bool:
+    """Whether a window may be opened, by the environment's variables; on other systems than Linux always."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in _VARIABLES)
