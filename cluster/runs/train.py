@@ -38,7 +38,7 @@ from evolution.episodes.curriculum import HELD_OUT_SEEDS
 from gridsim.car.ego import DISTANCE
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.files import short_lap
+from gridsim.maps.files import problems_of
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
 
@@ -238,7 +238,7 @@ class Session:
     def learn(self) -> None:
         """Learn to the end, saving once a second and at the end."""
         learning, scenario = self.learning, self.run.settings.scenario
-        if is_map_file(scenario) and (problem := short_lap(scenario, learning.sim)):
+        for problem in problems_of(scenario, learning.sim) if is_map_file(scenario) else ():
             learning.warn(problem)
         log_rows(self.tracker, learning.history)
         self._state, self._saved_steps = learning.state(), learning.steps

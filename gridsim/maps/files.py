@@ -61,6 +61,7 @@ MAX_NODES = 1 << 24  # of the field
 MAX_TABLE = 1 << 28  # bytes of the table of start ranges
 RESOLUTION = (0.01, 1.0)  # m a pixel, from, to
 SHORTEST_SIDE = 16  # m
+MOST_BORDER = 0.5  # share of a picture's border that is road, from which on it is taken for inverted
 
 
 @dataclass(frozen=True)
@@ -86,17 +87,27 @@ def load_map(name: str, config: SimConfig | None = None) -> Map:
     return _load(os.path.abspath(name), map_digest(name), config or SimConfig())
 
 
-def short_lap(name: str, config: SimConfig) -> str:
-    """A warning (one line) if a file's road is so short that a second lap counts no distance, else ""."""
-    road, revisit = load_map(name, config).road, config.episode.revisit
+def problems_of(name: str, config: SimConfig) -> list[str]:
+    """Warnings, a line each: a road so short that a second lap counts no distance, and one that may be inverted."""
+    road, revisit, stem = load_map(name, config).road, config.episode.revisit, Path(name).stem
     nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
     length = road_length(nodes)
-    if length > 1.05 * revisit:  # 5 % for the error of the estimate
-        return ""
-    return (
-        f"{Path(name).stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
-        "nothing: cars end idle in their second lap. Make the road longer, or its resolution larger"
-    )
+    problems = []
+    if length <= 1.05 * revisit:  # 5 % for the error of the estimate
+        problems.append(
+            f"{stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
+            "nothing: cars end idle in their second lap. Make the road longer, or its resolution larger"
+        )
+    file = read_map_file(Path(os.path.abspath(name)))
+    free = read_free(file)
+    border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
+    if border >= MOST_BORDER and not file.torus:
+        problems.append(
+            f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
+            f"set negate: {int(not file.negate)} in its YAML; if cars shall stay within a track, make what is around "
+            "it wall"
+        )
+    return problems
 
 
 def map_digest(name: str) -> str:

@@ -28,6 +28,7 @@ _SMOOTH = 3.0  # m, standard deviation of the window over which a road's directi
 _COHERENCE = 0.5  # least agreement of directions there, from 0 (a plaza, a crossing) to 1 (a straight road)
 _STARTS = 512
 _NODE = 1.0 / CELLS_PER_M  # m
+_APART = 24  # nodes of wall around a window, so that averages on one side do not see the road on the other
 _BACK = np.array([0.0, 0.0, math.pi])
 
 
@@ -154,8 +155,24 @@ def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return labels, connected_components(joined, directed=False)[1]
 
 
+def _window(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The part of a field that has road, with wall around it, as a torus, and its corner: x, y (m).
+
+    A track may be small in a large picture. A side is kept whole where cutting it would not make it shorter.
+    """
+    corner = np.zeros(2)
+    for axis in (0, 1):
+        road = np.flatnonzero((nodes > 0.0).any(axis=1 - axis))
+        if len(road) and road[-1] - road[0] + 2 * _APART < nodes.shape[axis]:
+            index = np.arange(road[0] - _APART, road[-1] + _APART)
+            nodes = nodes.take(index, axis=axis, mode="wrap")
+            corner[1 - axis] = index[0] * _NODE
+    return nodes, corner
+
+
 def road_length(nodes: np.ndarray) -> float:
     """Estimated length (m) of the largest connected road: area over width. Within 10 % for a ring."""
+    nodes, _ = _window(nodes)
     road = nodes > 0.0
     labels, group = _components(road)
     middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
@@ -184,6 +201,7 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
 
     Raises: ValueError with one line if a car fits nowhere.
     """
+    nodes, corner = _window(nodes)
     wide = nodes >= vehicle.width / 2 + _MARGIN
     large = _large(wide)
     if not large.any():
@@ -210,6 +228,7 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
             f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
             f"check the resolution and what is bright"
         )
+    poses[:, :2] += corner
     return _spread_sample(poses, _STARTS)
 
 
@@ -220,11 +239,12 @@ def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig
     """
     complete = np.array(poses, dtype=np.float64)
     size = np.array(nodes.shape[::-1]) * _NODE
-    angle, coherence = _directions(nodes)
+    window, corner = _window(nodes)
+    angle, coherence = _directions(window)
     for pose in complete:
         inside = bool((pose[:2] >= 0.0).all() and (pose[:2] < size).all())
         if inside and math.isnan(pose[2]):
-            column, row = (pose[:2] * CELLS_PER_M).round().astype(int) % nodes.shape[::-1]
+            column, row = ((pose[:2] - corner) * CELLS_PER_M).round().astype(int) % window.shape[::-1]
             clear = coherence[row, column] >= _COHERENCE
             pose[2] = angle[row, column] if clear else _widest_headings(nodes, pose[None, :2], vehicle)[0]
             ways = np.array([pose, pose + _BACK])

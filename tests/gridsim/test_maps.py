@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.files import MapFile, load_map, map_digest, read_free, read_map_file, short_lap
+from gridsim.maps.files import MapFile, load_map, map_digest, problems_of, read_free, read_map_file
 from gridsim.maps.map import Map, sample_starts, starts_at
 from gridsim.maps.raster import signed_clearance
 from gridsim.maps.scenarios import build, label
@@ -132,12 +133,41 @@ def test_starts_head_along_a_ring(tmp_path):
 )
 def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
     pixels = picture(lambda x, y: ring(x - 45, y - 45, radius, half_width), 90.0, 90.0)
-    said = short_lap(save(tmp_path / "ring.png", pixels), SimConfig())
-    assert bool(said) == short
+    said = problems_of(save(tmp_path / "ring.png", pixels), SimConfig())
+    assert len(said) == short
     if short:
-        about = re.match(r"ring has about (\d+) m of road\. What is driven again within 200 m counts nothing", said)
+        about = re.match(r"ring has about (\d+) m of road\. What is driven again within 200 m counts nothing", said[0])
         assert about is not None
         assert float(about[1]) == pytest.approx(2 * math.pi * radius, rel=0.1)
+
+
+def test_an_inverted_picture_is_told_and_where_it_is_used(tmp_path):
+    pixels = picture(lambda x, y: ring(x - 45, y - 45, 36.0, 5.0), 90.0, 90.0)
+    save(tmp_path / "dark.png", 255 - pixels)
+    expected = "100% of dark's border is road. If the road is what is dark, set negate: 1 in its YAML"
+    assert problems_of(str(tmp_path / "dark.png"), SimConfig())[0].startswith(expected)
+    with pytest.warns(UserWarning, match="100% of dark's border is road"):
+        GridSimEnv(str(tmp_path / "dark.png"))
+    name = write_yaml(tmp_path, image="dark.png", negate=1)
+    assert problems_of(name, SimConfig()) == []
+
+
+def test_a_track_in_a_large_picture_loads_as_fast_as_one_in_a_small_one(tmp_path):
+    """As f1tenth's vegas: 120 m x 60 m at 0.5 m a pixel, 1 km from the picture's corner. With the same starts."""
+    x, y = (np.arange(260) * 0.5)[None], (np.arange(140) * 0.5)[:, None]
+    away = np.hypot(np.maximum(np.abs(x - 65) - 35, 0), np.maximum(np.abs(y - 35) - 5, 0))
+    track = np.where(np.abs(away - 20.0) < 5.0, 254, 205).astype(np.uint8)
+    large = np.full((3000, 3000), 205, dtype=np.uint8)
+    large[-1640:-1500, 1500:1760] = track
+    spent, starts = [], []
+    for name, pixels in (("small", track), ("large", large)):
+        save(tmp_path / f"{name}.png", pixels)
+        path = write_yaml(tmp_path, name=name, image=f"{name}.png", resolution=0.5)
+        begun = time.process_time()
+        starts.append(load_map(path).starts)
+        spent.append(time.process_time() - begun)
+    np.testing.assert_allclose(starts[1] - starts[0], np.tile([750.0, 750.0, 0.0, 0.0, 0.0], (512, 1)), atol=1e-4)
+    assert spent[1] < 3.0
 
 
 def test_starts_are_on_the_road_and_not_in_the_shed(tmp_path):
