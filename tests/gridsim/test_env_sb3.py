@@ -1,10 +1,12 @@
-"""Stable-Baselines3's learners on the vector environment."""
+"""Learners of others: Stable-Baselines3 on the vector environment and in processes of its own, and EvoTorch."""
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from gridsim.envs.sb3 import SB3VecEnv
 
@@ -42,3 +44,26 @@ def test_its_learners_learn_on_rays_and_pictures():
     assert DQN("MlpPolicy", few, buffer_size=1000, learning_starts=50).learn(200).num_timesteps >= 200
     pictures = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="image")
     assert PPO("CnnPolicy", pictures, n_steps=8, batch_size=16, n_epochs=1).learn(64).num_timesteps == 64
+
+
+def test_sb3s_own_processes_find_the_environment_by_its_modules_name():
+    """They have not imported gridsim; what stands before the colon tells Gymnasium to."""
+    cars = make_vec_env("gridsim:GridSim/Curved-v0", 2, seed=3, env_kwargs={"maps": 1}, vec_env_cls=SubprocVecEnv)
+    own = gymnasium.make_vec("GridSim/Curved-v0", 2, maps=1)
+    np.testing.assert_array_equal(cars.reset(), own.reset(seed=3)[0])
+    np.testing.assert_array_equal(cars.step(np.zeros(2, dtype=int))[0], own.step(np.zeros(2, dtype=int))[0])
+    cars.close()
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # EvoTorch's own
+def test_evotorch_evolves_on_the_environment():
+    from evotorch.algorithms import SNES
+    from evotorch.neuroevolution import GymNE
+
+    options = {"maps": 1, "max_episode_steps": 40}
+    problem = GymNE("gridsim:GridSim/Curved-v0", "Linear(obs_length, act_length)", env_config=options)
+    search = SNES(problem, popsize=8, stdev_init=0.5)
+    search.run(2)
+    assert problem.status["total_episode_count"] == 16
+    assert 16 * 15 <= problem.status["total_interaction_count"] <= 16 * 40
+    assert np.isfinite(search.status["best_eval"])

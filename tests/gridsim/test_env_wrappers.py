@@ -15,6 +15,7 @@ from gymnasium.spaces import flatten
 from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
+from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs import episodes, observing, simulator
@@ -190,6 +191,17 @@ def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
                 assert infos[k]["episode"]["l"] == lengths[k]
                 counted += 1
     assert counted > 9
+
+
+@pytest.mark.parametrize("observation", ["rays", "grid"])
+def test_numpy_to_torch_takes_all_that_is_told(observation: str) -> None:
+    options: Any = {"maps": 1, "max_episode_steps": 3, "observation": observation}
+    env = wrappers.NumpyToTorch(gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options))
+    _, info = env.reset(seed=0)
+    assert info["end"].tolist() == [End.RUNNING] * 2
+    for _ in range(3):
+        *_, info = env.step(torch.full((2,), 4))
+    assert info["end"].tolist() == [End.TIME] * 2
 
 
 def test_environments_share_maps(monkeypatch: pytest.MonkeyPatch) -> None:
