@@ -117,15 +117,13 @@ def write_video(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        try:
-            temporary.touch()  # what is wrong with the place is said better here than by ffmpeg
-            count = _encode(temporary, pictures, size, fps, CODING[path.suffix.lower()].split())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+        temporary.touch()  # its error is clearer than ffmpeg's
+        count = _encode(temporary, pictures, size, fps, CODING[path.suffix.lower()].split())
+        os.replace(temporary, path)
     except OSError as error:
         raise VideoError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
     return count
 
 
@@ -140,25 +138,17 @@ def _encode(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], f
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
     command = [program, "-y", "-v", "error", *raw, "-an", *coding, str(path)]
     try:  # in a session of its own, where Ctrl-C does not reach it
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
-        )
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
     except OSError as error:
         raise VideoError(f"ffmpeg cannot be started: {program}: {error.strerror or error}") from error
     count = 0
     with process:
         assert process.stdin is not None
-        try:
-            with contextlib.suppress(BrokenPipeError):  # ffmpeg's message follows
-                for image in pictures:
-                    process.stdin.write(np.ascontiguousarray(image).data)
-                    count += 1
-            message = process.communicate()[1].decode(errors="replace").strip()
-        except BaseException:
-            process.kill()
-            with contextlib.suppress(BrokenPipeError):
-                process.stdin.close()
-            raise
+        with contextlib.suppress(BrokenPipeError):  # ffmpeg's message follows
+            for image in pictures:
+                process.stdin.write(np.ascontiguousarray(image).data)
+                count += 1
+        message = process.communicate()[1].decode(errors="replace").strip()
     if process.returncode:
         raise VideoError(f"ffmpeg failed: {message.splitlines()[-1][:160] if message else process.returncode}")
     return count

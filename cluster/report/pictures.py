@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.table import Table
 
-from gridsim.car.ego import X, Y
+from gridsim.car.ego import SPEED, X, Y
 from gridsim.maps.map import Map
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS
 
@@ -90,8 +90,6 @@ def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], 
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
 
-    from gridsim.car.ego import SPEED
-
     figure, (axis,) = _figure(8.6, 7.6)
     draw_map(axis, scenario)
     points = states[:, [X, Y]].astype(np.float64)
@@ -115,7 +113,8 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
     Bars are medians over seeds, whiskers quartiles, dots the seeds.
     """
     roads = list(dict.fromkeys(group.road for group in groups))
-    names = list(dict.fromkeys((group.name, group.learner, group.observation) for group in groups))
+    names = list(dict.fromkeys(group.name for group in groups))
+    several_observations = len({group.observation for group in groups}) > 1
     width = 0.8 / len(names)
     figure, axes = _figure(max(9.0, 3.0 + 2.2 * len(roads)), 4.6, 2)
     panels = (
@@ -124,14 +123,13 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
     )
     for axis, (name, title) in zip(axes, panels, strict=True):
         for group in groups:
-            which = [other[0] for other in names].index(group.name)
-            place = roads.index(group.road) + (which - (len(names) - 1) / 2) * width
+            place = roads.index(group.road) + (names.index(group.name) - (len(names) - 1) / 2) * width
             found = group.spread(name)
             if not found.n:
                 axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
                 continue
             whiskers = [[found.median - found.lower], [found.upper - found.median]] if found.n > 1 else None
-            hatch = "//" if group.observation == "grid" and len({view for _, _, view in names}) > 1 else None
+            hatch = "//" if group.observation == "grid" and several_observations else None
             axis.bar(
                 place, found.median, 0.92 * width, color=_LEARNERS[group.learner], alpha=0.75, yerr=whiskers, capsize=3,
                 hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2, label=group.name,
@@ -175,9 +173,7 @@ def along_route(
         for learner, found in drives.items():
             colour = _LEARNERS[learner]
             arc = np.arange(0.0, min(metres, max(float(series.arc[-1]) for series in found)), 0.5)
-            errors = np.array(
-                [np.interp(arc, series.arc, getattr(series, name), right=np.nan) for series in found]
-            )  # fmt: skip
+            errors = np.array([np.interp(arc, each.arc, getattr(each, name), right=np.nan) for each in found])
             there = np.isfinite(errors).any(axis=0)
             if len(found) > 1:
                 low, high = np.nanmin(errors[:, there], axis=0), np.nanmax(errors[:, there], axis=0)
@@ -198,7 +194,7 @@ def along_route(
 
 
 def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
-    """The closing table: how good a champion is where it never was."""
+    """How well a champion drives on roads it never saw."""
     table = Table(title=title, title_justify="left", show_header=False)
     table.add_column()
     table.add_column(justify="right")
@@ -216,13 +212,12 @@ def errors_table(title: str, figures: Mapping[str, float]) -> Table:
     table = Table("", "mean", "max", title=title, title_justify="left")
     for column in table.columns[1:]:
         column.justify = "right"
-    for name, unit, digits in (("velocity", "mps", 2), ("steering", "deg", 1)):
-        shown = "m/s" if unit == "mps" else "degrees"
-        table.add_row(
-            f"{name} error, {shown}",
-            *(f"{figures[f'{name}_{kind}_{unit}']:.{digits}f}" for kind in ("mean", "max")),
-        )
-        of = "the reference's mean speed" if unit == "mps" else "the steering limit"
-        table.add_row(f"  % of {of}", *(f"{figures[f'{name}_{kind}_percent']:.1f}" for kind in ("mean", "max")))
+    for head, mean, largest, digits in (
+        ("velocity error, m/s", "velocity_mean_mps", "velocity_max_mps", 2),
+        ("  % of the reference's mean speed", "velocity_mean_percent", "velocity_max_percent", 1),
+        ("steering error, degrees", "steering_mean_deg", "steering_max_deg", 1),
+        ("  % of the steering limit", "steering_mean_percent", "steering_max_percent", 1),
+    ):
+        table.add_row(head, f"{figures[mean]:.{digits}f}", f"{figures[largest]:.{digits}f}")
     table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
     return table
