@@ -7,11 +7,8 @@ import subprocess
 import sys
 import time
 
-from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, one_line
+from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, one_line, server_problem
 from cluster.tracking.mlflow_run import run_tables
-
-# The server runs no jobs.
-_ENVIRONMENT = {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"}
 
 
 def main(port: str) -> None:
@@ -30,30 +27,20 @@ def main(port: str) -> None:
     command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]
     server = subprocess.Popen(
         [sys.executable, "-m", "mlflow", *command, "--uvicorn-opts", "--log-level warning"],
-        env={**os.environ, **_ENVIRONMENT},
+        env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"},
     )
     try:
-        while server.poll() is None and not _answers(address):
+        while server.poll() is None and server_problem(address):
             time.sleep(0.2)
         if server.poll() is None:
-            print(f"MLflow's UI on {address}; Ctrl-C ends it")
-            for name, table in tables.items():
-                print(f"runs of {name}: {table}")
-            if not tables:
-                print("there are no runs yet: make evolve makes one")
-            sys.stdout.flush()
+            links = [f"runs of {name}: {table}" for name, table in tables.items()]
+            links = links or ["there are no runs yet: make evolve makes one"]
+            print(f"MLflow's UI on {address}; Ctrl-C ends it", *links, sep="\n", flush=True)
         sys.exit(server.wait())
     except KeyboardInterrupt:
         server.wait()
     finally:
         server.terminate()
-
-
-def _answers(address: str) -> bool:
-    try:
-        return bool(check_uri(address))
-    except TrackingError:
-        return False
 
 
 if __name__ == "__main__":

@@ -397,7 +397,7 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
     except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited
         reason = f"{run.path} has not the files of a finished run ({type(error).__name__})"
         return "", f"what MLflow lacks is not sent: {reason}"
-    tracker = make_tracker(run, uri, experiment, late=True, started=started)
+    tracker = make_tracker(run, uri, experiment, finished=True, started=started)
     log_rows(tracker, history)
     tracker.log_model(run.path, model)
     log_end(tracker, run, len(history) - 1, summary, note)

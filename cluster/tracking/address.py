@@ -9,7 +9,6 @@ import re
 import socket
 import sqlite3
 import ssl
-import threading
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -21,7 +20,7 @@ DEFAULT_URI = "sqlite:///mlflow.db"
 UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
 PROBE_S = 3.0
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
-_PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # which a gateway in front of MLflow serves, too
+_PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # also served by a gateway in front of MLflow
 
 
 class TrackingError(GridSimError):
@@ -29,7 +28,7 @@ class TrackingError(GridSimError):
 
 
 def check_uri(uri: str | None = None) -> str:
-    """The tracking address made absolute and probed, within 4 s and without MLflow.
+    """The tracking address made absolute and probed, without MLflow.
 
     None stands for MLFLOW_TRACKING_URI and, where that is not set, for `sqlite:///mlflow.db` in the working directory.
     Raises TrackingError for a server that does not answer, a database that cannot be written, a folder (MLflow 3
@@ -41,12 +40,15 @@ def check_uri(uri: str | None = None) -> str:
         return _check_sqlite(uri)
     if scheme in ("http", "https"):
         uri = uri.rstrip("/")
-        if reason := _probe(uri):
-            raise TrackingError(f"no MLflow server at {shown(uri)}: {reason}; start one, or use {DEFAULT_URI}")
+        if problem := server_problem(uri):
+            raise TrackingError(f"no MLflow server at {shown(uri)}: {problem}; start one, or use {DEFAULT_URI}")
         return uri
     if scheme in _DATABASES:
-        if reason := _probe(uri, _DATABASES[scheme]):
-            raise TrackingError(f"no database server at {shown(uri)}: {reason}")
+        parts = urllib.parse.urlsplit(uri)
+        try:
+            socket.create_connection((parts.hostname or "localhost", parts.port or _DATABASES[scheme]), PROBE_S).close()
+        except (OSError, ValueError) as error:
+            raise TrackingError(f"no database server at {shown(uri)}: {one_line(error)}") from error
         return uri
     if scheme in ("", "file"):
         raise TrackingError(f"{uri}: MLflow 3 keeps no runs in folders; use sqlite:///mlflow.db or http://host:port")
@@ -66,7 +68,8 @@ def _check_sqlite(uri: str) -> str:
         raise TrackingError(f"{uri}: {path} is a folder; name a file")
     if path.exists() and path.stat().st_size:
         try:
-            with contextlib.closing(connect(path, "rw")) as database:
+            address = f"file:{urllib.parse.quote(str(path))}?mode=rw"
+            with contextlib.closing(sqlite3.connect(address, PROBE_S, isolation_level=None, uri=True)) as database:
                 database.execute("BEGIN IMMEDIATE")
                 database.execute("PRAGMA schema_version").fetchone()
                 database.execute("ROLLBACK")
@@ -82,26 +85,7 @@ def sqlite_path(uri: str) -> Path | None:
     return None if match is None or match[1] == ":memory:" else Path(os.path.abspath(match[1]))
 
 
-def _probe(uri: str, port: int = 0) -> str:
-    """Why a server cannot be used, or "". A database server, with its usual `port`, only has to accept a connection."""
-    reason = [f"no answer within {PROBE_S:g} s"]
-
-    def probe() -> None:
-        try:
-            if port:
-                parts = urllib.parse.urlsplit(uri)
-                socket.create_connection((parts.hostname or "localhost", parts.port or port), PROBE_S).close()
-            reason[0] = "" if port else _probe_http(uri)
-        except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
-            reason[0] = one_line(error)
-
-    thread = threading.Thread(target=probe, daemon=True)  # nothing else bounds the time that looking up a name takes
-    thread.start()
-    thread.join(PROBE_S + 1.0)
-    return reason[0]
-
-
-def _probe_http(uri: str) -> str:
+def server_problem(uri: str) -> str:
     """Why there is no MLflow server at `uri`, or "". Sends no credentials, and so checks no certificate."""
     unchecked = ssl.create_default_context()
     unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
@@ -114,12 +98,8 @@ def _probe_http(uri: str) -> str:
         if error.code >= 500:
             return f"it answers with error {error.code}"
         return "" if error.code in (400, 401, 403, 405, 429) else "something else answers there"
-
-
-def connect(path: Path, mode: str) -> sqlite3.Connection:
-    """A SQLite database opened as its URI's `mode` says: ro or rw."""
-    address = f"file:{urllib.parse.quote(str(path))}?mode={mode}"
-    return sqlite3.connect(address, timeout=PROBE_S, isolation_level=None, uri=True)
+    except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
+        return one_line(error)
 
 
 def shown(uri: str) -> str:

@@ -1,4 +1,4 @@
-"""What MLflow is told of a training run: its name, parameters, tags, description, and its champion."""
+"""How MLflow describes a training run: its name, parameters, tags, description, and its champion."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ if TYPE_CHECKING:
     from cluster.runs.run import RunFolder
 
 
+def file_name(scenario: str) -> str:
+    """A scenario's name as part of a folder's name."""
+    return re.sub(r"[^\w.+=@-]", "_", label(scenario))
+
+
 def what(settings: RunSettings) -> str:
     """Scenario, algorithm and seed in one word, with which the name of a run begins unless another is given."""
-    road = re.sub(r"[^\w.+=@-]", "_", label(settings.scenario))  # as names of folders may be
-    return f"{road}-{settings.algorithm}-s{settings.seed}"
+    return f"{file_name(settings.scenario)}-{settings.algorithm}-s{settings.seed}"
 
 
 def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
@@ -129,13 +133,13 @@ def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
         "observations and return a number for each of the eight actions, of which the greatest acts.",
         note=f"{headline(settings)} {held_out['success_rate']:.1%} of the held-out drives succeed.",
-        facts={
+        tags={
             "policy": champion.policy,
             "scenario": label(settings.scenario),
             "algorithm": settings.algorithm,
             "traffic": str(champion.traffic),
             "seed": str(settings.seed),
+            **{name: f"{value:.6g}" for name, value in held_out_metrics(held_out).items()},
         },
-        scores={name: f"{value:.6g}" for name, value in held_out_metrics(held_out).items()},
         build=build,
     )

@@ -2,10 +2,9 @@
 
 Everything here blocks and may raise whatever MLflow raises; any call can be repeated (`tracker.Tracker` does).
 
-Models are written here and never read, whoever may write to the server. What is written is `torch.export`'s graph with
-its weights, MLflow's format `pt2`, never a pickled module. But `mlflow.pytorch.load_model`, in a program of the user's
-own, runs whatever a model's maker has put into it, in either format, unless MLFLOW_ALLOW_PICKLE_DESERIALIZATION is
-`false`: then it refuses all but plain tensors. Models that were written here load with it.
+Models are written here and never read. They are `torch.export`'s graph with its weights, MLflow's format `pt2`, never a
+pickled module, and load where MLFLOW_ALLOW_PICKLE_DESERIALIZATION is `false`. Where it is not, a user's own
+`mlflow.pytorch.load_model` runs whatever a model's maker has put into it, in either format.
 """
 
 from __future__ import annotations
@@ -21,28 +20,28 @@ import time
 import uuid
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from cluster.tracking.address import TrackingError, connect, shown, sqlite_path
+from cluster.tracking.address import TrackingError, shown, sqlite_path
 from cluster.tracking.commit import git_commit
 
 if TYPE_CHECKING:
     import numpy as np
     import torch
-    from mlflow.entities import Experiment, FileInfo, Run
+    from mlflow.entities import FileInfo, Run
     from mlflow.tracking import MlflowClient
 
 Status = Literal["FINISHED", "KILLED", "FAILED"]
 
 KEY_TAG = "gridsim.key"
-"""The tag that a run is found again by."""
+"""The tag by which a run is found again."""
 NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
 """MLflow's tag of the description, and ours that says which was written here; the UI lists neither."""
 CHAMPION_TAG = "champion_sha256"
-"""The tag by which a registered version tells whose champion it is."""
+"""The tag of a registered version that identifies its champion."""
 RUN_ID = "{run_id}"
 """Stands in a description for MLflow's id of the run, which is not known when it is written."""
 BEST = "best"
@@ -83,16 +82,14 @@ class Row:
     """Metrics of one step.
 
     Attributes:
-        step: which.
-        metrics: values by name.
-        wall_s: seconds after the run's start, pauses left out; None: `given` counts.
-        given: ms since the epoch; fixed, so that a repeated request is the same one.
+        wall_s: seconds after the run's start, pauses left out; None: `logged_ms` counts.
+        logged_ms: ms since the epoch; fixed, so that a repeated request is the same one.
     """
 
     step: int
     metrics: Mapping[str, float]
     wall_s: float | None = None
-    given: int = field(default_factory=lambda: time.time_ns() // 1_000_000)
+    logged_ms: int = field(default_factory=lambda: time.time_ns() // 1_000_000)
 
 
 @dataclass(frozen=True)
@@ -104,12 +101,9 @@ class Identity:
 
     Attributes:
         uri: what `address.check_uri` returned.
-        experiment: name of MLflow's experiment.
-        name: of the run.
-        params, tags: its parameters and tags.
         note: its description, Markdown.
         key: the run's own unique name, made before MLflow is imported, by which the run is found again (KEY_TAG).
-        late: the run is over, and what MLflow has of it stays as it is: its status, its times, its files.
+        finished: whether the run has ended, so that what MLflow has of it stays as it is: status, times, files.
         started: seconds since the epoch at which a new one began; None: now.
     """
 
@@ -120,7 +114,7 @@ class Identity:
     tags: Mapping[str, str]
     note: str = ""
     key: str = field(default_factory=lambda: uuid.uuid4().hex)
-    late: bool = False
+    finished: bool = False
     started: float | None = None
 
 
@@ -133,8 +127,7 @@ class Model:
         champion_sha256: digest of the champion's genome; a run registers one champion once.
         about: what all versions of the registered model have in common, Markdown.
         note: what this version is, Markdown.
-        facts: what the saved model says of itself, and the version's tags.
-        scores: more tags of the version.
+        tags: the version's; the saved model has them as its metadata.
         build: makes the module and an input for it, float32 [n, inputs] with n of 2 or more, so that any number may be
             given to what is written; called in the tracker's thread, as torch takes seconds to import.
     """
@@ -143,21 +136,17 @@ class Model:
     champion_sha256: str
     about: str
     note: str
-    facts: Mapping[str, str]
-    scores: Mapping[str, str]
+    tags: Mapping[str, str]
     build: Callable[[], tuple[torch.nn.Module, np.ndarray]]
 
 
 class LoggedRun:
     """A run in MLflow, opened: found by its key, or created.
 
-    Attributes:
-        run_id: MLflow's id.
-        experiment_id: MLflow's id of its experiment.
+    Attributes: MLflow's ids of the run and of its experiment.
     """
 
     def __init__(self, identity: Identity):
-        """Import MLflow, open the store, find or create the run."""
         quiet()
         from mlflow.tracking import MlflowClient
 
@@ -168,19 +157,14 @@ class LoggedRun:
         self._client = MlflowClient(tracking_uri=identity.uri)
         self.experiment_id = _experiment_id(self._client, identity.experiment, path)
         self._logged: defaultdict[str, set[int]] = defaultdict(set)  # the steps that MLflow has of each metric
-        self._listed: dict[str | None, dict[str, int]] = {}  # folder -> sizes of the artifacts in it
-        run = self._find() or self._create()
+        everywhere = [each.experiment_id for each in self._client.search_experiments()]
+        found = self._client.search_runs(everywhere, f"tags.`{KEY_TAG}` = '{identity.key}'", max_results=1)
+        run = found[0] if found else self._create()
         self.run_id: str = run.info.run_id
         self._artifacts: str = run.info.artifact_uri
         self._started: int = run.info.start_time
-        self._over = identity.late and run.info.status == "FINISHED"
+        self._has_ended = identity.finished and run.info.status == "FINISHED"
         self._complete(run)
-
-    def _find(self) -> Run | None:
-        """The run of this key in any experiment; None if this store has none, or only in its bin."""
-        experiments = [each.experiment_id for each in self._client.search_experiments()]
-        found = self._client.search_runs(experiments, f"tags.`{KEY_TAG}` = '{self._identity.key}'", max_results=1)
-        return found[0] if found else None
 
     def _create(self) -> Run:
         from mlflow.tracking.context.git_context import GitRunContext
@@ -199,11 +183,11 @@ class LoggedRun:
         from mlflow.entities import Param, RunTag
 
         run_id, data = run.info.run_id, run.data
-        if not self._identity.late:
+        if not self._identity.finished:
             self._client.update_run(run_id, status="RUNNING")
         for name in data.metrics:
             self._logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
-        # MLflow lets no parameter change; what is different is told beside it.
+        # MLflow lets no parameter change; what is different is logged beside it.
         resumed: dict[str, str] = {}
         for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
             resumed |= {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
@@ -218,12 +202,12 @@ class LoggedRun:
         """Log what MLflow does not have of some rows. Returns: of how many."""
         from mlflow.entities import Metric
 
-        missing = {
-            (name, row.step): Metric(name, float(value), self._time_of(row), row.step)
-            for row in rows
-            for name, value in row.metrics.items()
-            if row.step not in self._logged[name]
-        }
+        missing = {}
+        for row in rows:
+            logged_ms = row.logged_ms if row.wall_s is None else self._started + round(1000.0 * row.wall_s)
+            for name, value in row.metrics.items():
+                if row.step not in self._logged[name]:
+                    missing[name, row.step] = Metric(name, float(value), logged_ms, row.step)
         metrics = list(missing.values())
         for k in range(0, len(metrics), MAX_BATCH):
             batch = metrics[k : k + MAX_BATCH]
@@ -232,58 +216,42 @@ class LoggedRun:
                 self._logged[metric.key].add(metric.step)
         return len({step for _, step in missing})
 
-    def _time_of(self, row: Row) -> int:
-        """In ms since the epoch."""
-        return row.given if row.wall_s is None else self._started + round(1000.0 * row.wall_s)
-
-    def describe(self, text: str) -> None:
-        """Replace the run's description, unless somebody has written one of his own."""
-        from mlflow.entities import RunTag
-
-        text = text.replace(RUN_ID, self.run_id)
-        tags = self._client.get_run(self.run_id).data.tags
-        there = tags.get(NOTE_TAG, "")
-        if there != text and (not there or _note_tags(there)[OWN_NOTE_TAG] == tags.get(OWN_NOTE_TAG)):
-            self._client.log_batch(self.run_id, tags=[RunTag(*tag) for tag in _note_tags(text).items()])
-
-    def upload(self, path: Path, folder: str | None) -> bool:
-        """Store a file among the artifacts. False where the run is `late` and MLflow has it.
+    def upload(self, path: Path, folder: str | None = None) -> bool:
+        """Store a file among the artifacts. False for a finished run's file that MLflow has in the same size.
 
         One by one: MLflow's own pool of threads would hold up the exit if a server hangs.
         """
-        if self._identity.late and self._sizes(folder).get(path.name) == path.stat().st_size:
-            return False
+        if self._identity.finished:
+            listed: list[FileInfo] = self._client.list_artifacts(self.run_id, folder)
+            if (path.name, path.stat().st_size) in [(Path(each.path).name, each.file_size) for each in listed]:
+                return False
         self._client.log_artifact(self.run_id, str(path), folder)
         return True
 
-    def _sizes(self, folder: str | None) -> dict[str, int]:
-        """Sizes in bytes of the artifacts in a folder, by name."""
-        if folder not in self._listed:
-            listed: list[FileInfo] = self._client.list_artifacts(self.run_id, folder)
-            self._listed[folder] = {Path(each.path).name: each.file_size or 0 for each in listed if not each.is_dir}
-        return self._listed[folder]
+    def log_model(self, folder: Path, model: Model) -> bool:
+        """Write a torch model into a run's folder, store its files and register it; returns what `register` does."""
+        write_model(folder / MODEL, model)
+        for path in sorted((folder / MODEL).rglob("*")):
+            if path.is_file():
+                self.upload(path, path.parent.relative_to(folder).as_posix())
+        return self.register(model)
 
     def register(self, model: Model) -> bool:
         """Make the uploaded model the newest version of its name, and give the best of all versions its alias.
 
         Returns: whether it was made; False where this run's champion is one already.
         """
-        from mlflow.exceptions import MlflowException
-
         client = self._client
         found = client.search_model_versions(f"name = '{model.name}' and run_id = '{self.run_id}'")
         new = all(each.tags.get(CHAMPION_TAG) != model.champion_sha256 for each in found)
         if new:
-            try:
+            with _may_exist():
                 client.create_registered_model(model.name, description=model.about)
-            except MlflowException as error:
-                if error.error_code != "RESOURCE_ALREADY_EXISTS":
-                    raise
             client.create_model_version(
                 model.name,
                 f"{self._artifacts.rstrip('/')}/{MODEL}",
                 self.run_id,
-                tags={CHAMPION_TAG: model.champion_sha256, **model.facts, **model.scores},
+                tags={CHAMPION_TAG: model.champion_sha256, **model.tags},
                 description=model.note,
                 await_creation_for=0,
             )
@@ -295,15 +263,25 @@ class LoggedRun:
             client.set_registered_model_alias(model.name, BEST, str(best.version))
         return new
 
-    def end(self, status: Status, wall_s: float | None = None) -> None:
-        """End the run, now or so many seconds after its start. One that is over stays as it is.
+    def end(self, status: Status, wall_s: float | None = None, note: str = "") -> None:
+        """End the run, now or so many seconds after its start, and replace its description unless a user edited it.
 
         MLflow's UI shows the time from start to end as the run's duration, and lets no start change: the pauses of a
-        run that was stopped and resumed are left out by an earlier end.
+        run that was stopped and resumed are left out by an earlier end. A run that has ended keeps its end.
         """
-        if not (self._over and status == "FINISHED"):
+        if note:
+            self._describe(note.replace(RUN_ID, self.run_id))
+        if not (self._has_ended and status == "FINISHED"):
             ended = None if wall_s is None else self._started + round(1000.0 * wall_s)
             self._client.set_terminated(self.run_id, status, ended)
+
+    def _describe(self, text: str) -> None:
+        from mlflow.entities import RunTag
+
+        tags = self._client.get_run(self.run_id).data.tags
+        old = tags.get(NOTE_TAG, "")
+        if old != text and (not old or _note_tags(old)[OWN_NOTE_TAG] == tags.get(OWN_NOTE_TAG)):
+            self._client.log_batch(self.run_id, tags=[RunTag(*tag) for tag in _note_tags(text).items()])
 
 
 def _note_tags(text: str) -> dict[str, str]:
@@ -316,43 +294,30 @@ def write_model(folder: Path, model: Model) -> None:
 
     A folder that has the same champion is left as it is, another one is replaced as a whole.
     """
-    if saved_champion(folder) == model.champion_sha256:
+    written = folder / "MLmodel"
+    if written.is_file() and model.champion_sha256 in written.read_text(encoding="utf-8"):
         return
     import mlflow.pytorch
     import torch
     from mlflow.models import infer_signature
 
     module, example = model.build()
-    for left_behind in folder.parent.glob(f".{folder.name}.*.tmp"):
-        shutil.rmtree(left_behind, ignore_errors=True)
-    built = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of torch's and MLflow's own making
-            mlflow.pytorch.save_model(
-                module,
-                str(built),
-                input_example=example,
-                signature=infer_signature(example, module(torch.from_numpy(example)).numpy()),
-                serialization_format="pt2",
-                # Given, as MLflow would start a process and load the model there to find out.
-                pip_requirements=[f"mlflow=={mlflow.__version__}", f"torch=={torch.__version__.partition('+')[0]}"],
-                metadata={**model.facts, CHAMPION_TAG: model.champion_sha256},
-            )
-        shutil.rmtree(folder, ignore_errors=True)
-        built.rename(folder)
-    finally:
-        shutil.rmtree(built, ignore_errors=True)
-
-
-def saved_champion(folder: Path) -> str:
-    """Digest of the champion that `write_model` wrote to a folder, or ""."""
-    quiet()
-    from mlflow.models import Model as Saved
-
-    with contextlib.suppress(Exception):  # not there, or not whole: it is written again
-        return str((Saved.load(str(folder)).metadata or {}).get(CHAMPION_TAG, ""))
-    return ""
+    built = folder.with_name(f".{folder.name}.tmp")
+    shutil.rmtree(built, ignore_errors=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of torch's and MLflow's own making
+        mlflow.pytorch.save_model(
+            module,
+            str(built),
+            input_example=example,
+            signature=infer_signature(example, module(torch.from_numpy(example)).numpy()),
+            serialization_format="pt2",
+            # Given, as MLflow would start a process and load the model there to find out.
+            pip_requirements=[f"mlflow=={mlflow.__version__}", f"torch=={torch.__version__.partition('+')[0]}"],
+            metadata={**model.tags, CHAMPION_TAG: model.champion_sha256},
+        )
+    shutil.rmtree(folder, ignore_errors=True)
+    built.rename(folder)
 
 
 def _create_database(path: Path) -> None:
@@ -368,8 +333,7 @@ def _create_database(path: Path) -> None:
         with tempfile.TemporaryDirectory() as folder:
             built = Path(folder, "mlflow.db")
             MlflowClient(tracking_uri=f"sqlite:///{built}").search_experiments(max_results=1)
-            with contextlib.closing(connect(built, "ro")) as database:
-                whole.write_bytes(database.serialize())
+            shutil.copyfile(built, whole)
         try:
             os.link(whole, path)
         except FileExistsError:
@@ -381,23 +345,33 @@ def _create_database(path: Path) -> None:
         whole.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def _may_exist() -> Iterator[None]:
+    """Ignore that what is created exists already: another run may have been first."""
+    from mlflow.exceptions import MlflowException
+
+    try:
+        yield
+    except MlflowException as error:
+        if error.error_code != "RESOURCE_ALREADY_EXISTS":
+            raise
+
+
 def _experiment_id(client: MlflowClient, name: str, database: Path | None) -> str:
-    """The experiment of that name, created if need be with its artifacts beside the database."""
+    """The experiment of that name, created if need be with its artifacts beside the database, and its saved view."""
     from mlflow.exceptions import MlflowException
 
     http = client.tracking_uri.startswith("http")  # the server knows best where artifacts go
     location = None if http else ((database.parent if database else Path.cwd()) / "mlartifacts").as_uri()
+    if client.get_experiment_by_name(name) is None:
+        with _may_exist():
+            client.create_experiment(name, artifact_location=location)
     experiment = client.get_experiment_by_name(name)
-    if experiment is None:
-        try:
-            return client.create_experiment(name, artifact_location=location, tags={_VIEW_TAG: _view()})
-        except MlflowException as error:
-            if error.error_code != "RESOURCE_ALREADY_EXISTS":  # another run was first
-                raise
-            experiment = client.get_experiment_by_name(name)
     if experiment is None or experiment.lifecycle_stage != "active":
         raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
-    _add_view(client, experiment)
+    if _VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
+        with contextlib.suppress(MlflowException):  # a server may allow runs and no more
+            client.set_experiment_tag(experiment.experiment_id, _VIEW_TAG, _view())
     return experiment.experiment_id
 
 
@@ -417,18 +391,7 @@ def run_tables(uri: str, server: str) -> dict[str, str]:
         return {}
     client = MlflowClient(tracking_uri=uri)
     found = [each for each in client.search_experiments() if client.search_runs([each.experiment_id], max_results=1)]
-    for experiment in found:
-        _add_view(client, experiment)
     return {each.name: run_table(server, each.experiment_id) for each in found}
-
-
-def _add_view(client: MlflowClient, experiment: Experiment) -> None:
-    """Give an experiment the saved view, unless it has one, which may have been changed in the UI."""
-    from mlflow.exceptions import MlflowException
-
-    if _VIEW_TAG not in experiment.tags:
-        with contextlib.suppress(MlflowException):  # a server may allow runs and no more
-            client.set_experiment_tag(experiment.experiment_id, _VIEW_TAG, _view())
 
 
 def _view() -> str:

@@ -1,10 +1,10 @@
 """Sends a run to MLflow from a thread of its own, so that MLflow never stops or slows the run.
 
-MLflow takes two seconds to import and to open its store, and milliseconds a row. The thread syncs whenever there is
-news, and a last time when the run ends. A sync sends what MLflow lacks, and nothing twice: it asks MLflow once what it
-has, and a request whose answer was lost is repeated with the same timestamps, which MLflow recognises. What cannot be
-sent is kept, tried again, and in the end reported in one line. All of it is also in the run's folder, from which it can
-be sent later (`train.send_missing`).
+MLflow takes two seconds to import and to open its store, and milliseconds a row. The thread syncs whenever something
+is new, and a last time when the run ends. A sync sends what MLflow lacks, and nothing twice: it asks MLflow once what
+it has, and repeats a request without an answer with the same timestamps, which MLflow recognises. What cannot be sent
+is kept, tried again, and in the end reported in one line. All of it is also in the run's folder, from which it can be
+sent later (`train.send_missing`).
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from cluster.tracking.address import UI, TrackingError, one_line, shown
-from cluster.tracking.mlflow_run import MODEL, Identity, LoggedRun, Model, Row, Status, run_table, write_model
+from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, run_table
 
 FLUSH_S = 2.0  # rows that come within this time go out as one request: 5 ms of CPU for a row alone, 0.8 ms among many
 RETRY_S = 5.0
 CHANCE_S = 1.0  # between the two attempts that a closed tracker still makes
-CLOSE_S, STOP_S = 60.0, 15.0  # that closing takes at most, of a run that is finished and of one that is not
+CLOSE_S, STOP_S = 60.0, 15.0  # that closing takes at most, for a finished run and for one that was stopped
 
 
 class Tracker:
@@ -40,21 +40,19 @@ class Tracker:
         self.uri = identity.uri
         self.run_id: str | None = None
         self.error: str | None = None
-        self.sent: Counter[str] = Counter()
+        self.sent = Counter(row=0, file=0, model=0)
         self._identity = identity
-        # Appended to by the run, removed from by the thread once MLflow has it.
+        self._run: LoggedRun | None = None
+        # What MLflow lacks: the run adds to it, and the thread removes what it has sent.
         self._rows: list[Row] = []
-        self._files: list[tuple[Path, str | None]] = []
-        self._note: str | None = None
+        self._files: list[Path] = []
         self._model: tuple[Path, Model] | None = None
-        self._model_written = False
-        self._model_error = ""
+        self._note = ""
         self._wall_s: float | None = None
         self._status: Status | None = None  # set by close()
         self._ended = False
         self._report: str | None = None
 
-        self._run: LoggedRun | None = None
         self._tried, self._news, self._closed = (threading.Event() for _ in range(3))
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
 
@@ -82,7 +80,7 @@ class Tracker:
 
     def log_files(self, paths: Iterable[Path]) -> None:
         """Send files, each under its own name; they must stay as they are until `close` returns."""
-        self._files += [(path, None) for path in paths]
+        self._files += paths
         self._notify()
 
     def log_model(self, folder: Path, model: Model) -> None:
@@ -90,25 +88,24 @@ class Tracker:
 
         What is there of the same champion is not written again, and what is registered is not registered again.
         """
-        self._model = folder / MODEL, model
+        self._model = folder, model
         self._notify()
 
     def describe(self, note: str) -> None:
-        """Replace the run's description, Markdown; one that somebody has written in MLflow's UI is left alone."""
+        """Replace the run's description, Markdown, when it ends; one written in MLflow's UI is left alone."""
         self._note = note
-        self._notify()
 
     def close(self, status: Status, timeout_s: float | None = None) -> str | None:
         """Send what is left, end the run as `status`, and return None, or one line about what could not be sent.
 
-        Raises nothing and returns within `timeout_s`, whatever MLflow does; a server that is away gets one more chance.
+        Raises nothing and returns within `timeout_s`, whatever MLflow does; an unreachable server is tried once more.
         """
         if self._status is None and self._thread.ident is not None:
             self._status = status
             if status != "FINISHED":
-                self._model = None  # there is a better one to come
+                self._model = None  # a resumed run finds a better one
             self._closed.set()
-            self._notify()
+            self._news.set()
             timeout_s = timeout_s or (CLOSE_S if status == "FINISHED" else STOP_S)
             self._thread.join(timeout_s)
             self._report = self._missing(f"no answer within {timeout_s:g} s")
@@ -120,10 +117,9 @@ class Tracker:
         span = f"{steps[0]} to {steps[-1]}" if len(steps) > 1 else f"{steps[0]}" if steps else ""
         lost = [f"{count(len(steps), 'row')} (step {span})"] if steps else []
         lost += [count(len(self._files), "file")] if self._files else []
-        lost += ["the model"] if self._model or self._model_error else []
+        lost += ["the model"] if self._model else []
         lost += [] if self._ended else [f"the status {self._status}"]
-        reason = self.error or self._model_error or reason
-        return f"not logged to MLflow at {shown(self.uri)}: {', '.join(lost)}: {reason}" if lost else None
+        return f"not logged to MLflow at {shown(self.uri)}: {', '.join(lost)}: {self.error or reason}" if lost else None
 
     def _notify(self) -> None:
         if self._thread.ident is None:
@@ -131,90 +127,58 @@ class Tracker:
         self._news.set()
 
     def _work(self) -> None:
-        """Sync when there is news, until closed."""
-        chances = 2
-        while True:
+        """Sync when something is new, and once or twice when closed."""
+        while not self._closed.is_set():
             self._news.clear()
-            closed = self._closed.is_set()
             synced = self._sync()
-            if closed:
-                chances -= 1
-                if synced or not chances:
-                    return
-                time.sleep(CHANCE_S)
-            else:
-                self._closed.wait(FLUSH_S if synced else RETRY_S)
-                if synced:
-                    self._news.wait()
+            self._closed.wait(FLUSH_S if synced else RETRY_S)
+            if synced:
+                self._news.wait()
+        if not self._sync():
+            time.sleep(CHANCE_S)
+            self._sync()
 
     def _sync(self) -> bool:
         """Send what MLflow lacks; what fails holds up nothing else. Returns whether MLflow has all of it."""
-        parts = (self._log_rows, self._describe, self._write_model, self._upload, self._register, self._end)
-        done = self._attempt(self._open) and sum(map(self._attempt, parts)) == len(parts)
-        if done:
-            self.error = None
-        return done
-
-    def _attempt(self, part: Callable[[], None]) -> bool:
-        """Whether `part` succeeded. If not, `error` says why: whatever it was, the run that is tracked goes on."""
-        try:
-            part()
-        except Exception as error:
-            self.error = one_line(error)
-            return False
-        finally:
-            self._tried.set()
-        return True
-
-    def _open(self) -> None:
-        if self._run is None:
-            self._run = LoggedRun(self._identity)
-            self.run_id = self._run.run_id
+        error: str | None = None
+        for send in (self._send_rows, self._send_files, self._send_model, self._end):
+            try:
+                send()
+            except Exception as failure:  # whatever it is, the run that is tracked goes on
+                self.error = error = one_line(failure)
+                if self._run is None:
+                    break
+            finally:
+                self._tried.set()
+        self.error = error
+        return error is None
 
     @property
     def _opened(self) -> LoggedRun:
-        assert self._run is not None
+        """MLflow's run, found or created when it is first needed."""
+        if self._run is None:
+            self._run = LoggedRun(self._identity)
+            self.run_id = self._run.run_id
         return self._run
 
-    def _log_rows(self) -> None:
+    def _send_rows(self) -> None:
         rows = self._rows[:]
         self.sent["row"] += self._opened.log(rows)
         del self._rows[: len(rows)]
 
-    def _describe(self) -> None:
-        note = self._note
-        if note is not None:
-            self._opened.describe(note)
-            self._note = None if self._note == note else self._note
-
-    def _write_model(self) -> None:
-        """Write the model to the run's folder and queue its files. An error is final: it will not go away by itself."""
-        if self._model is None or self._model_written:
-            return
-        folder, model = self._model
-        try:
-            write_model(folder, model)
-        except Exception as error:
-            self._model, self._model_error = None, one_line(error)
-            return
-        self._model_written = True
-        for path in sorted(folder.rglob("*")):
-            if path.is_file():
-                self._files.append((path, path.parent.relative_to(folder.parent).as_posix()))
-
-    def _upload(self) -> None:
+    def _send_files(self) -> None:
         while self._files:
-            self.sent["file"] += self._opened.upload(*self._files[0])
+            self.sent["file"] += self._opened.upload(self._files[0])
             del self._files[0]
 
-    def _register(self) -> None:
-        if self._model and self._model_written and not self._files:
-            self.sent["model"] += self._opened.register(self._model[1])
+    def _send_model(self) -> None:
+        if self._model:
+            self.sent["model"] += self._opened.log_model(*self._model)
             self._model = None
 
     def _end(self) -> None:
         if self._status is not None:
-            self._opened.end(self._status, self._wall_s)
+            self._opened.end(self._status, self._wall_s, self._note)
             self._ended = True
 
 
