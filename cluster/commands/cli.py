@@ -7,11 +7,10 @@ import dataclasses
 import json
 import os
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import tyro
@@ -25,24 +24,32 @@ from cluster.commands.common import (
     Stopped,
     UsageError,
     WorkFlags,
-    called,
     check_unchanged,
+    command_path,
     fail,
     main,
     parse,
+    select,
+    short_path,
     stoppable,
-    typed,
-    warn_of_crowd,
+    warn_of_many_workers,
     wrong_use,
 )
-from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings, check_workers
+from cluster.commands.entry import STARTED
+from cluster.commands.progress import Progress
+from cluster.comparison.errors import series
+from cluster.report.pictures import errors_table, held_out_table
+from cluster.runs.champion import evaluate, load_champion
+from cluster.runs.checkpoint import CHECKPOINT, CONFIG, CheckpointError
+from cluster.runs.run import RunFolder, is_finished, lock, new_run, open_run, read_config
+from cluster.runs.settings import DqnSettings, EvolveSettings, check_workers
+from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
+from cluster.tracking.address import check_uri
+from cluster.tracking.tracker import count
+from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import default_traffic, is_map_file, label
-
-if TYPE_CHECKING:
-    from cluster.runs.run import RunFolder
-    from cluster.runs.train import Session
+from gridsim.reference.errors import combine
 
 
 @dataclass(frozen=True)
@@ -114,48 +121,30 @@ class EvaluateFlags(RoadFlags):
     """Print one JSON object and nothing else."""
 
 
-def process_age_s() -> float:
-    """Seconds since this process was started (0 where the system does not tell)."""
-    try:
-        ticks = Path("/proc/self/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()[19]
-        return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - float(ticks) / os.sysconf("SC_CLK_TCK"))
-    except (OSError, ValueError, IndexError, AttributeError):
-        return 0.0
-
-
 def evolve_main() -> None:
     """Entry point of `gridsim-evolve`."""
-    _learn_main(EvolveFlags)
+    main(EvolveFlags.command, lambda: _learn(EvolveFlags, sys.argv[1:]))
 
 
 def dqn_main() -> None:
     """Entry point of `gridsim-dqn`."""
-    _learn_main(DqnFlags)
-
-
-def _learn_main(kind: type[Flags]) -> None:
-    started = time.perf_counter() - process_age_s()
-    main(kind.command, lambda: _learn(kind, sys.argv[1:], started))
+    main(DqnFlags.command, lambda: _learn(DqnFlags, sys.argv[1:]))
 
 
 def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     """Flags and the run's folder, checked; nothing is written yet. Raises GridSimError."""
-    from cluster.runs import run as runs
-    from cluster.runs.champion import load_champion
-    from evolution.networks.policy import PolicySpec
-
     prog = kind.command
     base: Flags | None = None
     flags = parse(kind, prog, arguments)
     resume, config = flags.resume, flags.config
     if resume and config:
         raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
-    if resume:
-        run = runs.open_run(Path(resume))
-        settings, init = run.settings, run.init
-    elif config:
-        settings, init = runs.read_config(Path(config))
-    if resume or config:  # they are the defaults
+    if resume or config:  # its settings are the defaults
+        if resume:
+            run = open_run(Path(resume))
+            settings, init = run.settings, run.init
+        else:
+            settings, init = read_config(Path(config))
         if settings.command != prog:
             raise UsageError(f"{resume or config} is a run of {settings.command}; give it to that command")
         base = kind(**dataclasses.asdict(settings), init=init)
@@ -170,7 +159,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         flags = flags.extending(base)
         free = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"}
         check_unchanged(flags, base, free, kind.unbound, "run")
-    settings = settings_of(flags)
+    settings = select(EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings, flags)
     settings.check()
     _check_device(flags)
     if resume:
@@ -184,13 +173,13 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         if not np.isfinite(champion.genome).all():
             raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
         digest = champion.sha256
-    return flags, runs.new_run(Path(flags.output), flags.name, settings, flags.init, digest)
+    return flags, new_run(Path(flags.output), flags.name, settings, flags.init, digest)
 
 
 def _check_device(flags: Flags) -> None:
     """Raises UsageError for a device that is not there."""
     if isinstance(flags, DqnFlags) and flags.device == "cuda":
-        from evolution.dqn.learner import device_of
+        from evolution.dqn.learner import device_of  # and PyTorch
 
         try:
             device_of(flags.device)
@@ -199,104 +188,80 @@ def _check_device(flags: Flags) -> None:
             raise UsageError(there if flags.resume else f"--device {flags.device}: {error}") from error
 
 
-def settings_of(flags: Flags) -> RunSettings:
-    """What decides the champion."""
-    kind = EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings
-    return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})
-
-
-def _learn(kind: type[Flags], arguments: Sequence[str], started: float) -> int:
-    prog = kind.command
+def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
+    prog, step = kind.command, kind.counts[0]  # generation or evaluation
     console = Console()
     flags, run = _prepare(kind, arguments)
-    from cluster.commands.progress import Progress
-    from cluster.runs.champion import load_champion
-    from cluster.runs.run import is_finished
-    from cluster.runs.train import Workers, send_missing, train, undisturbed
-    from cluster.tracking.address import check_uri
-    from cluster.workers.ray_session import check_address
-
-    if is_finished(run):
-        first = kind.counts[0]
-        sent, lost = send_missing(run, flags.tracking_uri, flags.experiment)
+    if run.saved and is_finished(run):
+        sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
         sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
-        console.print(f"{run.path} is finished: {run.saved[1][first]} {first}s; {sent}.", soft_wrap=True)  # type: ignore[index]
-        if lost:
-            print(f"{prog}: warning: {lost}", file=sys.stderr)
+        console.print(f"{run.path} is finished: {run.saved[1][step]} {step}s; {sent}.", soft_wrap=True)
+        if unsent:
+            print(f"{prog}: warning: {unsent}", file=sys.stderr)
         return 0
     saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
     uri = check_uri(flags.tracking_uri or saved or None)
     address = flags.address or os.environ.get("RAY_ADDRESS") or None
     if address and flags.workers:
-        address = check_address(address)
+        from cluster.workers.ray_session import check_address  # and Ray
 
-    warn_of_crowd(prog, flags.workers, flags.address)
-    made = _make_folder(run)
+        address = check_address(address)
+    warn_of_many_workers(prog, flags.workers, flags.address)
+    new_folders = [path for path in (run.path, *run.path.parents) if not path.exists()]
+    lock(run.path)
     workers = Workers(flags.workers, address, flags.patience)
-    resume = f"{called(prog)} --resume {typed(run.path)}"
-    again = f"continue with: {resume}"
+    folder = short_path(run.path)
+    resume = f"{command_path(prog)} --resume {folder}"
+    hint = f"continue with: {resume}"
     code, message = 0, ""
     try:
         with stoppable():
             initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
-            progress = Progress(console, prog, typed(run.path), resume)
-            session = train(run, workers, uri, flags.experiment, progress, started, initial=initial)
+            progress = Progress(console, prog, folder, resume)
+            session = train(run, workers, uri, flags.experiment, progress, STARTED, initial=initial)
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Stopped:
         code = TERMINATED
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         code, message = FAILED, str(error) or type(error).__name__
-        if isinstance(error, FloatingPointError):  # to go on would be to come to the same
-            again = f"repeat it with: {called(prog)} --config {typed(run.path)}/config.json --learning-rate ..."
+        if isinstance(error, FloatingPointError):  # continued, it would fail in the same way
+            hint = f"repeat it with: {command_path(prog)} --config {folder}/config.json --learning-rate ..."
     finally:
         with undisturbed():
             workers.close()
     if code == 0:
-        _show_end(console, session)
+        _print_end(console, session)
         return code
-    resumable = (run.path / "checkpoint.npz").is_file()
+    resumable = (run.path / CHECKPOINT).is_file()
     if not resumable:
-        _discard(made)
+        _remove_folders(new_folders)
     if code == FAILED:
-        fail(prog, message, again if resumable else "", FAILED)
-    print(f"{prog}: stopped; {again if resumable else f'no {kind.counts[0]} was done yet'}", file=sys.stderr)
+        fail(prog, message, hint if resumable else "", FAILED)
+    print(f"{prog}: stopped; {hint if resumable else f'no {step} was done yet'}", file=sys.stderr)
     return code
 
 
-def _show_end(console: Console, session: Session) -> None:
+def _print_end(console: Console, session: Session) -> None:
     """The closing words of a finished run."""
-    from cluster.report import pictures
-    from cluster.tracking.tracker import count
-
     summary, name, path = session.summary, session.learning.step_name, session.run.path
-    console.print(pictures.held_out_table("The champion on held-out drives", summary["held_out"]))
+    console.print(held_out_table("The champion on held-out drives", summary["held_out"]))
     steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "the best so far"
     console.print(
         f"{how} ({summary['validation_success_rate']:.0%} of validation) "
         f"after {steps}, {summary['car_steps'] / 1e6:,.1f} million car-steps, {summary['wall_s']:.0f} s\n"
-        f"run: {typed(path)}   champion: {typed(path / 'champion.npz')}\n"
-        f"watch it: {called('gridsim-watch')} {typed(path)}\n"
+        f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"
+        f"watch it: {command_path('gridsim-watch')} {short_path(path)}\n"
         f"compare: {session.tracker.where()}",
         soft_wrap=True,
     )
 
 
-def _make_folder(run: RunFolder) -> list[Path]:
-    """Make a run's folder and lock it. Returns the folders that were made for it, the innermost first."""
-    from cluster.runs.run import lock
-
-    made = [path for path in (run.path, *run.path.parents) if not path.exists()]
-    lock(run.path)
-    return made
-
-
-def _discard(made: list[Path]) -> None:
-    """Remove the folders of a run in which nothing was done."""
+def _remove_folders(new_folders: Sequence[Path]) -> None:
+    """Remove the folders that were made for a run without a first step, the innermost first."""
     with contextlib.suppress(OSError):
-        for path in made:
-            if path == made[0]:
-                (path / "config.json").unlink(missing_ok=True)
+        for path in new_folders:
+            (path / CONFIG).unlink(missing_ok=True)
             path.rmdir()
 
 
@@ -307,29 +272,24 @@ def evaluate_main() -> None:
 
 def _evaluate() -> int:
     flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
-    from cluster.comparison.errors import series
-    from cluster.report.pictures import errors_table, held_out_table
-    from cluster.runs.champion import evaluate, load_champion
-    from gridsim.reference.errors import combine
-
     champion = load_champion(flags.champion)
     traffic = None if flags.traffic == -1 else flags.traffic
     chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
-    missed = None
+    errors = None
     with wrong_use():
         if flags.errors or flags.reference:  # first, as a wrong --reference is found at once
             parts = series(champion, *chosen, flags.reference or None)
-            missed = combine([part.errors(champion.sim.vehicle) for part in parts]).figures()
+            errors = combine([part.errors(champion.sim.vehicle) for part in parts]).figures()
         figures = evaluate(champion, *chosen)
     if flags.json:
-        print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
+        print(json.dumps(figures if errors is None else {**figures, "errors": errors}))
         return 0
-    road, cars = flags.scenario or champion.scenario, flags.traffic
-    if cars == -1:
-        cars = champion.traffic if road == champion.scenario else default_traffic(road)
-    title = f"{flags.champion} on {label(road)}" + (f", {cars} cars" if cars else "")
+    road = flags.scenario or champion.scenario
+    if traffic is None:
+        traffic = champion.traffic if road == champion.scenario else default_traffic(road)
+    title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     Console().print(held_out_table(title, figures))
-    if missed is not None:
-        Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
+    if errors is not None:
+        Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", errors))
     return 0

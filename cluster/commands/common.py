@@ -28,7 +28,7 @@ from gridsim.maps.scenarios import HELD_OUT_SEED
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-CROWDED = 4  # workers a core beyond which there is a warning
+MANY_WORKERS = 4  # a core; there is a warning beyond
 
 # tyro wraps a field's docstring as a whole only where its lines are not indented.
 _constant = attrdoc.ast_get_constant_value
@@ -103,7 +103,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     parts = re.split(r"-{9,}", printed.getvalue())
     reason = parts[1] if len(parts) > 1 else "cannot read these flags"
     reason = re.sub(r"invalid literal for int\(\) with base 10: ('[^']*')", r"\1 is no whole number", reason)
-    fail(prog, reason, f"see {called(prog)} --help")
+    fail(prog, reason, f"see {command_path(prog)} --help")
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
@@ -118,7 +118,7 @@ def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
             raise UsageError(f"{flag} was removed: {instead}")
         like = difflib.get_close_matches(flag, known, 1)
         meant = f"; did you mean {like[0]}?" if like else ""
-        fail(prog, f"unrecognized {flag}{meant}", f"see {called(prog)} --help")
+        fail(prog, f"unrecognized {flag}{meant}", f"see {command_path(prog)} --help")
 
 
 def as_flag(name: str) -> str:
@@ -150,39 +150,43 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
         )
 
 
+def select(kind: type[T], flags: Any) -> T:
+    """Those of a command's flags that are fields of `kind`."""
+    return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})  # type: ignore[arg-type]
+
+
 @contextlib.contextmanager
-def wrong_use(flag: str = "") -> Iterator[None]:
-    """Take a ValueError of the simulator (of a map, its name, a number of episodes) for wrong use, of a flag."""
+def wrong_use() -> Iterator[None]:
+    """Report a ValueError of the simulator (a map, its name, a number of episodes) as wrong use."""
     try:
         yield
     except ValueError as error:
-        raise UsageError(f"{flag} {error}".strip()) from error
+        raise UsageError(str(error)) from error
 
 
 def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
     """End with one clear line, and perhaps a second one that says what to do."""
-    line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: called(name[0]), " ".join(message.split()))
+    line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: command_path(name[0]), " ".join(message.split()))
     print(f"{prog}: error: {line}", *([hint] if hint else []), sep="\n", file=sys.stderr, flush=True)
     raise SystemExit(code)
 
 
-def typed(path: Path) -> str:
-    """A path as the user would type it."""
-    with contextlib.suppress(ValueError):
-        return str(path.resolve().relative_to(Path.cwd()))
-    return str(path)
+def short_path(path: Path) -> str:
+    """A path as the user would type it: relative to the working directory if it lies there."""
+    absolute, here = path.resolve(), Path.cwd()
+    return str(absolute.relative_to(here) if absolute.is_relative_to(here) else path)
 
 
-def called(prog: str) -> str:
-    """One of the commands as the user would type it: with its folder, where that is not on the PATH."""
+def command_path(prog: str) -> str:
+    """One of the commands as the user would type it: with its folder if that is not on the PATH."""
     folder = Path(sys.argv[0]).parent
     on_path = folder.resolve() in (Path(name).resolve() for name in os.get_exec_path())
-    return prog if on_path or not (folder / prog).is_file() else typed(folder / prog)
+    return prog if on_path or not (folder / prog).is_file() else short_path(folder / prog)
 
 
-def warn_of_crowd(prog: str, workers: int, address: str) -> None:
-    """One line where so many workers are started on this machine that they only wait for each other."""
-    if workers > CROWDED * cores() and not (address or os.environ.get("RAY_ADDRESS")):
+def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
+    """Warn in one line if this machine has far fewer cores than workers."""
+    if workers > MANY_WORKERS * cores() and not (address or os.environ.get("RAY_ADDRESS")):
         print(
             f"{prog}: warning: {workers:,} workers on {cores()} cores: more than one a core are no faster, and each "
             "takes some 200 MB",

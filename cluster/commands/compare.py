@@ -6,13 +6,12 @@ import dataclasses
 import math
 import os
 import re
-import shutil
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 from rich.box import SIMPLE
@@ -27,29 +26,31 @@ from cluster.commands.common import (
     UsageError,
     WorkFlags,
     as_flag,
-    called,
     check_unchanged,
+    command_path,
     main,
     parse,
-    typed,
-    warn_of_crowd,
+    select,
+    short_path,
+    warn_of_many_workers,
 )
-from cluster.commands.progress import Line, clock
+from cluster.commands.progress import Line, clock, way
 from cluster.comparison import tables
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import ERROR_FIGURES, Run, read_run, series_of, with_errors
+from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run, series_of
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
 from cluster.runs.settings import check_workers
+from cluster.runs.train import Reporter, Session, Workers, train
+from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.mlflow_run import Identity, Status
+from cluster.tracking.tracker import Tracker
+from cluster.workers.pool import PoolError
 from gridsim.errors import GridSimError
 from gridsim.view.drive import read_drive
 
-if TYPE_CHECKING:
-    from cluster.tracking.tracker import Tracker
-
 PROG = "gridsim-compare"
 TABLE, ROWS, PICTURE, ROUTE = "table.md", "table.csv", "comparison.png", "route.png"
-ERRORS_KEPT = "errors.json"
 ROUTE_M = 400.0  # m of the seamless route that are drawn
 
 
@@ -84,20 +85,20 @@ def compare_main() -> None:
 
 
 def _compare(arguments: Sequence[str]) -> int:
-    from cluster.tracking.address import check_uri
-
     flags = parse(CompareFlags, PROG, arguments)
     if flags.quick and not flags.resume:
         flags = parse(CompareFlags, PROG, arguments, QUICK)
     console = Console()
     if flags.runs:
-        return _existing(console, flags)
+        return _compare_finished(console, flags)
     folder, flags = _prepare(arguments, flags)
-    cells = folder.cells()
+    cells = folder.plan.cells(folder.path)
+    for cell in cells:
+        cell.check()
     uri = check_uri(flags.tracking_uri or None)
     lock(folder.path)
-    warn_of_crowd(PROG, flags.workers, flags.address)
-    return _experiment(console, folder, cells, flags, uri)
+    warn_of_many_workers(PROG, flags.workers, flags.address)
+    return _train_and_compare(console, folder, cells, flags, uri)
 
 
 def _new_folder(flags: CompareFlags) -> Path:
@@ -110,33 +111,33 @@ def _new_folder(flags: CompareFlags) -> Path:
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
     """The comparison's folder, checked; nothing is written yet. Raises GridSimError."""
     check_workers(flags.workers, flags.address, flags.patience)
-    if not flags.resume:
-        plan = _plan(flags)
-        plan.check()
-        return ComparisonFolder(_new_folder(flags), plan), flags
-    folder = open_comparison(Path(flags.resume))
-    before = CompareFlags(**vars(folder.plan), output=str(folder.path.parent), name=folder.path.name)
-    flags = parse(CompareFlags, PROG, arguments, before)
-    if limits(flags.budget) == limits(before.budget):
-        flags = dataclasses.replace(flags, budget=before.budget)
-    check_unchanged(flags, before, FREE, ("seeds",), "comparison")
-    folder.plan = _plan(flags)
-    folder.plan.check()
-    return folder, flags
+    if flags.resume:
+        folder = open_comparison(Path(flags.resume))
+        before = CompareFlags(**vars(folder.plan), output=str(folder.path.parent), name=folder.path.name)
+        flags = parse(CompareFlags, PROG, arguments, before)
+        if limits(flags.budget) == limits(before.budget):
+            flags = dataclasses.replace(flags, budget=before.budget)
+        check_unchanged(flags, before, FREE, ("seeds",), "comparison")
+        folder.plan = select(Plan, flags)
+        folder.plan.check()
+        return folder, flags
+    plan = select(Plan, flags)
+    plan.check()
+    return ComparisonFolder(_new_folder(flags), plan), flags
 
 
-def _plan(flags: CompareFlags) -> Plan:
-    """What decides the runs."""
-    return Plan(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(Plan)})
-
-
-def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str) -> int:
-    """Train what is not finished, and write what can be said of what is."""
+def _train_and_compare(
+    console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str
+) -> int:
+    """Train what is not finished, and write tables and pictures of what is."""
     finished, left = ([cell for cell in cells if cell.finished() == done] for done in (True, False))
     folder.write()
-    tracker = _tracker(folder, uri, flags.experiment)
+    params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
+    tags = {"algorithm": "comparison"}
+    tracker = Tracker(Identity(uri, flags.experiment, folder.path.name, params, tags, key=folder.tracking_key))
     results = Results(folder.path, folder.plan)
     code, failed, problem = 0, 0, ""
+    status: Status = "FINISHED"
     try:
         with Progress(console, folder, len(cells), len(left)) as shown:
             shown.note("reading what is finished" if finished else "starting")
@@ -144,18 +145,20 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
                 results.add(read_run(cell.folder))
             failed = _train(left, flags, uri, results, tracker, shown)
     except KeyboardInterrupt:
-        code = INTERRUPTED
+        code, status = INTERRUPTED, "KILLED"
     except Stopped:
-        code = TERMINATED
+        code, status = TERMINATED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
-        problem = str(error) or type(error).__name__
+        problem, status = str(error) or type(error).__name__, "FAILED"
     if results.runs and not problem:
         with console.status("writing tables and pictures"):
             results.write()
-    lost = _close(tracker, results, "KILLED" if code else "FAILED" if problem else "FINISHED")
-    if lost:
-        print(f"{PROG}: warning: {lost}", file=sys.stderr)
-    again = f"continue with: {called(PROG)} --resume {typed(folder.path)}"
+    if results.runs:
+        tracker.log_row(len(results.runs), results.medians())
+        tracker.log_files(results.files())
+    if unsent := tracker.close(status):
+        print(f"{PROG}: warning: {unsent}", file=sys.stderr)
+    again = f"continue with: {command_path(PROG)} --resume {short_path(folder.path)}"
     if problem:
         raise Failed(problem, again)
     if results.runs:
@@ -171,53 +174,37 @@ def _experiment(console: Console, folder: ComparisonFolder, cells: list[Cell], f
 def _train(
     cells: Sequence[Cell], flags: CompareFlags, uri: str, results: Results, tracker: Tracker, shown: Progress
 ) -> int:
-    """Train one run after the other. Returns how many failed; these stop no others."""
-    from cluster.comparison.cells import Cells
-    from cluster.tracking.address import TrackingError
-
+    """Train one run after the other, on one pool of workers. Returns how many failed; these stop no others."""
     parent, failed = "", 0
     if cells:
         try:
-            parent = tracker.wait_ready(30.0)
+            parent = tracker.wait_ready()
         except TrackingError as error:
             shown.line(f"{PROG}: warning: its runs are not nested in MLflow: {error}")
     _, wall_s = limits(flags.budget)
-    train = Cells(flags.workers, flags.address, uri, flags.experiment, wall_s, parent, shown.note, flags.patience)
+    workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
     try:
         for cell in cells:
             shown.begin(cell)
             try:
-                train(cell)
+                train(
+                    cell.open(), workers, uri, flags.experiment, shown,
+                    parent_id=parent, wall_limit_s=wall_s or math.inf,
+                )  # fmt: skip
                 shown.note("measuring errors")
                 run = results.add(read_run(cell.folder))
             except (GridSimError, FloatingPointError) as error:
                 failed += 1
-                shown.failed(cell, str(error))
+                shown.failed(str(error))
+                if isinstance(error, PoolError):
+                    workers.close()  # the next run has workers of its own
                 continue
             results.write_tables()
             tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
-            shown.done(cell, run)
+            shown.done(run)
     finally:
-        train.close()
+        workers.close()
     return failed
-
-
-def _tracker(folder: ComparisonFolder, uri: str, name: str) -> Tracker:
-    """MLflow's parent run."""
-    from cluster.tracking.mlflow_run import Identity
-    from cluster.tracking.tracker import Tracker
-
-    params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
-    tags = {"algorithm": "comparison"}
-    return Tracker(Identity(uri, name, folder.path.name, params, tags, key=folder.tracking_key))
-
-
-def _close(tracker: Tracker, results: Results, status: str) -> str | None:
-    """Log medians and files, and end the parent run."""
-    if results.runs:
-        tracker.log_row(len(results.runs), results.medians())
-        tracker.log_files(results.files())
-    return tracker.close(status, timeout_s=60.0 if status == "FINISHED" else 15.0)  # type: ignore[arg-type]
 
 
 class Results:
@@ -230,7 +217,7 @@ class Results:
 
     def add(self, run: Run) -> Run:
         """Add a run. Returns it with its errors. Raises GridSimError."""
-        self.runs.append(with_errors(run, self.reference, self.path / ERRORS_KEPT))
+        self.runs.append(dataclasses.replace(run, figures={**run.figures, **errors_of(run, self.reference)}))
         return self.runs[-1]
 
     @property
@@ -288,7 +275,7 @@ class Results:
                 table.add_row(*(cell.partition(" (")[0] for cell in row))
             console.print(table, "")
         console.print(tables.NOTES.replace(", quartiles in brackets", ""), highlight=False)
-        console.print(f"tables and pictures: {typed(self.path)}/", soft_wrap=True)
+        console.print(f"tables and pictures: {short_path(self.path)}/", soft_wrap=True)
 
 
 def _median_first(runs: Sequence[Run]) -> list[Run]:
@@ -298,74 +285,91 @@ def _median_first(runs: Sequence[Run]) -> list[Run]:
         value = run.figures["velocity_error_percent"]
         return value if math.isfinite(value) else math.inf
 
-    ordered = sorted(runs, key=error)
-    middle = (len(runs) - 1) // 2
-    return ordered[middle : middle + 1] + ordered[:middle] + ordered[middle + 1 :]
+    ordered, middle = sorted(runs, key=error), (len(runs) - 1) // 2
+    return ordered[middle:] + ordered[:middle]
 
 
-def _existing(console: Console, flags: CompareFlags) -> int:
-    """Compare runs that are there. Raises GridSimError."""
-    plain = CompareFlags()
+def _compare_finished(console: Console, flags: CompareFlags) -> int:
+    """Compare finished runs. Raises GridSimError."""
+    default = CompareFlags()
     for f in dataclasses.fields(CompareFlags):
-        if f.name not in KEPT and getattr(flags, f.name) != getattr(plain, f.name):
+        if f.name not in KEPT and getattr(flags, f.name) != getattr(default, f.name):
             raise UsageError(f"{as_flag(f.name)}: runs that are there are compared as they are; leave it out")
     if flags.reference:
         read_drive(flags.reference)
     runs = read_runs([Path(name) for name in flags.runs])
-    path = _new_folder(flags)
-    path.mkdir(parents=True)
-    try:
-        results = Results(path, reference=flags.reference)
-        with console.status("measuring errors") as shown:
-            for k, run in enumerate(runs):
-                shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
-                results.add(run)
-            shown.update("writing tables and pictures")
-            results.write()
-    except BaseException:
-        shutil.rmtree(path, ignore_errors=True)  # it was made just now
-        raise
+    results = Results(_new_folder(flags), reference=flags.reference)
+    with console.status("measuring errors") as shown:
+        for k, run in enumerate(runs):
+            shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
+            results.add(run)
+        shown.update("writing tables and pictures")
+        results.path.mkdir(parents=True)
+        results.write()
     results.show(console)
     return 0
 
 
-class Progress(Line):
+class Progress(Reporter, Line):
     """Shows which run is trained, how far it is, and ETA: a line on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console, folder: ComparisonFolder, total: int, left: int):
         super().__init__(console)
         self._total, self._left, self._done = total, left, 0
         self._wall_s = limits(folder.plan.budget)[1]
-        self._begun = self._last = time.perf_counter()  # of the first run, and the end of the last one
-        self._name = ""
+        self._begun = self._last = time.perf_counter()  # start of the first run, end of the last one
+        self._cell: Cell | None = None
         there = f", {total - left} of them finished" if left < total else ""
-        console.print(f"comparing {total} runs{there} -> {typed(folder.path)}", soft_wrap=True)
+        console.print(f"comparing {total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
     def begin(self, cell: Cell) -> None:
         """A run begins, or goes on."""
-        self._name = cell.name
+        self._cell = cell
         self.note("starting")
 
     def note(self, text: str, more: str = "") -> None:
         """How far it is, and more where there is room."""
-        self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}  {text}", f"{self._name}  {more}"
+        name = self._cell.name if self._cell else ""
+        self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}  {text}", f"{name}  {more}"
 
-    def done(self, cell: Cell, run: Run) -> None:
-        """It is trained and measured."""
+    def compiling(self) -> AbstractContextManager[object]:
+        self.note("compiling the simulator for this machine, once")
+        return nullcontext()
+
+    def learning(self, session: Session) -> AbstractContextManager[object]:
+        self._learning = session.learning
+        return nullcontext()
+
+    def row(self, steps: int, row: dict[str, float]) -> None:
+        success = f"success {row['validation/success_rate']:.0%}"
+        self.note(f"{way(self._learning, bound=False)}  {success}", self._learning.describe(row))
+
+    def warn(self, text: str) -> None:
+        assert self._cell
+        print(f"{self._cell.name}: warning: {text}", file=sys.stderr, flush=True)
+
+    def unsent(self, text: str, finished: bool) -> None:
+        assert self._cell
+        again = f"{self._cell.settings.command} --resume {self._cell.folder}"
+        self.warn(f"{text}; send it later with: {again}" if finished else text)
+
+    def done(self, run: Run) -> None:
+        """The run is trained and measured."""
         error = run.figures["velocity_error_percent"]
         self._next()
         self.line(
-            f"{self._counter()}  {cell.name}: success {run.figures['success_rate']:.0%}, "
+            f"{self._counter()}  {run.folder.name}: success {run.figures['success_rate']:.0%}, "
             f"{run.figures['distance_m']:,.0f} m, "
             + (f"velocity error {error:.1f} %, " if math.isfinite(error) else "")
             + f"{run.figures['training_s']:.0f} s"
             + (f"  ETA {self._eta()}" if self._left else "")
         )
 
-    def failed(self, cell: Cell, reason: str) -> None:
-        """It could not be trained."""
+    def failed(self, reason: str) -> None:
+        """The run could not be trained."""
+        assert self._cell
         self._next()
-        print(f"{PROG}: {cell.name} failed: {reason}", file=sys.stderr, flush=True)
+        print(f"{PROG}: {self._cell.name} failed: {reason}", file=sys.stderr, flush=True)
 
     def line(self, text: str) -> None:
         """A line that stays."""

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
+import time
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
+
+STARTED = time.perf_counter()  # of the process, but for Python's own start of some 30 ms
 
 
 def _enter(module: str, name: str) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from cluster.commands.common import Failed, RoadFlags, UsageError, called, main, parse, wrong_use
+from cluster.commands.common import Failed, RoadFlags, UsageError, command_path, main, parse, wrong_use
 from cluster.report.film import CODING, Recording, VideoError, frames, others, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs import checkpoint
@@ -147,7 +147,7 @@ def changed(run: Path) -> int:
 
 
 def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
-    """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and what it is called.
+    """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and its title.
 
     Raises: RunError, CheckpointError, UsageError.
     """
@@ -167,22 +167,19 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
 
 def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     """Gives the champion or elite before each drive, with its title. Raises UsageError, RunError, CheckpointError."""
-    source = Path(flags.source)
+    source, of_run = Path(flags.source), flags.generation is not None or flags.follow
     if flags.generation is not None and flags.follow:
         raise UsageError("--generation and --follow exclude each other")
-    if (flags.generation is not None or flags.follow) and source.is_file():
+    if of_run and source.is_file():
         raise UsageError(f"{source} holds one driver; give a run's folder with --generation or --follow")
     if flags.follow and flags.output:
         raise UsageError("--follow needs a window; leave out --output, or film one elite with --generation")
     if not source.exists():
         raise UsageError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
-    if flags.generation is None and not flags.follow:
-        champion = load_champion(source)
-        return lambda: (champion, "champion")
-    if not (source / CONFIG).is_file():
+    if of_run and not (source / CONFIG).is_file():
         raise RunError(f"{source} is no run's folder: it has no {CONFIG}")
-    if flags.generation is not None:
-        found = elite(source, flags.generation)
+    if not flags.follow:
+        found = elite(source, flags.generation) if of_run else (load_champion(source), "champion")
         return lambda: found
     if not changed(source):
         print(f"waiting for the first {read_config(source / CONFIG)[0].counts[0]} ...", flush=True)
@@ -212,21 +209,23 @@ def _is_recording(flags: WatchFlags) -> bool:
     return flags.source.lower().endswith(".csv")
 
 
+def _drives_once(flags: WatchFlags, seconds: float) -> list[tuple[Recording, str]]:
+    """As `_drives`, but one drive of a champion."""
+    return list(_recorded(flags)) if _is_recording(flags) else [next(_drives(flags, seconds))]
+
+
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     """The episodes of a recorded drive."""
     if flags.generation is not None or flags.follow or flags.scenario or flags.traffic != -1:
         raise UsageError("a recorded drive has its own driver and road; leave out all but --output and how it looks")
-    kept = read_drive(flags.source)
-    config = SimConfig()
-    scenario, _ = _map(kept.scenario, kept.map_seed, config)
-    _, cars, ranges, worlds = replay(kept, scenario, config)
+    recorded, config = read_drive(flags.source), SimConfig()
+    scenario, _ = _map(recorded.scenario, recorded.map_seed, config)
+    _, cars, ranges, worlds = replay(recorded, scenario, config)
     title = f"{Path(flags.source).name}    {label(scenario.name)}, map {scenario.seed:,}"
-    episodes = int(kept.episodes[-1]) + 1
+    episodes = int(recorded.episodes[-1]) + 1
     for episode in range(episodes):
-        own = kept.episodes == episode
-        drive = Recording(
-            scenario, cars[own], ranges[own], others(worlds[own]), End.RUNNING, config.episode.control_period
-        )
+        own, period = recorded.episodes == episode, config.episode.control_period
+        drive = Recording(scenario, cars[own], ranges[own], others(worlds[own]), End.RUNNING, period)
         yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
 
 
@@ -247,7 +246,7 @@ def _page(flags: WatchFlags, limit: float) -> None:
     for source in (flags.source, *flags.beside):
         one = dataclasses.replace(flags, source=source)
         recorded = _is_recording(one)
-        for found, title in _recorded(one) if recorded else [next(_drives(one, limit))]:
+        for found, title in _drives_once(one, limit):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
             shown.append(Shown(label, str(len(shown)), found))
             if not recorded:  # the others drive on its road, among as many cars
@@ -266,11 +265,9 @@ def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     fps = flags.fps or (10 if suffix == ".gif" else 20)
     if suffix == ".gif" and 100 % fps:
         raise UsageError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
-    if _is_recording(flags):
-        drives = list(_recorded(flags))
-    else:
-        limit = limit if flags.seconds else FILM_S
-        drives = [next(_drives(flags, limit))]
+    if not (flags.seconds or _is_recording(flags)):
+        limit = FILM_S
+    drives = _drives_once(flags, limit)
     seconds = min(limit, sum(drive.seconds for drive, _ in drives))
     total = max(1, round(seconds * fps))
     renderer = Renderer(drives[0][0].scenario, size)
@@ -298,26 +295,21 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     fps = flags.fps or 30
     run = Path(flags.source)
     drives = _drives(flags, SimConfig().episode.time_limit)
-    coming = next(drives, None)  # errors come before the window
+    first = next(drives)  # errors come before the window
     shown = 0.0
     with Window(size, f"GridSim: {flags.source}") as window:
-        while coming is not None and not window.closed and shown < limit:
-            seen = changed(run)
-            drive, title = coming
+        for drive, title in itertools.chain([first], drives):
+            before = changed(run)
             renderer = Renderer(drive.scenario, size)
-            end = round((drive.seconds + LINGER_S) * fps)
-            for k in range(end + 1):
-                if shown >= limit:
-                    break
+            for k in range(round((drive.seconds + LINGER_S) * fps) + 1):
                 window.show(picture(renderer, drive, k / fps, title), fps)
                 shown += 1 / fps
                 pressed, _ = window.keys()
-                if window.closed or pressed & {"escape", "q"}:
+                if window.closed or pressed & {"escape", "q"} or shown >= limit:
                     return
-                newer = flags.follow and k / fps >= FOLLOW_S and changed(run) != seen
+                newer = flags.follow and k / fps >= FOLLOW_S and changed(run) != before
                 if "n" in pressed or newer:
                     break
-            coming = next(drives, None) if shown < limit else None
 
 
 def drive_main() -> None:
@@ -337,15 +329,11 @@ def _drive() -> int:
         if flags.record:
             period = config.episode.control_period
             recorder = stack.enter_context(Recorder(flags.record, scenario, period, traffic))
-            stack.callback(_say_kept, recorder)  # also where the drive is interrupted
+            stack.callback(_print_recorded, recorder)  # also if the drive is interrupted
         done = drive(scenario, start, window, Renderer(scenario, size), recorder, config, seconds, traffic)
         print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
     return 0
 
 
-def _say_kept(recorder: Recorder) -> None:
-    print(f"kept {recorder.rows} steps; watch them: {called(WATCH)} {recorder.path}")
-
-
-if __name__ == "__main__":
-    watch_main()
+def _print_recorded(recorder: Recorder) -> None:
+    print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {recorder.path}")

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -19,11 +20,12 @@ from typing import Any, NamedTuple
 
 from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, read_run
 from cluster.runs import checkpoint
-from cluster.runs.run import CONFIG, SUMMARY, read_config
+from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, new_run, open_run, read_config
 from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, to_dict
+from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import REGISTRY, is_map_file, label
+from gridsim.maps.scenarios import REGISTRY, is_map_file
 from gridsim.view.drive import read_drive
 
 COMPARISON = "comparison.json"
@@ -34,7 +36,7 @@ EVALUATIONS = 10  # of the DQN at least
 
 
 class Cell(NamedTuple):
-    """One training run of a comparison: its folder, and what it is asked to do."""
+    """One training run of a comparison."""
 
     folder: Path
     settings: RunSettings
@@ -56,17 +58,21 @@ class Cell(NamedTuple):
             if not self.folder.is_dir() or any(not path.name.startswith(".") for path in self.folder.iterdir()):
                 raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
             return
-        found, asked = (_described(settings) for settings in (read_config(self.folder / CONFIG)[0], self.settings))
-        for name, value in asked.items():
-            if found.get(name) != value:
+        found, _ = read_config(self.folder / CONFIG)
+        for name in ("learner", *to_dict(self.settings)):
+            actual, asked = getattr(found, name, None), getattr(self.settings, name)
+            if actual != asked:
                 raise ExperimentError(
-                    f"{self.folder}: its {name} is {found.get(name)}, and {COMPARISON} asks for {value}; "
-                    "one of them was edited"
+                    f"{self.folder}: its {name} is {actual}, and {COMPARISON} asks for {asked}; one of them was edited"
                 )
 
-
-def _described(settings: RunSettings) -> dict[str, Any]:
-    return {"learner": settings.learner, **to_dict(settings)}
+    def open(self) -> RunFolder:
+        """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""
+        if (self.folder / CHECKPOINT).is_file():
+            return open_run(self.folder)
+        if self.folder.exists():  # killed before its first step
+            shutil.rmtree(self.folder)
+        return new_run(self.folder.parent, self.name, self.settings)
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,7 @@ class Plan:
                 raise ExperimentError(f"--learners: {learner!r:.40} is none; use {', '.join(LEARNERS)}")
         if not 1 <= self.seeds <= MAX_SEEDS:
             raise ExperimentError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
-        if len({_word(name) for name in self.scenarios}) != len(self.scenarios):
+        if len({file_name(name) for name in self.scenarios}) != len(self.scenarios):
             raise ExperimentError("--scenarios: two maps have the same name; rename one")
         for cell in dataclasses.replace(self, seeds=1).cells(Path()):
             cell.settings.check()
@@ -123,7 +129,7 @@ class Plan:
     def cells(self, folder: Path) -> list[Cell]:
         """All runs of a comparison in that folder, in the order in which they are made."""
         return [
-            Cell(folder / f"{_word(scenario)}-{learner}-s{seed}", self.settings(scenario, learner, seed))
+            Cell(folder / f"{file_name(scenario)}-{learner}-s{seed}", self.settings(scenario, learner, seed))
             for seed in range(self.seeds)
             for scenario in self.scenarios
             for learner in self.learners
@@ -132,18 +138,22 @@ class Plan:
     def settings(self, scenario: str, learner: Learner, seed: int) -> RunSettings:
         """What one run is asked to do."""
         car_steps, _ = limits(self.budget)
-        # Equal budgets: a run ends earlier only if its champion succeeds in every validation drive.
-        common: dict[str, Any] = {"scenario": scenario, "traffic": self.traffic, "seed": seed, "until": 1.0}
+        common: dict[str, Any] = {
+            "scenario": scenario,
+            "traffic": self.traffic,
+            "seed": seed,
+            "observation": self.observation,
+            "until": 1.0,  # equal budgets: a run ends earlier only if its champion succeeds in every validation drive
+        }
         if learner == "dqn":
             steps = car_steps or UNBOUND
             usual = DqnSettings.suited[self.observation]["evaluate_every"]
             every = min(usual, max(steps // EVALUATIONS, 1))
-            return DqnSettings(**common, observation=self.observation, car_steps=steps, evaluate_every=every)
+            return DqnSettings(**common, car_steps=steps, evaluate_every=every)
         if self.population:
             common["population"] = self.population
         return EvolveSettings(
             **common,
-            observation=self.observation,
             search="random" if learner == "random" else "evolution",
             recombination="two" if learner == "two-parents" else "all",
             car_steps=car_steps,
@@ -175,13 +185,7 @@ def limits(budget: str) -> tuple[int, float]:
 
 @dataclass
 class ComparisonFolder:
-    """Where a comparison is kept.
-
-    Attributes:
-        path: the folder.
-        plan: what was asked.
-        tracking_key: by which MLflow's parent run is found again.
-    """
+    """Where a comparison is kept, its plan, and the key by which MLflow's parent run is found again."""
 
     path: Path
     plan: Plan
@@ -197,13 +201,6 @@ class ComparisonFolder:
             "tracking_key": self.tracking_key,
         }
         checkpoint.write_atomic(self.path / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())
-
-    def cells(self) -> list[Cell]:
-        """All of its runs, checked. Raises ExperimentError, RunError."""
-        cells = self.plan.cells(self.path)
-        for cell in cells:
-            cell.check()
-        return cells
 
 
 def open_comparison(folder: Path) -> ComparisonFolder:
@@ -228,11 +225,6 @@ def open_comparison(folder: Path) -> ComparisonFolder:
         raise ExperimentError(f"{path}: not a {COMPARISON} of this GridSim ({type(error).__name__})") from error
 
 
-def _word(scenario: str) -> str:
-    """A scenario's name as part of a folder's."""
-    return re.sub(r"[^\w.+=@-]", "_", label(scenario))
-
-
 def read_runs(folders: Iterable[Path]) -> list[Run]:
     """Finished runs from their folders; a comparison's folder stands for its finished runs. Raises GridSimError."""
     found: list[Run] = []
@@ -245,13 +237,12 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
             found += runs
         else:
             found.append(read_run(folder))
-    paths = [run.folder.resolve() for run in found]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise ExperimentError(f"{path} is named twice")
     first: dict[tuple[object, ...], Run] = {}
-    for run in found:  # counted as two seeds they would make a figure look surer than it is
-        other = first.setdefault((run.champion_sha256, run.learner, run.scenario, run.traffic), run)
+    for run in found:  # counted as two seeds they would make a figure look more certain than it is
+        same = (run.champion_sha256, run.settings.learner, run.settings.scenario, run.settings.traffic)
+        other = first.setdefault(same, run)
         if other is not run:
+            if other.folder.resolve() == run.folder.resolve():
+                raise ExperimentError(f"{run.folder.resolve()} is named twice")
             raise ExperimentError(f"{other.folder} and {run.folder} are the same run, made twice; leave one out")
     return found

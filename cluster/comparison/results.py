@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import hashlib
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Literal, get_args
 
 from cluster.comparison.errors import series
-from cluster.runs import checkpoint
 from cluster.runs.champion import load_champion
 from cluster.runs.checkpoint import CHAMPION
 from cluster.runs.run import CONFIG, SUMMARY, read_config
+from cluster.runs.settings import RunSettings
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import label
 from gridsim.reference.errors import Series, combine
 
 Learner = Literal["evolution", "two-parents", "dqn", "random"]
@@ -55,18 +50,12 @@ class Run:
     """A finished training run, of a comparison or any other.
 
     Attributes:
-        folder: its folder.
-        learner, scenario, seed, traffic, observation: what it was.
         champion_sha256: digest of its champion's genome.
         figures: RUN_FIGURES, and ERROR_FIGURES once they are measured; not a number where they could not be.
     """
 
     folder: Path
-    learner: str
-    scenario: str
-    seed: int
-    traffic: int
-    observation: str
+    settings: RunSettings
     champion_sha256: str
     figures: Mapping[str, float]
 
@@ -91,10 +80,7 @@ def read_run(folder: Path) -> Run:
         raise ExperimentError(f"{reason}; delete it, and make it again with --resume {folder}") from error
     if found != (settings.scenario, settings.seed, champion.sha256):
         raise ExperimentError(f"{folder}: {CONFIG}, {CHAMPION} and {SUMMARY} do not belong together; one was edited")
-    return Run(
-        folder, settings.learner, settings.scenario, settings.seed, settings.traffic, settings.observation,
-        champion.sha256, figures,
-    )  # fmt: skip
+    return Run(folder, settings, champion.sha256, figures)
 
 
 def series_of(run: Run, reference: str, episodes: int) -> list[Series]:
@@ -105,8 +91,8 @@ def series_of(run: Run, reference: str, episodes: int) -> list[Series]:
     try:
         champion = load_champion(run.folder / CHAMPION)
         if reference:  # it brings its own map and traffic
-            return series(champion, run.scenario, reference=reference)
-        return series(champion, run.scenario, episodes, traffic=run.traffic)
+            return series(champion, run.settings.scenario, reference=reference)
+        return series(champion, run.settings.scenario, episodes, traffic=run.settings.traffic)
     except ValueError as error:
         raise ExperimentError(f"{run.folder}: no errors can be measured: {error}") from error
 
@@ -125,16 +111,3 @@ def errors_of(run: Run, reference: str) -> dict[str, float]:
             "of GridSim made it; make it again, or leave it out"
         )
     return {mine: figures.get(theirs, math.nan) for mine, theirs in ERROR_FIGURES.items()}
-
-
-def with_errors(run: Run, reference: str, kept: Path) -> Run:
-    """The run with its errors among its figures. They are measured once and kept in a file. Raises GridSimError."""
-    digest = hashlib.sha256(Path(reference).read_bytes()).hexdigest() if reference else ""
-    key = "/".join((run.champion_sha256, label(run.scenario), str(run.traffic), digest, version("gridsim")))
-    known: dict[str, dict[str, float]] = {}
-    with contextlib.suppress(OSError, ValueError, TypeError):  # then they are measured again
-        known = dict(json.loads(kept.read_text(encoding="utf-8")))
-    if key not in known:
-        known[key] = errors_of(run, reference)
-        checkpoint.write_atomic(kept, json.dumps(known, indent=1).encode(), durable=False)
-    return dataclasses.replace(run, figures={**run.figures, **known[key]})

@@ -77,9 +77,8 @@ def interval(values: Iterable[float]) -> tuple[float, float]:
     from scipy.stats import bootstrap
 
     found = [np.sort([value for value in values if math.isfinite(value)])]
-    rng = np.random.default_rng(np.random.SeedSequence(_SEED))
     low, high = bootstrap(
-        found, np.median, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile", rng=rng
+        found, np.median, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile", rng=_SEED
     ).confidence_interval
     return float(low), float(high)
 
@@ -116,26 +115,28 @@ class Group:
 
 def group(runs: Sequence[Run], plan: Plan | None = None) -> list[Group]:
     """Runs by road and learner, in the order of the registry and of NAMES; with a plan also what is missing."""
-    asked: Sequence[Run | RunSettings] = [cell.settings for cell in plan.cells(Path())] if plan else runs
-    wanted: dict[tuple[str, int, str, str], list[int]] = {}
-    for each in asked:
-        wanted.setdefault((each.scenario, each.traffic, each.observation, each.learner), []).append(each.seed)
+    settings = [each.settings for each in (plan.cells(Path()) if plan else runs)]
 
     def order(key: tuple[str, int, str, str]) -> tuple[int, str, int, int, str]:
         scenario, traffic, observation, learner = key
         return [*REGISTRY, scenario].index(scenario), scenario, traffic, [*NAMES].index(learner), observation
 
-    several_views = len({view for _, _, view, _ in wanted}) > 1
+    keys = sorted({_key(each) for each in settings}, key=order)
+    several_observations = len({observation for _, _, observation, _ in keys}) > 1
     found = []
-    for key in sorted(wanted, key=order):
+    for key in keys:
         scenario, traffic, observation, learner = key
-        several = len({other[1] for other in wanted if other[0] == scenario}) > 1
-        road = label(scenario) + (f", {traffic} cars" if several else "")
-        called = NAMES[learner] + (f" on {observation}" if several_views else "")
-        mine = [run for run in runs if (run.scenario, run.traffic, run.observation, run.learner) == key]
-        mine.sort(key=lambda run: run.seed)
-        found.append(Group(*key, road, called, tuple(mine), tuple(sorted(wanted[key]))))
+        several_traffics = len({other[1] for other in keys if other[0] == scenario}) > 1
+        road = label(scenario) + (f", {traffic} cars" if several_traffics else "")
+        name = NAMES[learner] + (f" on {observation}" if several_observations else "")
+        finished = sorted((run for run in runs if _key(run.settings) == key), key=lambda run: run.settings.seed)
+        seeds = sorted(each.seed for each in settings if _key(each) == key)
+        found.append(Group(*key, road, name, tuple(finished), tuple(seeds)))
     return found
+
+
+def _key(settings: RunSettings) -> tuple[str, int, str, str]:
+    return settings.scenario, settings.traffic, settings.observation, settings.learner
 
 
 def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
@@ -144,14 +145,19 @@ def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
     writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
     for each in groups:
-        runs = {run.seed: run for run in each.runs}
-        common = {"scenario": label(each.scenario), "traffic": each.traffic, "observation": each.observation}
+        finished = {run.settings.seed for run in each.runs}
+        common = {
+            "scenario": label(each.scenario),
+            "traffic": each.traffic,
+            "observation": each.observation,
+            "learner": each.learner,
+        }
         for run in each.runs:
             where = run.folder.relative_to(folder) if run.folder.is_relative_to(folder) else run.folder
             numbers = {name: repr(value) for name, value in run.figures.items() if math.isfinite(value)}
-            own = {"learner": each.learner, "seed": run.seed, "champion_sha256": run.champion_sha256, "run": where}
+            own = {"seed": run.settings.seed, "champion_sha256": run.champion_sha256, "run": where}
             writer.writerow(common | own | numbers)
-        writer.writerows(common | {"learner": each.learner, "seed": s} for s in each.seeds if s not in runs)
+        writer.writerows(common | {"seed": seed} for seed in each.seeds if seed not in finished)
     return stream.getvalue().encode()
 
 

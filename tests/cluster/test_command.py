@@ -11,7 +11,7 @@ import pytest
 from cluster.commands import common as command
 from cluster.commands import entry, watch
 from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
-from cluster.commands.common import Failed, UsageError, called, main, parse, warn_of_crowd
+from cluster.commands.common import Failed, UsageError, command_path, main, parse, warn_of_many_workers
 from cluster.commands.compare import CompareFlags
 from cluster.commands.watch import DriveFlags, WatchFlags
 from cluster.workers import ray_pool
@@ -89,11 +89,11 @@ def test_a_command_is_called_as_this_one_was(tmp_path, monkeypatch):
         (folder / name).touch()
     monkeypatch.setattr(sys, "argv", ["venv/bin/gridsim-evolve"])
     monkeypatch.setenv("PATH", "/usr/bin:/bin")
-    assert called("gridsim-watch") == "venv/bin/gridsim-watch"
+    assert command_path("gridsim-watch") == "venv/bin/gridsim-watch"
     monkeypatch.setenv("PATH", f"/bin:{folder}")
-    assert called("gridsim-watch") == "gridsim-watch"
+    assert command_path("gridsim-watch") == "gridsim-watch"
     monkeypatch.setattr(sys, "argv", ["-c"])
-    assert called("gridsim-watch") == "gridsim-watch"
+    assert command_path("gridsim-watch") == "gridsim-watch"
 
 
 @pytest.mark.parametrize("prog", FLAGS)
@@ -152,6 +152,6 @@ def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monke
     warning, error = capsys.readouterr().err.splitlines()
     assert warning.startswith("gridsim-evolve: warning: 1,000 workers on 2 cores")
     assert error == "gridsim-evolve: error: no Ray in this test"
-    warn_of_crowd("gridsim-compare", 4, "")
-    warn_of_crowd("gridsim-compare", 1000, "head:6379")
+    warn_of_many_workers("gridsim-compare", 4, "")
+    warn_of_many_workers("gridsim-compare", 1000, "head:6379")
     assert capsys.readouterr().err == ""

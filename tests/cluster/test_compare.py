@@ -12,7 +12,7 @@ from commands import finish, start, wait_until
 from finished_runs import make_run
 
 from cluster.commands import compare
-from cluster.comparison import cells, results
+from cluster.comparison import results
 from cluster.comparison.plan import ComparisonFolder, Plan
 from cluster.workers.pool import PoolError
 
@@ -71,16 +71,16 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     trained: list[str] = []
     broken = {"seamless-evolution-s0"}
 
-    def train(self, cell):
-        trained.append(cell.name)
-        if cell.name in broken:
+    def train(run, *_, **__):
+        trained.append(run.name)
+        if run.name in broken:
             raise PoolError("the workers are gone")
-        make_run(cell.folder, settings=cell.settings)
+        make_run(run.path, settings=run.settings)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cells.Cells, "__call__", train)
-    monkeypatch.setattr(results, "errors_of", lambda run, reference: dict.fromkeys(results.ERROR_FIGURES, 2.5))
-    monkeypatch.setattr(compare, "_tracker", lambda *_: Untracked())
+    monkeypatch.setattr(compare, "train", train)
+    monkeypatch.setattr(compare, "errors_of", lambda run, reference: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
     assert run(monkeypatch, *asked, "--name", "c", "--seeds", 1) == 1
     err = capsys.readouterr().err
@@ -95,7 +95,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     assert trained[4:] == ["seamless-evolution-s0", *names[4:]]
     assert run(monkeypatch, "--resume", "runs/c", "--workers", 0) == 0
     assert len(trained) == 9
-    assert {"table.md", "table.csv", "comparison.png", "errors.json"} <= set(os.listdir("runs/c"))
+    assert {"table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
     assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
     assert run(monkeypatch, "runs/c", "--name", "again") == 0
     rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))

@@ -2,35 +2,12 @@
 
 import dataclasses
 import json
-import math
 
 import pytest
 from finished_runs import HELD_OUT, make_run
 
-from cluster.comparison import results
-from cluster.comparison.results import ERROR_FIGURES, LEARNERS, ExperimentError, errors_of, read_run, with_errors
+from cluster.comparison.results import ERROR_FIGURES, LEARNERS, ExperimentError, errors_of, read_run
 from gridsim.errors import GridSimError
-
-
-def test_errors_are_measured_once(tmp_path, monkeypatch):
-    make_run(tmp_path / "a")
-    kept, measured = tmp_path / "errors.json", []
-
-    def measure(run, reference):
-        measured.append(run.folder)
-        return dict.fromkeys(ERROR_FIGURES, 2.5) | {"steering_error_deg": math.nan}
-
-    monkeypatch.setattr(results, "errors_of", measure)
-    for _ in range(2):
-        found = with_errors(read_run(tmp_path / "a"), "", kept)
-        assert found.figures["velocity_error_percent"] == 2.5
-        assert math.isnan(found.figures["steering_error_deg"])
-        assert found.figures["success_rate"] == 0.5
-    assert len(measured) == 1
-    for count, text in enumerate(("", "[]", "7"), 2):
-        kept.write_text(text)
-        with_errors(read_run(tmp_path / "a"), "", kept)
-        assert len(measured) == count
 
 
 def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path):
@@ -46,7 +23,8 @@ def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path)
 def test_run_is_read(tmp_path, learner):
     make_run(tmp_path / "a", learner, "seamless", 3)
     found = read_run(tmp_path / "a")
-    assert (found.learner, found.scenario, found.seed) == (learner, "seamless", 3)
+    settings = found.settings
+    assert (settings.learner, settings.scenario, settings.seed) == (learner, "seamless", 3)
     figures = found.figures
     assert (figures["wall_s"], figures["training_s"]) == (12.5, 6.0)
     assert (figures["best_wall_s"], figures["best_car_steps"]) == (4.0, 3000.0)
