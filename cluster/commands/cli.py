@@ -31,7 +31,6 @@ from cluster.commands.common import (
     parse,
     select,
     short_path,
-    stoppable,
     warn_of_many_workers,
     wrong_use,
 )
@@ -215,10 +214,9 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     hint = f"continue with: {resume}"
     code, message = 0, ""
     try:
-        with stoppable():
-            initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
-            progress = Progress(console, prog, folder, resume)
-            session = train(run, workers, uri, flags.experiment, progress, STARTED, initial=initial)
+        initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
+        progress = Progress(console, prog, folder, resume)
+        session = train(run, workers, uri, flags.experiment, progress, STARTED, initial=initial)
     except KeyboardInterrupt:
         code = INTERRUPTED
     except Stopped:

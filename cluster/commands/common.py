@@ -28,7 +28,7 @@ from gridsim.maps.scenarios import HELD_OUT_SEED
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
-MANY_WORKERS = 4  # a core; there is a warning beyond
+MANY_WORKERS = 4  # a core; more give a warning
 
 # tyro wraps a field's docstring as a whole only where its lines are not indented.
 _constant = attrdoc.ast_get_constant_value
@@ -42,7 +42,7 @@ class UsageError(GridSimError):
 
 
 class Failed(GridSimError):
-    """A failure of a command that was used rightly, which ends with 1; `hint` is a second line."""
+    """A failure that is no wrong use, which ends with 1; `hint` is a second line."""
 
     def __init__(self, message: str, hint: str = ""):
         super().__init__(message)
@@ -90,10 +90,9 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
     given: dict[str, Any] = {} if default is None else {"default": default}
     printed = io.StringIO()
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(contextlib.redirect_stderr(printed))
-        if not {"-h", "--help"} & set(arguments):  # no terminal: tyro draws no box then, and uses no colours
-            stack.enter_context(contextlib.redirect_stdout(printed))
+    # Without a terminal tyro draws no box and uses no colours: its error is read below.
+    out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
+    with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
             return tyro.cli(kind, prog=prog, description=_about(kind), args=arguments, config=config, **given)
         except SystemExit as stop:
@@ -107,7 +106,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
-    """Fail where a flag is unknown, with the one that is most like it, or what takes the place of a removed one."""
+    """Fail for an unknown flag, with the most similar one, or what replaces a removed one."""
     fields = dataclasses.fields(kind)
     known = [as_flag(f.name) for f in fields if "Positional" not in str(f.type)]
     for argument in arguments:
@@ -127,27 +126,25 @@ def as_flag(name: str) -> str:
 
 
 def _about(kind: type) -> str:
-    """A command's description as --help shows it. tyro leaves lines alone that begin with a space."""
+    """A command's description as --help shows it. tyro keeps lines that begin with a space."""
     paragraphs = [*inspect.cleandoc(kind.__doc__ or "").split("\n\n"), "--version prints GridSim's version."]
     width = shutil.get_terminal_size().columns
     return "\n".join(textwrap.fill(text, width, initial_indent=" ", subsequent_indent=" ") for text in paragraphs)
 
 
 def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Collection[str], what: str) -> None:
-    """Raises UsageError where flags contradict what was asked of a run or comparison (`what`) that is continued.
+    """Raises UsageError if flags contradict those of the run or comparison (`what`) that is continued.
 
-    Args: the fields that may differ, and those that may be greater, where 0 is any number.
+    Args: `free` fields may differ; those that `may_grow` may be greater, where 0 stands for any number.
     """
     for f in dataclasses.fields(before):
-        now, then = getattr(flags, f.name), getattr(before, f.name)
+        new, old = getattr(flags, f.name), getattr(before, f.name)
         if f.name == "output":
-            now, then = Path(now).resolve(), Path(then).resolve()
-        if now == then or f.name in free or (f.name in may_grow and (now or math.inf) >= (then or math.inf)):
+            new, old = Path(new).resolve(), Path(old).resolve()
+        if new == old or f.name in free or (f.name in may_grow and (new or math.inf) >= (old or math.inf)):
             continue
-        now, then = (" ".join(value) if isinstance(value, tuple) else value for value in (now, then))
-        raise UsageError(
-            f"{as_flag(f.name)} {now} contradicts the {what}'s {then}; leave it out, or start a new {what}"
-        )
+        new, old = (" ".join(value) if isinstance(value, tuple) else value for value in (new, old))
+        raise UsageError(f"{as_flag(f.name)} {new} contradicts the {what}'s {old}; leave it out, or start a new {what}")
 
 
 def select(kind: type[T], flags: Any) -> T:

@@ -1,4 +1,4 @@
-"""gridsim-compare: the paper's comparison in one command, or a comparison of runs that are there."""
+"""gridsim-compare: the paper's comparison in one command, or a comparison of finished runs."""
 
 from __future__ import annotations
 
@@ -74,9 +74,8 @@ class CompareFlags(WorkFlags, Plan):
 
 
 QUICK = CompareFlags(seeds=1, budget="10s")
-# May differ when a comparison is resumed.
-FREE = ("resume", "workers", "address", "patience", "tracking_uri", "experiment")
-KEPT = ("runs", "output", "name", "reference")  # go with --runs
+MAY_DIFFER = ("resume", "workers", "address", "patience", "tracking_uri", "experiment")  # in a resumed comparison
+WITH_RUNS = ("runs", "output", "name", "reference")  # flags for a comparison of finished runs
 
 
 def compare_main() -> None:
@@ -117,7 +116,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
         flags = parse(CompareFlags, PROG, arguments, before)
         if limits(flags.budget) == limits(before.budget):
             flags = dataclasses.replace(flags, budget=before.budget)
-        check_unchanged(flags, before, FREE, ("seeds",), "comparison")
+        check_unchanged(flags, before, MAY_DIFFER, ("seeds",), "comparison")
         folder.plan = select(Plan, flags)
         folder.plan.check()
         return folder, flags
@@ -249,7 +248,7 @@ class Results:
             pictures.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, missing)
 
     def files(self) -> list[Path]:
-        """That were written."""
+        """Those that exist."""
         names = (COMPARISON, TABLE, ROWS, PICTURE, ROUTE)
         return [self.path / name for name in names if (self.path / name).is_file()]
 
@@ -265,7 +264,8 @@ class Results:
     def show(self, console: Console) -> None:
         """Print the tables without their quartiles, and where the whole ones are."""
         console.print(tables.introduction(self.plan))
-        for head, *rows in (tables.driving(self.groups), tables.errors(self.groups)):
+        for columns in (tables.DRIVING, tables.ERRORS):
+            head, *rows = tables.table(self.groups, columns)
             table = Table(box=SIMPLE, padding=0, pad_edge=False, show_edge=False)
             for name in head:  # a word a line, so that it is narrow
                 table.add_column(
@@ -293,7 +293,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     """Compare finished runs. Raises GridSimError."""
     default = CompareFlags()
     for f in dataclasses.fields(CompareFlags):
-        if f.name not in KEPT and getattr(flags, f.name) != getattr(default, f.name):
+        if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(default, f.name):
             raise UsageError(f"{as_flag(f.name)}: runs that are there are compared as they are; leave it out")
     if flags.reference:
         read_drive(flags.reference)

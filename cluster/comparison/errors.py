@@ -13,19 +13,11 @@ from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED
-from gridsim.reference.errors import (
-    TURN,
-    Driven,
-    Series,
-    driven,
-    error_series,
-    error_series_beside,
-    poses_of,
-)
+from gridsim.reference.errors import TURN, Driven, Series, driven, error_series, error_series_beside, poses_of
 from gridsim.view.drive import Drive, DriveError, read_drive, replay
 
-_STRETCH = 1.0  # m of a recording that are worth another start
-_DRIFT = 0.5  # m by which a drive, replayed, may miss what was recorded
+_SHORTEST = 1.0  # m that must be left of a recording for another start
+_MAX_DRIFT = 0.5  # m from a recorded position to the replayed one
 
 
 def series(
@@ -39,8 +31,8 @@ def series(
     """A champion and its reference along each route, in the order of the episodes; `gridsim.reference.errors.combine`
     makes one of their errors.
 
-    An episode in which it came nowhere has none. Beside a recorded drive there is one for each stretch of it that
-    the champion followed.
+    An episode without a metre forward has none. Beside a recorded drive there is one for each stretch of it that the
+    champion followed.
 
     Args: as `champion.evaluate`'s; or a recorded drive, which brings its own map, start and traffic.
     Raises: ValueError with one line as `champion.evaluate`; DriveError (a ValueError) for a file that is no recorded
@@ -56,16 +48,14 @@ def series(
         for row, world in zip(chosen.rows, chosen.worlds, strict=True):
             road = maps.get(chosen.maps[row["map"]])
             path = _drive(champion, road, row["start"], world, champion.sim.episode.target)
-            part = None if path is None else error_series(path, road, sim=champion.sim)
-            if part is not None and len(part.arc) > 1:
-                found.append(part)
-        return found
+            found += [error_series(path, road, sim=champion.sim)] if path else []
+        return [part for part in found if len(part.arc) > 1]
     finally:
         maps.close()
 
 
 def _drive(champion: Champion, road: Map, start: np.ndarray, world: np.ndarray, target: float) -> Driven | None:
-    """The path of an episode of so many m; None if the car never came forward."""
+    """The path of an episode of so many m; None without a metre forward."""
     episode = champion.sim.episode
     limits = Limits(target, round(episode.time_limit / episode.control_period))
     spec = PolicySpec.parse(champion.policy)
@@ -79,43 +69,41 @@ def _drive(champion: Champion, road: Map, start: np.ndarray, world: np.ndarray, 
 def _beside(
     champion: Champion, maps: Maps, name: str, traffic: int | None, reference: str | os.PathLike[str]
 ) -> list[Series]:
-    """A champion beside a recorded drive: wherever their paths part, it begins anew a bit further on.
+    """A champion beside a recorded drive: where their paths part, it starts again a bit further on.
 
     Of several episodes in the file, the longest is taken.
     """
-    kept = read_drive(reference)
-    if kept.scenario != name:
-        raise DriveError(f"{reference} was driven on {kept.scenario}, not on {name}: choose that scenario")
-    if traffic not in (None, kept.traffic):
-        raise DriveError(f"{reference} was driven among {kept.traffic} cars, not {traffic}: leave traffic out")
-    road = maps.get(kept.map_seed)
-    poses, _, _, worlds = replay(kept, road)
-    away = np.abs(poses[:, :2] - kept.poses[:, :2]).max()
-    if away > _DRIFT:
-        raise DriveError(f"{reference}: replayed, the drive is {away:.1f} m off: it was driven on another map")
-    rows, recorded = _longest(kept, road)
+    recording = read_drive(reference)
+    if recording.scenario != name:
+        raise DriveError(f"{reference} was driven on {recording.scenario}, not on {name}: choose that scenario")
+    if traffic not in (None, recording.traffic):
+        raise DriveError(f"{reference} was driven among {recording.traffic} cars, not {traffic}: leave traffic out")
+    road = maps.get(recording.map_seed)
+    poses, _, _, worlds = replay(recording, road)
+    drift = np.abs(poses[:, :2] - recording.poses[:, :2]).max()
+    if drift > _MAX_DRIFT:
+        raise DriveError(f"{reference}: replayed, the drive is {drift:.1f} m off: it was driven on another map")
+    rows, recorded = _longest(recording, road)
     found = []
     arc, end = 0.0, float(recorded.arc[-1])
-    while end - arc > _STRETCH:
+    while end - arc > _SHORTEST:
         k = int(np.searchsorted(recorded.arc, arc))
-        row = rows[recorded.rows[k]]
-        path = _drive(champion, road, kept.poses[row], worlds[row], end - float(recorded.arc[k]))
-        reached = float(recorded.arc[k])
+        row, reached = rows[recorded.rows[k]], float(recorded.arc[k])
+        path = _drive(champion, road, recording.poses[row], worlds[row], end - reached)
         if path is not None:
             part, reached = error_series_beside(path, recorded, road, k)
-            if len(part.arc) > 1:
-                found.append(part)
+            found.append(part)
         arc = reached + TURN
-    return found
+    return [part for part in found if len(part.arc) > 1]
 
 
-def _longest(kept: Drive, road: Map) -> tuple[np.ndarray, Driven]:
+def _longest(recording: Drive, road: Map) -> tuple[np.ndarray, Driven]:
     """The rows of the longest episode of a recording, and its path."""
     episodes = []
-    for episode in range(int(kept.episodes[-1]) + 1):
-        rows = np.flatnonzero(kept.episodes == episode)
+    for episode in range(int(recording.episodes[-1]) + 1):
+        rows = np.flatnonzero(recording.episodes == episode)
         with contextlib.suppress(ValueError):  # an episode without a metre forward
-            episodes.append((rows, driven(kept.poses[rows], road)))
+            episodes.append((rows, driven(recording.poses[rows], road)))
     if not episodes:
         raise DriveError("nothing was driven in the recording that could be compared with")
     return max(episodes, key=lambda found: float(found[1].arc[-1]))

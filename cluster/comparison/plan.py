@@ -1,6 +1,6 @@
 """The paper's comparison: scenarios x learners x seeds, each a training run in a folder of its own.
 
-Runs are ordered by seed first, so that a comparison that was stopped has something of everything. What was asked is
+Runs are ordered by seed first, so that a stopped comparison has results of every learner on every road. Its plan is
 kept in comparison.json.
 """
 
@@ -46,16 +46,14 @@ class Cell(NamedTuple):
         return self.folder.name
 
     def finished(self) -> bool:
-        """Whether there is nothing left to do: its summary is there, the last file that a run writes."""
+        """Whether its summary is there, the last file that a run writes."""
         return (self.folder / SUMMARY).is_file()
 
     def check(self) -> None:
         """Compare what is in the folder with what was asked. Raises ExperimentError, RunError."""
-        if not self.folder.exists():
-            return
         if not (self.folder / CONFIG).is_file():
             # Killed while it wrote its first file, a run leaves a hidden one.
-            if not self.folder.is_dir() or any(not path.name.startswith(".") for path in self.folder.iterdir()):
+            if self.folder.is_file() or any(self.folder.glob("[!.]*")):
                 raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
             return
         found, _ = read_config(self.folder / CONFIG)
@@ -216,9 +214,9 @@ def open_comparison(folder: Path) -> ComparisonFolder:
         values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in content["plan"].items()
         }
-        found = ComparisonFolder(folder.resolve(), Plan(**values), uuid.UUID(content["tracking_key"]).hex)
-        found.plan.check()
-        return found
+        plan = Plan(**values)
+        plan.check()
+        return ComparisonFolder(folder.resolve(), plan, uuid.UUID(content["tracking_key"]).hex)
     except GridSimError as error:
         raise ExperimentError(f"{path}: {error}") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

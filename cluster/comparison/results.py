@@ -20,7 +20,7 @@ from gridsim.reference.errors import Series, combine
 
 Learner = Literal["evolution", "two-parents", "dqn", "random"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
-ALIKE = 0.25  # share of a summary's distance that a champion must drive again when its errors are measured
+LEAST_SHARE = 0.25  # of a summary's distance that a champion must drive again when its errors are measured
 LEFT_OUT_M = 100.0  # m of an episode, at most, of which no error is known
 
 ERROR_FIGURES = {
@@ -84,7 +84,7 @@ def read_run(folder: Path) -> Run:
 
 
 def series_of(run: Run, reference: str, episodes: int) -> list[Series]:
-    """A run's champion and the reference along its held-out drives, or beside the recorded one.
+    """A run's champion and the reference along its held-out drives, or beside a recorded one.
 
     Raises: ExperimentError.
     """
@@ -100,14 +100,14 @@ def series_of(run: Run, reference: str, episodes: int) -> list[Series]:
 def errors_of(run: Run, reference: str) -> dict[str, float]:
     """ERROR_FIGURES of a run's champion against a drive.csv, or "" for the reference driver.
 
-    They are not a number if it never came forward. Raises ExperimentError.
+    They are not a number for a champion without a metre forward. Raises ExperimentError.
     """
     found = series_of(run, reference, HELD_OUT_EPISODES)
     figures = combine([part.errors() for part in found]).figures() if found else {}
-    driven, said = figures.get("metres", 0.0) / HELD_OUT_EPISODES + LEFT_OUT_M, run.figures["distance_m"]
-    if not reference and driven < ALIKE * said:
+    driven, expected = figures.get("metres", 0.0) / HELD_OUT_EPISODES + LEFT_OUT_M, run.figures["distance_m"]
+    if not reference and driven < LEAST_SHARE * expected:
         raise ExperimentError(
-            f"{run.folder}: its champion drives {driven:,.0f} m where {SUMMARY} says {said:,.0f} m: another version "
-            "of GridSim made it; make it again, or leave it out"
+            f"{run.folder}: its champion drives {driven:,.0f} m where {SUMMARY} says {expected:,.0f} m: another "
+            "version of GridSim made it; make it again, or leave it out"
         )
-    return {mine: figures.get(theirs, math.nan) for mine, theirs in ERROR_FIGURES.items()}
+    return {name: figures.get(original, math.nan) for name, original in ERROR_FIGURES.items()}

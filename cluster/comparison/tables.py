@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -30,35 +30,8 @@ RESAMPLES, CONFIDENCE = 9_999, 0.95
 _SEED = 20_190_111  # of the resamples: the same numbers always give the same interval
 
 
-class Column(NamedTuple):
-    """A column of a table: its head, the figure, the factor to its unit, decimals."""
-
-    head: str
-    figure: str
-    scale: float
-    digits: int
-
-
-DRIVING = (
-    Column("success, %", "success_rate", 100.0, 0),
-    Column("distance, m", "distance_m", 1.0, 0),
-    Column("speed, m/s", "speed_mps", 1.0, 1),
-    Column("training, s", "training_s", 1.0, 0),
-    Column("best after, s", "best_wall_s", 1.0, 0),
-    Column("million car-steps", "car_steps", 1e-6, 1),
-)
-ERRORS = (
-    Column("velocity error, m/s", "velocity_error_mps", 1.0, 2),
-    Column("% of the reference", "velocity_error_percent", 1.0, 1),
-    Column("largest, m/s", "velocity_error_max_mps", 1.0, 1),
-    Column("steering error, degrees", "steering_error_deg", 1.0, 2),
-    Column("largest, degrees", "steering_error_max_deg", 1.0, 1),
-)
-INTERVAL = "its bootstrap interval"  # of the percentage
-
-
 class Spread(NamedTuple):
-    """What is known of a figure from n seeds: their median and quartiles, not a number where there are none."""
+    """Median and quartiles of a figure over n seeds; not a number without any."""
 
     n: int
     lower: float
@@ -67,7 +40,7 @@ class Spread(NamedTuple):
 
 
 def spread(values: Iterable[float]) -> Spread:
-    """Median and quartiles (linear interpolation). What is not finite was not measured, and is left out."""
+    """Median and quartiles (linear interpolation) of the finite values: others were not measured."""
     found = [value for value in values if math.isfinite(value)]
     return Spread(len(found), *np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist())
 
@@ -88,11 +61,10 @@ class Group:
     """The runs of one learner on one road, all seeds of them.
 
     Attributes:
-        scenario, traffic, observation, learner: what they have in common.
-        road: the scenario's name, with its traffic where the comparison has it twice.
-        name: the learner's, with what it sees where the comparison has both.
-        runs: those that are finished.
-        seeds: that were asked for.
+        road: the scenario's name, with its traffic where the comparison has several.
+        name: the learner's, with its observation where the comparison has both.
+        runs: the finished ones.
+        seeds: those of the plan.
     """
 
     scenario: str
@@ -140,7 +112,7 @@ def _key(settings: RunSettings) -> tuple[str, int, str, str]:
 
 
 def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
-    """A row a run, raw; a missing one's figures are empty. Runs inside `folder` have their names there."""
+    """A row for each run, without rounding; a missing run has no figures. Paths are relative to `folder`."""
     stream = io.StringIO()
     writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
@@ -162,53 +134,71 @@ def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
 
 
 def table_md(groups: Sequence[Group], plan: Plan | None = None) -> bytes:
-    """What was asked, two tables, and notes on them."""
-    parts = [_markdown(rows) for rows in (driving(groups), errors(groups))]
-    return ("\n\n".join([introduction(plan), *parts, NOTES]) + "\n").encode()
+    """The plan, two tables, and notes on them."""
+    parts = [introduction(plan), *(_markdown(table(groups, columns)) for columns in (DRIVING, ERRORS)), NOTES]
+    return ("\n\n".join(parts) + "\n").encode()
 
 
 def introduction(plan: Plan | None) -> str:
-    """What was asked."""
+    """The plan in a line."""
     if plan is None:
         return "Finished runs."
-    views = {"rays": "31 rays", "grid": "the occupancy grid"}
+    sensors = {"rays": "31 rays", "grid": "the occupancy grid"}
     traffic = "traffic as each road has it by default" if plan.traffic == -1 else f"{plan.traffic} other cars"
-    return f"{plan.seeds} seeds, at most {plan.budget} a run, {views[plan.observation]}, {traffic}."
+    return f"{plan.seeds} seeds, at most {plan.budget} a run, {sensors[plan.observation]}, {traffic}."
 
 
-def driving(groups: Sequence[Group]) -> list[list[str]]:
-    """How far and fast champions drive on held-out roads, and what training cost."""
-    rows = [["road", "learner", "seeds", *(column.head for column in DRIVING)]]
-    for each in groups:
-        asked, there = len(each.seeds), len(each.runs)
-        count = f"{there}" if there == asked else f"{there} of {asked}" if there else "missing"
-        rows.append([each.road, each.name, count, *_cells(each, DRIVING)])
-    return rows
+def _seeds(group: Group) -> str:
+    """How many runs are finished."""
+    asked, finished = len(group.seeds), len(group.runs)
+    return f"{finished}" if finished == asked else f"{finished} of {asked}" if finished else "missing"
 
 
-def errors(groups: Sequence[Group]) -> list[list[str]]:
-    """Errors against the reference."""
-    first, percent, *others = ERRORS
-    heads = [column.head for column in others]
-    rows = [["road", "learner", first.head, percent.head, INTERVAL, *heads]]
-    for each in groups:
-        low_high = NOTHING
-        if each.spread(percent.figure).n > 1:
-            low_high = "{:.1f} to {:.1f}".format(*interval(each.values(percent.figure)))
-        rows.append([each.road, each.name, *_cells(each, (first, percent)), low_high, *_cells(each, others)])
-    return rows
+def _median(figure: str, scale: float, digits: int) -> Callable[[Group], str]:
+    """A column of medians with their quartiles."""
 
-
-def _cells(group: Group, columns: Iterable[Column]) -> Iterable[str]:
-    """Medians with their quartiles."""
-    for _, figure, scale, digits in columns:
+    def cell(group: Group) -> str:
         n, *found = group.spread(figure)
         lower, median, upper = (f"{value * scale:,.{digits}f}" for value in found)
-        yield f"{median} ({lower} to {upper})" if n > 1 else median if n else NOTHING
+        return f"{median} ({lower} to {upper})" if n > 1 else median if n else NOTHING
+
+    return cell
+
+
+def _percent_interval(group: Group) -> str:
+    values = group.values("velocity_error_percent")
+    return "{:.1f} to {:.1f}".format(*interval(values)) if spread(values).n > 1 else NOTHING
+
+
+Columns = Mapping[str, Callable[[Group], str]]
+DRIVING: Columns = {
+    "seeds": _seeds,
+    "success, %": _median("success_rate", 100.0, 0),
+    "distance, m": _median("distance_m", 1.0, 0),
+    "speed, m/s": _median("speed_mps", 1.0, 1),
+    "training, s": _median("training_s", 1.0, 0),
+    "best after, s": _median("best_wall_s", 1.0, 0),
+    "million car-steps": _median("car_steps", 1e-6, 1),
+}
+"""How far and fast champions drive on held-out roads, and what training cost."""
+ERRORS: Columns = {
+    "velocity error, m/s": _median("velocity_error_mps", 1.0, 2),
+    "% of the reference": _median("velocity_error_percent", 1.0, 1),
+    "its bootstrap interval": _percent_interval,
+    "largest, m/s": _median("velocity_error_max_mps", 1.0, 1),
+    "steering error, degrees": _median("steering_error_deg", 1.0, 2),
+    "largest, degrees": _median("steering_error_max_deg", 1.0, 1),
+}
+"""Errors against the reference."""
+
+
+def table(groups: Sequence[Group], columns: Columns) -> list[list[str]]:
+    """Head and rows of a table: road, learner and the columns."""
+    rows = [[group.road, group.name, *(cell(group) for cell in columns.values())] for group in groups]
+    return [["road", "learner", *columns], *rows]
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
     """A table: words to the left, numbers to the right; the first row is its head."""
-    words = sum(cell in ("road", "learner") for cell in rows[0])
-    rule = ["---"] * words + ["---:"] * (len(rows[0]) - words)
+    rule = ["---", "---", *["---:"] * (len(rows[0]) - 2)]
     return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in [rows[0], rule, *rows[1:]])

@@ -1,4 +1,4 @@
-"""Films: a champion's drive, kept state by state, drawn picture by picture, written as MP4 or GIF at true speed."""
+"""Films: a champion's drive, recorded state by state, drawn and written as MP4 or GIF at true speed."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Recording:
     Attributes:
         scenario: the map.
         cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.car.ego`).
-        ranges: float32 [steps + 1, rays], what its rays say, m.
+        ranges: float32 [steps + 1, rays], of its rays, m.
         boxes: float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine).
         end: how it ended; RUNNING where the recording did.
         period: s from state to state.
@@ -68,16 +68,14 @@ def record(
     """
     episode = champion.sim.episode
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
-    result, cars, worlds = trajectory(
-        PolicySpec.parse(champion.policy), champion.genome, scenario, np.asarray(start, dtype=np.float32),
-        Limits(episode.target, steps), champion.sim, world,
-    )  # fmt: skip
+    spec, limits = PolicySpec.parse(champion.policy), Limits(episode.target, steps)
+    start = np.asarray(start, dtype=np.float32)
+    result, cars, worlds = trajectory(spec, champion.genome, scenario, start, limits, champion.sim, world)
     end = End(int(result["end"]))
     if end == End.TIME and steps < round(episode.time_limit / episode.control_period):
         end = End.RUNNING
-    return Recording(
-        scenario, cars, views(scenario, cars, worlds, champion.sim), others(worlds), end, episode.control_period
-    )
+    ranges = views(scenario, cars, worlds, champion.sim)
+    return Recording(scenario, cars, ranges, others(worlds), end, episode.control_period)
 
 
 def others(worlds: np.ndarray) -> np.ndarray:
@@ -94,7 +92,7 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
     car = interpolate(drive.cars[k], drive.cars[following], part, drive.scenario)
     boxes = interpolate(drive.boxes[k], drive.boxes[following], part, drive.scenario) if drive.boxes.shape[1] else None
     ranges, then = drive.ranges[k], drive.ranges[following]
-    # A ray that leaps from one thing to another is shown on either, never between them.
+    # A ray that jumps from one object to another is shown on either, never between them.
     ranges = np.where(np.abs(then - ranges) < 3.0, ranges + part * (then - ranges), ranges if part < 0.5 else then)
     path = np.concatenate([drive.cars[: k + 1, [X, Y]], car[None, [X, Y]]])
     minutes, rest = divmod(min(seconds, drive.seconds), 60)

@@ -24,7 +24,7 @@ _PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # also served by a g
 
 
 class TrackingError(GridSimError):
-    """MLflow cannot be used as asked; its text is one line for the user."""
+    """MLflow cannot be used; the message is one line for the user."""
 
 
 def check_uri(uri: str | None = None) -> str:

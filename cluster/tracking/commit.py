@@ -19,7 +19,7 @@ def git_commit() -> str:
         return done.stdout.strip()
 
     try:
-        # Installed into a .venv inside somebody else's repository, this file is there but is not tracked.
+        # Installed into a .venv inside another repository, this file is not tracked there.
         git("ls-files", "--error-unmatch", here.name)
         return git("rev-parse", "HEAD") or "unknown"
     except (OSError, subprocess.SubprocessError):

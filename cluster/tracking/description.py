@@ -31,22 +31,16 @@ def what(settings: RunSettings) -> str:
 
 
 def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
-    """Settings that are not what they are by default, but for those that decide when a run ends."""
-    kind = type(settings)
-    alike = {
-        name: getattr(settings, name)
-        for name in ("scenario", "observation", "traffic", "recombination")
-        if hasattr(settings, name)
-    }
-    usual = to_dict(kind(**alike)) | {"traffic": kind(scenario=settings.scenario).traffic}
-    if "recombination" in usual:
-        usual["recombination"] = "all"
+    """Settings that differ from the defaults of their road, except for those that decide when a run ends."""
+    kind, given = type(settings), to_dict(settings)
+    shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
+    defaults = to_dict(kind(**shared)) | {"traffic": kind(scenario=settings.scenario).traffic, "recombination": "all"}
     left_out = {"seed", *settings.unbound, *without}
-    return {name: value for name, value in to_dict(settings).items() if name not in left_out and value != usual[name]}
+    return {name: value for name, value in given.items() if name not in left_out and value != defaults[name]}
 
 
 def title(name: str, settings: RunSettings) -> str:
-    """MLflow's name of a run: its folder's, and what that does not say and sets it apart."""
+    """MLflow's name of a run: its folder's, and what else distinguishes it."""
     words = "" if f"{name}-".startswith(f"{what(settings)}-") else f": {what(settings)}"
     more = unusual(settings)
     parts = [str(more["policy"])] if "policy" in more else []
@@ -55,7 +49,7 @@ def title(name: str, settings: RunSettings) -> str:
 
 
 def group(settings: RunSettings) -> str:
-    """What runs that differ in their seeds alone have in common, in words."""
+    """What runs have in common that differ in their seeds alone, in words."""
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [f"{settings.traffic} cars"] if settings.traffic else []
     more = unusual(settings, "traffic", "observation", "policy", "search")
@@ -78,7 +72,7 @@ def tags(settings: RunSettings) -> dict[str, str]:
 
 
 def held_out_metrics(figures: Mapping[str, float]) -> dict[str, float]:
-    """How the champion drives held-out roads, under MLflow's names."""
+    """Held-out figures under MLflow's names."""
     return {f"held_out/{name}": float(value) for name, value in figures.items() if name != "episodes"}
 
 
@@ -119,7 +113,7 @@ def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
 
 
 def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str, float]) -> Model:
-    """The champion as a torch model, and what its registered version says."""
+    """The champion as a torch model, with the description of its registered version."""
 
     def build() -> tuple[torch.nn.Module, np.ndarray]:
         from evolution.networks.export import example, to_torch

@@ -39,7 +39,7 @@ Status = Literal["FINISHED", "KILLED", "FAILED"]
 KEY_TAG = "gridsim.key"
 """The tag by which a run is found again."""
 NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
-"""MLflow's tag of the description, and ours that says which was written here; the UI lists neither."""
+"""MLflow's tag of the description, and ours with the digest of the one that was written here; the UI lists neither."""
 CHAMPION_TAG = "champion_sha256"
 """The tag of a registered version that identifies its champion."""
 RUN_ID = "{run_id}"
@@ -54,7 +54,7 @@ MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
 MAX_BATCH = 1000  # metrics that MLflow takes in one request
 
-# Only where the user has not decided otherwise. MLflow's own retries would go on for minutes; ours replace them.
+# Unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
 _ENVIRONMENT = {
     "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
     "MLFLOW_CONFIGURE_LOGGING": "false",
@@ -96,8 +96,8 @@ class Row:
 class Identity:
     """Which run is meant, and what a new one begins with.
 
-    What a resumed run says differently (a larger number of generations, another commit) is added as tag
-    `resumed/<name>`, as MLflow lets no parameter change.
+    What differs in a resumed run (more generations, another commit) is added as tag `resumed/<name>`, as MLflow lets no
+    parameter change.
 
     Attributes:
         uri: what `address.check_uri` returned.
@@ -141,10 +141,7 @@ class Model:
 
 
 class LoggedRun:
-    """A run in MLflow, opened: found by its key, or created.
-
-    Attributes: MLflow's ids of the run and of its experiment.
-    """
+    """A run in MLflow, found by its key or created; `run_id` and `experiment_id` are MLflow's."""
 
     def __init__(self, identity: Identity):
         quiet()
@@ -170,13 +167,13 @@ class LoggedRun:
         from mlflow.tracking.context.git_context import GitRunContext
         from mlflow.tracking.context.registry import resolve_tags
 
-        asked, commit = self._identity, git_commit()
-        started = int(1000.0 * (time.time() if asked.started is None else asked.started))
+        identity, commit = self._identity, git_commit()
+        started = int(1000.0 * (time.time() if identity.started is None else identity.started))
         natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]  # mlflow.user, mlflow.source.*
         if commit != "unknown":
             natural["mlflow.source.git.commit"] = commit
-        tags = {**natural, **self._tags(), **_note_tags(asked.note)}
-        return self._client.create_run(self.experiment_id, started, tags, asked.name)
+        tags = {**natural, **self._tags(), **_note_tags(identity.note)}
+        return self._client.create_run(self.experiment_id, started, tags, identity.name)
 
     def _complete(self, run: Run) -> None:
         """Add what the run lacks of parameters and tags, and ask which steps it has."""
@@ -259,8 +256,7 @@ class LoggedRun:
             client.search_model_versions(f"name = '{model.name}'"),
             key=lambda each: (float(each.tags.get("held_out/success_rate", -1.0)), -int(each.version)),
         )
-        if str(client.get_registered_model(model.name).aliases.get(BEST)) != str(best.version):
-            client.set_registered_model_alias(model.name, BEST, str(best.version))
+        client.set_registered_model_alias(model.name, BEST, str(best.version))
         return new
 
     def end(self, status: Status, wall_s: float | None = None, note: str = "") -> None:
@@ -321,7 +317,7 @@ def write_model(folder: Path, model: Model) -> None:
 
 
 def _create_database(path: Path) -> None:
-    """Make a new MLflow database appear at `path` whole, if nobody else is first.
+    """Make a new MLflow database appear at `path` whole, unless another process is first.
 
     MLflow builds it by 60 migrations in a second. Killed in the middle of them it leaves a database that it can never
     open again, and two runs that start together do the same to each other. So it is built elsewhere.
@@ -336,10 +332,8 @@ def _create_database(path: Path) -> None:
             shutil.copyfile(built, whole)
         try:
             os.link(whole, path)
-        except FileExistsError:
-            pass
-        except OSError:  # a file system without hard links
-            if not path.exists():
+        except OSError:
+            if not path.exists():  # on a file system without hard links
                 os.rename(whole, path)
     finally:
         whole.unlink(missing_ok=True)
