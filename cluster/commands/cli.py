@@ -160,7 +160,14 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         check_unchanged(flags, base, free, kind.unbound, "run")
     settings = select(EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings, flags)
     settings.check()
-    _check_device(flags)
+    if isinstance(flags, DqnFlags) and flags.device == "cuda":
+        from evolution.dqn.learner import device_of  # and PyTorch
+
+        try:
+            device_of(flags.device)
+        except ValueError as error:
+            there = f"{resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
+            raise UsageError(there if resume else f"--device cuda: {error}") from error
     if resume:
         run.settings = settings
         return flags, run
@@ -173,18 +180,6 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
             raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
         digest = champion.sha256
     return flags, new_run(Path(flags.output), flags.name, settings, flags.init, digest)
-
-
-def _check_device(flags: Flags) -> None:
-    """Raises UsageError for a device that is not there."""
-    if isinstance(flags, DqnFlags) and flags.device == "cuda":
-        from evolution.dqn.learner import device_of  # and PyTorch
-
-        try:
-            device_of(flags.device)
-        except ValueError as error:
-            there = f"{flags.resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
-            raise UsageError(there if flags.resume else f"--device {flags.device}: {error}") from error
 
 
 def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
@@ -233,7 +228,10 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
         return code
     resumable = (run.path / CHECKPOINT).is_file()
     if not resumable:
-        _remove_folders(new_folders)
+        with contextlib.suppress(OSError):
+            (run.path / CONFIG).unlink(missing_ok=True)
+            for path in new_folders:
+                path.rmdir()
     if code == FAILED:
         fail(prog, message, hint if resumable else "", FAILED)
     print(f"{prog}: stopped; {hint if resumable else f'no {step} was done yet'}", file=sys.stderr)
@@ -253,14 +251,6 @@ def _print_end(console: Console, session: Session) -> None:
         f"compare: {session.tracker.where()}",
         soft_wrap=True,
     )
-
-
-def _remove_folders(new_folders: Sequence[Path]) -> None:
-    """Remove the folders that were made for a run without a first step, the innermost first."""
-    with contextlib.suppress(OSError):
-        for path in new_folders:
-            (path / CONFIG).unlink(missing_ok=True)
-            path.rmdir()
 
 
 def evaluate_main() -> None:

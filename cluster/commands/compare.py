@@ -38,6 +38,7 @@ from cluster.commands.progress import Line, clock, way
 from cluster.comparison import tables
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run, series_of
+from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
 from cluster.runs.settings import check_workers
@@ -224,15 +225,12 @@ class Results:
         return tables.group(self.runs, self.plan)
 
     def write_tables(self) -> None:
-        """Write table.md and table.csv."""
         groups = self.groups
         checkpoint.write_atomic(self.path / TABLE, tables.table_md(groups, self.plan), durable=False)
         checkpoint.write_atomic(self.path / ROWS, tables.table_csv(groups, self.path), durable=False)
 
     def write(self) -> None:
         """Write tables and pictures."""
-        from cluster.report import pictures
-
         self.write_tables()
         groups = self.groups
         pictures.comparison(groups, self.path / PICTURE)
@@ -323,7 +321,6 @@ class Progress(Reporter, Line):
         console.print(f"comparing {total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
     def begin(self, cell: Cell) -> None:
-        """A run begins, or goes on."""
         self._cell = cell
         self.note("starting")
 
@@ -354,7 +351,6 @@ class Progress(Reporter, Line):
         self.warn(f"{text}; send it later with: {again}" if finished else text)
 
     def done(self, run: Run) -> None:
-        """The run is trained and measured."""
         error = run.figures["velocity_error_percent"]
         self._next()
         self.line(
@@ -366,13 +362,11 @@ class Progress(Reporter, Line):
         )
 
     def failed(self, reason: str) -> None:
-        """The run could not be trained."""
         assert self._cell
         self._next()
         print(f"{PROG}: {self._cell.name} failed: {reason}", file=sys.stderr, flush=True)
 
     def line(self, text: str) -> None:
-        """A line that stays."""
         self.console.print(text, soft_wrap=True, highlight=False)
 
     def _counter(self) -> str:

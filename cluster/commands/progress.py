@@ -18,16 +18,13 @@ if TYPE_CHECKING:
     from cluster.runs.train import Session
     from cluster.training.trainer import Learning
 
-LINE_S = 5.0  # between lines where there is no terminal
-WINDOW_S = 10.0  # that the ETA is taken from, at least
+LINE_S = 5.0  # between lines without a terminal
+WINDOW_S = 10.0  # of steps from which the ETA follows, at least
 BAR = 10  # characters
 
 
 class Line:
-    """A line on a terminal: `head`, `facts`, a bar and the time if there is a share done, and `rest`.
-
-    A terminal that is too narrow cuts off the rest first.
-    """
+    """A line on a terminal: `head`, `facts`, a bar and the time if `share` is known, and `rest`, cut off first."""
 
     def __init__(self, console: Console):
         self.console = console
@@ -95,7 +92,6 @@ class Progress(Reporter, Line):
         self.share = int(done) / total if total else None
 
     def row(self, step: int, row: dict[str, float]) -> None:
-        """So many steps are done."""
         self._advance()
         self.facts = f"success {row['validation/success_rate']:.0%}  ETA {self._eta(row['car_steps'])}"
         self.rest = self._text = f"{self._learning.describe(row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
@@ -105,24 +101,22 @@ class Progress(Reporter, Line):
             self.console.print(f"{self.head}  {self.facts}  {self._text}", soft_wrap=True)
 
     def _eta(self, car_steps: float) -> str:
-        """When the first of the run's bounds is reached, as the latest steps went. It may be solved before."""
+        """When the run reaches the first of its bounds at the pace of the latest steps. It may be solved before."""
         now, (done, total, _) = time.perf_counter(), self._learning.way()
         self._steps.append((now, done, car_steps))
         while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:
             self._steps.popleft()
         begun, *before = self._steps[0]
         bounds = zip((total, self._learning.settings.car_steps), (done, car_steps), before, strict=True)
-        ends = [(bound - here) / (here - there) for bound, here, there in bounds if bound and here > there]
+        ends = [(bound - new) / (new - old) for bound, new, old in bounds if bound and new > old]
         if not ends or now - begun < WINDOW_S:
             return "-:--"
         return f"{clock(max(min(ends), 0.0) * (now - begun))} at most"
 
     def members(self, stage: str, done: int, total: int) -> None:
-        """Part of a step is done."""
         self.rest = f"{stage} {done:{len(str(total))}}/{total}  {self._text}"
 
     def note(self, text: str) -> None:
-        """What happens after the last step."""
         self.rest = text
         if not self.console.is_terminal:
             self.console.print(text)

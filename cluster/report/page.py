@@ -94,6 +94,7 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
 def write_page(path: str | os.PathLike[str], title: str, shown: Sequence[Shown], config: SimConfig) -> None:
     """Write a page of drives on one map, at first with the last of them. Raises: CheckpointError with one line."""
     road_map, constant = shown[-1].drive.scenario, constants(config)
+    x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
     data = {
         "title": title,
         "width": float(road_map.road.width),
@@ -105,7 +106,8 @@ def write_page(path: str | os.PathLike[str], title: str, shown: Sequence[Shown],
         "sensor": float(constant.front_axle),
         "fan": [float(constant.ray_first), float(constant.ray_step)],
         "actions": [action.name.lower().replace("_", " ") for action in Action],
-        "marks": _marks(road_map),
+        # Centre x, y (m) and half of the dash dx, dy (m).
+        "marks": np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist(),
         "picture": base64.b64encode(_picture(road_map)).decode(),
         "first": len(shown) - 1,
         "drives": [each.packed() for each in shown],
@@ -113,12 +115,6 @@ def write_page(path: str | os.PathLike[str], title: str, shown: Sequence[Shown],
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
     page = files("cluster.report").joinpath("drive.html").read_text(encoding="utf-8")
     write_atomic(path, page.replace('type="application/json">{}<', f'type="application/json">{text}<').encode())
-
-
-def _marks(road_map: Map) -> list[list[float]]:
-    """Lane marks as centre x, y (m) and half of the dash dx, dy (m)."""
-    x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
-    return np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist()
 
 
 def _picture(road_map: Map) -> bytes:

@@ -70,8 +70,11 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
     figure.savefig(Path(path), dpi=100)
 
 
-def draw_map(axis: Any, scenario: Map) -> None:
-    """Draw a scenario's drivable area and lane marks."""
+def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
+    """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
+    from matplotlib.collections import LineCollection
+
+    figure, (axis,) = _figure(8.6, 7.6)
     road = scenario.road
     nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
     width, height = float(road.width), float(road.height)
@@ -84,20 +87,12 @@ def draw_map(axis: Any, scenario: Map) -> None:
         y, x = np.nonzero(nodes > 0.0)
         left, right, low, high = (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width).tolist()
         axis.set(xlim=(left - 5.0, right + 5.0), ylim=(low - 5.0, high + 5.0))
-
-
-def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
-    """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
-    from matplotlib.collections import LineCollection
-
-    figure, (axis,) = _figure(8.6, 7.6)
-    draw_map(axis, scenario)
     points = states[:, [X, Y]].astype(np.float64)
     steps = np.stack([points[:-1], points[1:]], axis=1)
-    near = np.abs(points[1:] - points[:-1]).max(axis=1) < min(scenario.road.width, scenario.road.height) / 2
+    near = np.abs(points[1:] - points[:-1]).max(axis=1) < min(width, height) / 2
     lines = LineCollection(list(steps[near]), cmap="plasma", linewidths=2.0)
     lines.set_array(states[:-1, SPEED][near])
-    lines.set_clim(0.0, float(scenario.road.speed_high))
+    lines.set_clim(0.0, float(road.speed_high))
     axis.add_collection(lines)
     axis.plot(*points[0], marker="o", color="#2f9e44", markersize=9, markeredgecolor="white", label="start")
     axis.plot(*points[-1], marker="X", color="#e03131", markersize=10, markeredgecolor="white", label="end")

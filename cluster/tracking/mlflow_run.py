@@ -226,18 +226,14 @@ class LoggedRun:
         return True
 
     def log_model(self, folder: Path, model: Model) -> bool:
-        """Write a torch model into a run's folder, store its files and register it; returns what `register` does."""
+        """Write a model into a run's folder, store it, and make it the newest version of its name.
+
+        The best of all versions gets the alias. Returns: whether there is a new version; a champion has one.
+        """
         write_model(folder / MODEL, model)
         for path in sorted((folder / MODEL).rglob("*")):
             if path.is_file():
                 self.upload(path, path.parent.relative_to(folder).as_posix())
-        return self.register(model)
-
-    def register(self, model: Model) -> bool:
-        """Make the uploaded model the newest version of its name, and give the best of all versions its alias.
-
-        Returns: whether it was made; False where this run's champion is one already.
-        """
         client = self._client
         found = client.search_model_versions(f"name = '{model.name}' and run_id = '{self.run_id}'")
         new = all(each.tags.get(CHAMPION_TAG) != model.champion_sha256 for each in found)
@@ -265,23 +261,21 @@ class LoggedRun:
         MLflow's UI shows the time from start to end as the run's duration, and lets no start change: the pauses of a
         run that was stopped and resumed are left out by an earlier end. A run that has ended keeps its end.
         """
+        from mlflow.entities import RunTag
+
         if note:
-            self._describe(note.replace(RUN_ID, self.run_id))
+            text = note.replace(RUN_ID, self.run_id)
+            tags = self._client.get_run(self.run_id).data.tags
+            old = tags.get(NOTE_TAG, "")
+            if old != text and (not old or _note_tags(old)[OWN_NOTE_TAG] == tags.get(OWN_NOTE_TAG)):
+                self._client.log_batch(self.run_id, tags=[RunTag(*tag) for tag in _note_tags(text).items()])
         if not (self._has_ended and status == "FINISHED"):
             ended = None if wall_s is None else self._started + round(1000.0 * wall_s)
             self._client.set_terminated(self.run_id, status, ended)
 
-    def _describe(self, text: str) -> None:
-        from mlflow.entities import RunTag
-
-        tags = self._client.get_run(self.run_id).data.tags
-        old = tags.get(NOTE_TAG, "")
-        if old != text and (not old or _note_tags(old)[OWN_NOTE_TAG] == tags.get(OWN_NOTE_TAG)):
-            self._client.log_batch(self.run_id, tags=[RunTag(*tag) for tag in _note_tags(text).items()])
-
 
 def _note_tags(text: str) -> dict[str, str]:
-    """A description, and the mark that it is ours."""
+    """A description, and the digest by which a user's own one is recognised."""
     return {NOTE_TAG: text, OWN_NOTE_TAG: hashlib.sha256(text.encode()).hexdigest()} if text else {}
 
 
