@@ -42,7 +42,7 @@ from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
 from cluster.runs.settings import check_workers
-from cluster.runs.train import Reporter, Session, Workers, train
+from cluster.runs.train import Session, Workers, train
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
@@ -308,7 +308,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     return 0
 
 
-class Progress(Reporter, Line):
+class Progress(Line):
     """Shows which run is trained, how far it is, and ETA: a line on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console, folder: ComparisonFolder, total: int, left: int):
@@ -316,18 +316,16 @@ class Progress(Reporter, Line):
         self._total, self._left, self._done = total, left, 0
         self._wall_s = limits(folder.plan.budget)[1]
         self._begun = self._last = time.perf_counter()  # start of the first run, end of the last one
-        self._cell: Cell | None = None
         there = f", {total - left} of them finished" if left < total else ""
         console.print(f"comparing {total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
     def begin(self, cell: Cell) -> None:
-        self._cell = cell
+        self.name, self.resume = cell.name, f"{cell.settings.command} --resume {cell.folder}"
         self.note("starting")
 
     def note(self, text: str, more: str = "") -> None:
         """How far it is, and more where there is room."""
-        name = self._cell.name if self._cell else ""
-        self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}  {text}", f"{name}  {more}"
+        self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}  {text}", f"{self.name}  {more}"
 
     def compiling(self) -> AbstractContextManager[object]:
         self.note("compiling the simulator for this machine, once")
@@ -341,15 +339,6 @@ class Progress(Reporter, Line):
         success = f"success {row['validation/success_rate']:.0%}"
         self.note(f"{way(self._learning, bound=False)}  {success}", self._learning.describe(row))
 
-    def warn(self, text: str) -> None:
-        assert self._cell
-        print(f"{self._cell.name}: warning: {text}", file=sys.stderr, flush=True)
-
-    def unsent(self, text: str, finished: bool) -> None:
-        assert self._cell
-        again = f"{self._cell.settings.command} --resume {self._cell.folder}"
-        self.warn(f"{text}; send it later with: {again}" if finished else text)
-
     def done(self, run: Run) -> None:
         error = run.figures["velocity_error_percent"]
         self._next()
@@ -362,9 +351,8 @@ class Progress(Reporter, Line):
         )
 
     def failed(self, reason: str) -> None:
-        assert self._cell
         self._next()
-        print(f"{PROG}: {self._cell.name} failed: {reason}", file=sys.stderr, flush=True)
+        print(f"{PROG}: {self.name} failed: {reason}", file=sys.stderr, flush=True)
 
     def line(self, text: str) -> None:
         self.console.print(text, soft_wrap=True, highlight=False)

@@ -23,11 +23,14 @@ WINDOW_S = 10.0  # of steps from which the ETA follows, at least
 BAR = 10  # characters
 
 
-class Line:
-    """A line on a terminal: `head`, `facts`, a bar and the time if `share` is known, and `rest`, cut off first."""
+class Line(Reporter):
+    """A line on a terminal: `head`, `facts`, a bar and the time if `share` is known, and `rest`, cut off first.
 
-    def __init__(self, console: Console):
-        self.console = console
+    Warnings begin with `name`; `resume` is the command that sends later what MLflow lacks.
+    """
+
+    def __init__(self, console: Console, name: str = "", resume: str = ""):
+        self.console, self.name, self.resume = console, name, resume
         self.head = self.facts = self.rest = ""
         self.share: float | None = None
         self._started = time.perf_counter()
@@ -50,26 +53,26 @@ class Line:
             line.append(f"  {clock(time.perf_counter() - self._started)}  ", "progress.elapsed")
         return line.append(self.rest)
 
+    def warn(self, text: str) -> None:
+        print(f"{self.name}: warning: {text}", file=sys.stderr, flush=True)
 
-class Progress(Reporter, Line):
+    def unsent(self, text: str, finished: bool) -> None:
+        self.warn(f"{text}; send it later with: {self.resume}" if finished else text)
+
+
+class Progress(Line):
     """Shows how far a run is, its success and ETA, then distance, speed and car-steps per second.
 
     Args: the console; the command's name; the run's folder and how to resume it, as the user would type these.
     """
 
     def __init__(self, console: Console, prog: str, folder: str, resume: str):
-        super().__init__(console)
-        self._prog, self._folder, self._resume = prog, folder, resume
+        super().__init__(console, prog, resume)
+        self._folder = folder
         self._steps: deque[tuple[float, float, float]] = deque()  # when each ended, how far the run was, car-steps
         self._printed = 0.0
         self._text = ""
         self.facts, self.rest = "success 0%  ETA -:--", "starting the workers"
-
-    def warn(self, text: str) -> None:
-        print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
-
-    def unsent(self, text: str, finished: bool) -> None:
-        self.warn(f"{text}; send it later with: {self._resume}" if finished else text)
 
     def compiling(self) -> AbstractContextManager[object]:
         return self.console.status("compiling the simulator for this machine, once (some 10 s)")

@@ -19,7 +19,7 @@ import tyro
 from rich.console import Console
 
 from cluster.commands.common import Failed, RoadFlags, UsageError, command_path, main, parse, wrong_use
-from cluster.report.film import CODING, Recording, VideoError, frames, others, picture, record, write_video
+from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
@@ -89,7 +89,7 @@ class DriveFlags:
     """Width x height of the window, in pixels."""
 
 
-def _look(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
+def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
     """Width and height in pixels, and seconds, infinite for 0. Raises UsageError for these or --traffic."""
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
@@ -123,7 +123,9 @@ def _watch() -> int:
     flags = parse(WatchFlags, WATCH, sys.argv[1:])
     if not 0 <= flags.fps <= 120:
         raise UsageError(f"--fps must be 1 to 120, not {flags.fps}")
-    size, seconds = _look(flags.size or ("640x360" if flags.output else "960x640"), flags.seconds, flags.traffic)
+    size, seconds = _size_and_seconds(
+        flags.size or ("640x360" if flags.output else "960x640"), flags.seconds, flags.traffic
+    )
     if flags.scenario:
         with wrong_use():
             check_name(flags.scenario)
@@ -138,8 +140,8 @@ def _watch() -> int:
     return 0
 
 
-def changed(run: Path) -> int:
-    """A number that changes with a run's checkpoint; 0 before there is one."""
+def checkpoint_time(run: Path) -> int:
+    """When a run's checkpoint was written, ns; 0 before there is one."""
     try:
         return (run / CHECKPOINT).stat().st_mtime_ns
     except OSError:
@@ -152,7 +154,7 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     Raises: RunError, CheckpointError, UsageError.
     """
     settings, _ = read_config(run / CONFIG)
-    path, name = (run / CHECKPOINT, "elites") if changed(run) else (run / ELITES, "genomes")
+    path, name = (run / CHECKPOINT, "elites") if checkpoint_time(run) else (run / ELITES, "genomes")
     genomes = checkpoint.load(path)[0].get(name)
     genes = PolicySpec.parse(settings.policy).size
     if genomes is None or genomes.dtype != np.float32 or genomes.shape[1:] != (genes,) or not len(genomes):
@@ -181,9 +183,9 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     if not flags.follow:
         found = elite(source, flags.generation) if of_run else (load_champion(source), "champion")
         return lambda: found
-    if not changed(source):
+    if not checkpoint_time(source):
         print(f"waiting for the first {read_config(source / CONFIG)[0].counts[0]} ...", flush=True)
-        while not changed(source):
+        while not checkpoint_time(source):
             time.sleep(0.1)
     return partial(elite, source, None)
 
@@ -225,7 +227,7 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     episodes = int(recorded.episodes[-1]) + 1
     for episode in range(episodes):
         own, period = recorded.episodes == episode, config.episode.control_period
-        drive = Recording(scenario, cars[own], ranges[own], others(worlds[own]), End.RUNNING, period)
+        drive = Recording(scenario, cars[own], ranges[own], other_cars(worlds[own]), End.RUNNING, period)
         yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
 
 
@@ -299,7 +301,7 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     shown = 0.0
     with Window(size, f"GridSim: {flags.source}") as window:
         for drive, title in itertools.chain([first], drives):
-            before = changed(run)
+            before = checkpoint_time(run)
             renderer = Renderer(drive.scenario, size)
             for k in range(round((drive.seconds + LINGER_S) * fps) + 1):
                 window.show(picture(renderer, drive, k / fps, title), fps)
@@ -307,7 +309,7 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
                 pressed, _ = window.keys()
                 if window.closed or pressed & {"escape", "q"} or shown >= limit:
                     return
-                newer = flags.follow and k / fps >= FOLLOW_S and changed(run) != before
+                newer = flags.follow and k / fps >= FOLLOW_S and checkpoint_time(run) != before
                 if "n" in pressed or newer:
                     break
 
@@ -319,7 +321,7 @@ def drive_main() -> None:
 
 def _drive() -> int:
     flags = parse(DriveFlags, DRIVE, sys.argv[1:])
-    size, seconds = _look(flags.size, flags.seconds, flags.traffic)
+    size, seconds = _size_and_seconds(flags.size, flags.seconds, flags.traffic)
     config = SimConfig()
     scenario, start = _map(flags.scenario, flags.seed, config)
     traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic

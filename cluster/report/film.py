@@ -75,10 +75,10 @@ def record(
     if end == End.TIME and steps < round(episode.time_limit / episode.control_period):
         end = End.RUNNING
     ranges = views(scenario, cars, worlds, champion.sim)
-    return Recording(scenario, cars, ranges, others(worlds), end, episode.control_period)
+    return Recording(scenario, cars, ranges, other_cars(worlds), end, episode.control_period)
 
 
-def others(worlds: np.ndarray) -> np.ndarray:
+def other_cars(worlds: np.ndarray) -> np.ndarray:
     """The other cars' x, y (m) and heading (cosine, sine) [steps, others, 4] of traffic [steps, others, FIELDS]."""
     return worlds[:, (worlds[:, :, LANE] >= 0.0).all(axis=0), :4]
 

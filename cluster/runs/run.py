@@ -163,7 +163,7 @@ def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init
     """A new run's folder, checked but not yet made. Raises RunError."""
     if not name:
         stamp = time.strftime("%Y%m%d-%H%M%S")
-        name = f"{description.what(settings)}-{stamp}"
+        name = f"{description.default_name(settings)}-{stamp}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
     return RunFolder(new_folder(output, name), settings, init, init_sha256, _map_sha256(settings))

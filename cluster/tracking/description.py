@@ -25,12 +25,12 @@ def file_name(scenario: str) -> str:
     return re.sub(r"[^\w.+=@-]", "_", label(scenario))
 
 
-def what(settings: RunSettings) -> str:
+def default_name(settings: RunSettings) -> str:
     """Scenario, algorithm and seed in one word, with which the name of a run begins unless another is given."""
     return f"{file_name(settings.scenario)}-{settings.algorithm}-s{settings.seed}"
 
 
-def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
+def non_defaults(settings: RunSettings, *without: str) -> dict[str, Any]:
     """Settings that differ from the defaults of their road, except for those that decide when a run ends."""
     kind, given = type(settings), to_dict(settings)
     shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
@@ -41,8 +41,8 @@ def unusual(settings: RunSettings, *without: str) -> dict[str, Any]:
 
 def title(name: str, settings: RunSettings) -> str:
     """MLflow's name of a run: its folder's, and what else distinguishes it."""
-    words = "" if f"{name}-".startswith(f"{what(settings)}-") else f": {what(settings)}"
-    more = unusual(settings)
+    words = "" if f"{name}-".startswith(f"{default_name(settings)}-") else f": {default_name(settings)}"
+    more = non_defaults(settings)
     parts = [str(more["policy"])] if "policy" in more else []
     parts += [f"{settings.traffic} cars"] if "traffic" in more else []
     return " ".join([name + words, *parts])
@@ -52,7 +52,7 @@ def group(settings: RunSettings) -> str:
     """What runs have in common that differ in their seeds alone, in words."""
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [f"{settings.traffic} cars"] if settings.traffic else []
-    more = unusual(settings, "traffic", "observation", "policy", "search")
+    more = non_defaults(settings, "traffic", "observation", "policy", "search")
     return ", ".join([" ".join(words), *(f"{name} {value}" for name, value in more.items())])
 
 

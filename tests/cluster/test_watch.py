@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cluster.commands import watch
-from cluster.commands.watch import changed, elite, watch_main
+from cluster.commands.watch import checkpoint_time, elite, watch_main
 from cluster.report.film import Recording, VideoError, frames, picture, record, write_video
 from cluster.runs import checkpoint
 from cluster.runs.champion import load_champion
@@ -204,9 +204,9 @@ def test_newest_elite_is_read_anew(going):
     assert name == "elite of generation 3"
     assert (first.genome == elites[3]).all()
     assert first.sim == SimConfig()
-    before = changed(going)
+    before = checkpoint_time(going)
     checkpoint.save(going / "checkpoint.npz", {"elites": np.concatenate([elites, elites[:1]])}, meta)
-    assert changed(going) != before
+    assert checkpoint_time(going) != before
     assert (elite(going, None)[0].genome == elites[0]).all()
     (going / "checkpoint.npz").unlink()
     checkpoint.save(going / "elites.npz", {"genomes": elites}, {})  # which a run leaves at its end
