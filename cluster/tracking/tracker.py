@@ -51,7 +51,6 @@ class Tracker:
         self._wall_s: float | None = None
         self._status: Status | None = None  # set by close()
         self._ended = False
-        self._report: str | None = None
 
         self._tried, self._news, self._closed = (threading.Event() for _ in range(3))
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
@@ -100,26 +99,25 @@ class Tracker:
 
         Raises nothing and returns within `timeout_s`, whatever MLflow does; an unreachable server is tried once more.
         """
-        if self._status is None and self._thread.ident is not None:
-            self._status = status
-            if status != "FINISHED":
-                self._model = None  # a resumed run finds a better one
-            self._closed.set()
-            self._news.set()
-            timeout_s = timeout_s or (CLOSE_S if status == "FINISHED" else STOP_S)
-            self._thread.join(timeout_s)
-            self._report = self._missing(f"no answer within {timeout_s:g} s")
-        return self._report
-
-    def _missing(self, reason: str) -> str | None:
-        """What a closed tracker has not sent, and why."""
+        if self._thread.ident is None:
+            return None
+        self._status = status
+        if status != "FINISHED":
+            self._model = None  # a resumed run finds a better one
+        self._closed.set()
+        self._news.set()
+        timeout_s = timeout_s or (CLOSE_S if status == "FINISHED" else STOP_S)
+        self._thread.join(timeout_s)
         steps = sorted({row.step for row in self._rows})
         span = f"{steps[0]} to {steps[-1]}" if len(steps) > 1 else f"{steps[0]}" if steps else ""
         lost = [f"{count(len(steps), 'row')} (step {span})"] if steps else []
         lost += [count(len(self._files), "file")] if self._files else []
         lost += ["the model"] if self._model else []
         lost += [] if self._ended else [f"the status {self._status}"]
-        return f"not logged to MLflow at {shown(self.uri)}: {', '.join(lost)}: {self.error or reason}" if lost else None
+        if not lost:
+            return None
+        reason = self.error or f"no answer within {timeout_s:g} s"
+        return f"not logged to MLflow at {shown(self.uri)}: {', '.join(lost)}: {reason}"
 
     def _notify(self) -> None:
         if self._thread.ident is None:
