@@ -14,7 +14,6 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 #: A script and how it is run here; what `--json` must print.
 RUNS = {
     "peers.py": ([], None),
-    "reference.py": (["curved", "--episodes", "2"], None),
     "scaling.py": (
         ["--quick", "--json"],
         {

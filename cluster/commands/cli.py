@@ -48,7 +48,7 @@ from cluster.tracking.tracker import count
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import default_traffic, is_map_file, label
-from gridsim.reference.errors import combine
+from gridsim.reference.errors import errors
 
 
 @dataclass(frozen=True)
@@ -263,14 +263,14 @@ def _evaluate() -> int:
     champion = load_champion(flags.champion)
     traffic = None if flags.traffic == -1 else flags.traffic
     chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
-    errors = None
+    missed = None
     with wrong_use():
         if flags.errors or flags.reference:  # first, as a wrong --reference is found at once
             parts = series(champion, *chosen, flags.reference or None)
-            errors = combine([part.errors(champion.sim.vehicle) for part in parts]).figures()
+            missed = errors(parts, champion.sim.vehicle)
         figures = evaluate(champion, *chosen)
     if flags.json:
-        print(json.dumps(figures if errors is None else {**figures, "errors": errors}))
+        print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         return 0
     road = flags.scenario or champion.scenario
     if traffic is None:
@@ -278,6 +278,6 @@ def _evaluate() -> int:
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     Console().print(held_out_table(title, figures))
-    if errors is not None:
-        Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", errors))
+    if missed is not None:
+        Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
     return 0

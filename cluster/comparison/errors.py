@@ -28,8 +28,7 @@ def series(
     traffic: int | None = None,
     reference: str | os.PathLike[str] | None = None,
 ) -> list[Series]:
-    """A champion and its reference along each route, in the order of the episodes; `gridsim.reference.errors.combine`
-    makes one of their errors.
+    """A champion and its reference along each route, in the order of the episodes (`gridsim.reference.errors.errors`).
 
     An episode without a metre forward has none. Beside a recorded drive there is one for each stretch of it that the
     champion followed.
@@ -48,7 +47,7 @@ def series(
         for row, world in zip(chosen.rows, chosen.worlds, strict=True):
             road = maps.get(chosen.maps[row["map"]])
             path = _drive(champion, road, row["start"], world, champion.sim.episode.target)
-            found += [error_series(path, road, sim=champion.sim)] if path else []
+            found += [error_series(path, road, champion.sim.vehicle)] if path else []
         return [part for part in found if len(part.arc) > 1]
     finally:
         maps.close()

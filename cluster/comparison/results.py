@@ -15,8 +15,9 @@ from cluster.runs.checkpoint import CHAMPION
 from cluster.runs.run import CONFIG, SUMMARY, read_config
 from cluster.runs.settings import RunSettings
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
+from gridsim.config import VehicleConfig
 from gridsim.errors import GridSimError
-from gridsim.reference.errors import Series, combine
+from gridsim.reference.errors import Series, errors
 
 Learner = Literal["evolution", "two-parents", "dqn", "random"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
@@ -32,7 +33,7 @@ ERROR_FIGURES = {
     "compared_m": "metres",
 }
 """A champion's errors against the reference, mean and largest, and over how many metres; by their names in
-`gridsim.reference.errors.Errors`."""
+`gridsim.reference.errors.errors`."""
 RUN_FIGURES = (
     "success_rate", "distance_m", "speed_mps", "collision_rate", "car_steps", "wall_s", "training_s", "best_car_steps",
     "best_wall_s",
@@ -103,7 +104,7 @@ def errors_of(run: Run, reference: str) -> dict[str, float]:
     They are not a number for a champion without a metre forward. Raises ExperimentError.
     """
     found = series_of(run, reference, HELD_OUT_EPISODES)
-    figures = combine([part.errors() for part in found]).figures() if found else {}
+    figures = errors(found, VehicleConfig()) if found else {}
     driven, expected = figures.get("metres", 0.0) / HELD_OUT_EPISODES + LEFT_OUT_M, run.figures["distance_m"]
     if not reference and driven < LEAST_SHARE * expected:
         raise ExperimentError(

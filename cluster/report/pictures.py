@@ -203,7 +203,7 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
 
 
 def errors_table(title: str, figures: Mapping[str, float]) -> Table:
-    """Velocity and steering errors, `gridsim.reference.errors.Errors.figures`."""
+    """Velocity and steering errors, `gridsim.reference.errors.errors`."""
     table = Table("", "mean", "max", title=title, title_justify="left")
     for column in table.columns[1:]:
         column.justify = "right"

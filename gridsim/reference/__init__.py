@@ -1,1 +1,1 @@
-"""The reference driver, and the errors of other drives relative to it."""
+"""The reference driver's speed and steering, and the errors of drives relative to it."""

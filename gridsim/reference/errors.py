@@ -2,7 +2,7 @@
 
 e_v = v - v_ref in m/s and e_delta = delta - delta_ref in degrees (Trasnea et al. 2019), compared at the same place of
 the route, not at the same time: a delay of a second is not an error for the rest of the drive. Means are over metres,
-so that time at standstill has no weight. The reference is `routes.profile` along the driven path, or a recorded drive.
+so that time at standstill has no weight. The reference is `profile.profile` along the driven path, or a recorded drive.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
-from gridsim.config import SimConfig, VehicleConfig
+from gridsim.config import VehicleConfig
 from gridsim.maps.map import Map
-from gridsim.reference.routes import BRAKING, DRIVEN_WINDOW, profile, unwrapped
+from gridsim.reference.profile import BRAKING, WINDOW, arc_length, profile
 
 APART = 3.5  # m beside the recorded path, a lane's width, beyond which a drive has left it
 TURNED = math.radians(45.0)  # difference of headings beyond which it has
@@ -54,76 +54,40 @@ class Series(NamedTuple):
         """float64 [n], degrees, positive where the agent steers further to the left."""
         return np.degrees(self.steering - self.reference_steering)
 
-    def errors(self, vehicle: VehicleConfig | None = None) -> Errors:
-        """Means over the metres (trapezoidal rule) and maxima.
 
-        Raises: ValueError if nothing was driven.
-        """
-        metres = float(self.arc[-1] - self.arc[0]) if len(self.arc) > 1 else 0.0
-        if not metres > 0.0:
-            raise ValueError("nothing was driven that could be compared with a reference")
+def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
+    """The errors of several drives together, by name: means over the metres (trapezoidal rule) and maxima of |e|.
 
-        def mean(values: np.ndarray) -> float:
-            return float(np.trapezoid(values, self.arc)) / metres
+    Velocity in percent is relative to the reference's mean speed, since its speed at a place may be 0; steering to the
+    steering limit to one side, since the reference's angle is 0 on a straight.
 
-        velocity, steering = np.abs(self.velocity_error), np.abs(self.steering_error)
-        return Errors(
-            mean(velocity),
-            float(velocity.max()),
-            mean(self.reference_speed),
-            mean(steering),
-            float(steering.max()),
-            (vehicle or VehicleConfig()).steering_limit,
-            metres,
-        )
-
-
-class Errors(NamedTuple):
-    """Velocity and steering errors of one or several drives: of |e_v| and |e_delta|."""
-
-    velocity_mean_mps: float  # over the metres
-    velocity_max_mps: float
-    reference_mps: float  # mean speed of the reference over the same metres
-    steering_mean_deg: float  # over the metres
-    steering_max_deg: float
-    steering_limit_deg: float
-    metres: float  # m compared
-
-    def figures(self) -> dict[str, float]:
-        """The figures by name, for tables and JSON.
-
-        Velocity in percent is relative to the reference's mean speed, since its speed at a place may be 0; steering to
-        the steering limit to one side, since the reference's angle is 0 on a straight.
-        """
-        return {
-            "velocity_mean_mps": self.velocity_mean_mps,
-            "velocity_max_mps": self.velocity_max_mps,
-            "velocity_mean_percent": 100.0 * self.velocity_mean_mps / self.reference_mps,
-            "velocity_max_percent": 100.0 * self.velocity_max_mps / self.reference_mps,
-            "reference_mps": self.reference_mps,
-            "steering_mean_deg": self.steering_mean_deg,
-            "steering_max_deg": self.steering_max_deg,
-            "steering_mean_percent": 100.0 * self.steering_mean_deg / self.steering_limit_deg,
-            "steering_max_percent": 100.0 * self.steering_max_deg / self.steering_limit_deg,
-            "metres": self.metres,
-        }
-
-
-def combine(parts: Sequence[Errors]) -> Errors:
-    """The errors of several drives of one kind of car together: means weighted by metres, largest maxima.
-
-    Raises: ValueError if there are none.
+    Raises: ValueError if nothing was driven.
     """
-    if not parts:
+    parts = [part for part in parts if len(part.arc) > 1]
+    metres = sum(float(part.arc[-1] - part.arc[0]) for part in parts)
+    if not metres > 0.0:
         raise ValueError("nothing was driven that could be compared with a reference")
-    table = Errors(*np.array(parts).T)
-    mean = Errors(*np.average(parts, axis=0, weights=table.metres).tolist())
-    return mean._replace(
-        velocity_max_mps=float(np.max(table.velocity_max_mps)),
-        steering_max_deg=float(np.max(table.steering_max_deg)),
-        steering_limit_deg=parts[0].steering_limit_deg,
-        metres=float(np.sum(table.metres)),
-    )
+
+    def mean(values: Sequence[np.ndarray]) -> float:
+        return sum(float(np.trapezoid(each, part.arc)) for each, part in zip(values, parts, strict=True)) / metres
+
+    velocity = [np.abs(part.velocity_error) for part in parts]
+    steering = [np.abs(part.steering_error) for part in parts]
+    velocity_mean, velocity_max = mean(velocity), max(float(each.max()) for each in velocity)
+    steering_mean, steering_max = mean(steering), max(float(each.max()) for each in steering)
+    reference = mean([part.reference_speed for part in parts])
+    return {
+        "velocity_mean_mps": velocity_mean,
+        "velocity_max_mps": velocity_max,
+        "velocity_mean_percent": 100.0 * velocity_mean / reference,
+        "velocity_max_percent": 100.0 * velocity_max / reference,
+        "reference_mps": reference,
+        "steering_mean_deg": steering_mean,
+        "steering_max_deg": steering_max,
+        "steering_mean_percent": 100.0 * steering_mean / vehicle.steering_limit,
+        "steering_max_percent": 100.0 * steering_max / vehicle.steering_limit,
+        "metres": metres,
+    }
 
 
 def poses_of(states: np.ndarray) -> np.ndarray:
@@ -141,22 +105,21 @@ def driven(poses: np.ndarray, road_map: Map) -> Driven:
     Raises: ValueError if the car never moved forward.
     """
     poses = np.asarray(poses, dtype=np.float64)
-    if poses.ndim != 2 or poses.shape[1] != 5 or not np.isfinite(poses).all():
-        raise ValueError(f"a drive is finite poses [n, 5], not {poses.shape}")
-    points = unwrapped(poses[:, :2], float(road_map.road.width), float(road_map.road.height))
-    way = np.hypot(*np.diff(points, axis=0).T)
+    sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
+    steps = np.diff(poses[:, :2], axis=0)
+    steps -= np.round(steps / sides) * sides  # across the torus's edge
+    points = np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(steps, axis=0)])
+    way = np.hypot(*steps.T)
     forward = np.concatenate([[0.0], np.cumsum(np.where(poses[1:, 3] + poses[:-1, 3] < 0.0, -way, way))])
     furthest = np.maximum.accumulate(forward)
-    moved = np.append(poses[:1, 3] > 0.0, forward[1:] > furthest[:-1] + _STANDING)
-    rows = np.flatnonzero(moved[: len(poses)])
+    rows = np.flatnonzero(np.append(poses[0, 3] > 0.0, forward[1:] > furthest[:-1] + _STANDING))
     if len(rows) < 2:
         raise ValueError("nothing was driven that could be compared with a reference")
     points = points[rows]
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    return Driven(arc, points, poses[rows, 2], poses[rows, 3], poses[rows, 4], rows)
+    return Driven(arc_length(points), points, poses[rows, 2], poses[rows, 3], poses[rows, 4], rows)
 
 
-def error_series(path: Driven, road_map: Map, sim: SimConfig | None = None) -> Series:
+def error_series(path: Driven, road_map: Map, vehicle: VehicleConfig) -> Series:
     """A drive beside the reference driver's profile along its path.
 
     The reference begins with the agent's speed and ignores traffic, so the error in traffic includes the delay by other
@@ -167,10 +130,9 @@ def error_series(path: Driven, road_map: Map, sim: SimConfig | None = None) -> S
     stopped any more, because what it would have had to brake for is not known.
     """
     interval = float(road_map.road.speed_low), float(road_map.road.speed_high)
-    found = profile(path.points, interval, float(path.speed[0]), sim)
-    speed, steering = (np.interp(path.arc, found.arc, each) for each in (found.speed, found.steering))
+    speed, steering = profile(path.points, interval, float(path.speed[0]), vehicle)
     unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * BRAKING) > path.arc[-1])
-    part = slice(int(np.searchsorted(path.arc, DRIVEN_WINDOW / 2)), int(unknown[0]))
+    part = slice(int(np.searchsorted(path.arc, WINDOW / 2)), int(unknown[0]))
     return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
 
 
