@@ -55,14 +55,14 @@ def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
     return np.dtype(np.int16), spec.inputs
 
 
-def empty(spec: PolicySpec, rows: int) -> Experience:
-    """Uninitialised experience of so many rows."""
+def empty(spec: PolicySpec, *shape: int) -> Experience:
+    """Uninitialised experience of so many rows, or [episodes, rows]."""
     dtype, width = observation_dtype_and_width(spec)
     return Experience(
-        np.empty((rows, width), dtype=dtype),
-        np.empty(rows, dtype=np.uint8),
-        np.empty(rows, dtype=np.float32),
-        np.empty(rows, dtype=np.uint8),
+        np.empty((*shape, width), dtype=dtype),
+        np.empty(shape, dtype=np.uint8),
+        np.empty(shape, dtype=np.float32),
+        np.empty(shape, dtype=np.uint8),
     )
 
 

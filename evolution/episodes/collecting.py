@@ -9,23 +9,44 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from evolution.dqn.experience import Experience, empty, join
+from evolution.dqn.experience import Experience, empty
 from evolution.episodes.rollout import (
     RESULT,
+    EpisodeSetup,
     Limits,
     Recorder,
     checked_worlds,
-    episode_setup,
     make_workspace,
     packed_genome,
     policy_buffers,
     run_episode,
     simulations_on,
+    with_limits,
 )
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
+from gridsim.jit import njit
 from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
+
+
+@njit(nogil=True)
+def _collect(
+    simulation, genome, layers, which, starts, targets, steps, worlds, closing, grid_buffers, epsilons, keys,
+    experience, results,
+):  # fmt: skip
+    """Drive a genome through episodes `which` [k] on one map; fills their rows of experience and results.
+
+    Args: experience [e, rows, ...]; the others, but for the first four and the buffers, [e, ...].
+    """
+    workspace = make_workspace(simulation, layers, 0, 0)
+    packed = packed_genome(genome, layers, grid_buffers)
+    observations, actions, rewards, ends = experience
+    for k in which:
+        setup = EpisodeSetup(starts[k], targets[k], steps[k])
+        world = None if worlds is None else worlds[k].copy()
+        recorder = Recorder(Experience(observations[k], actions[k], rewards[k], ends[k]), epsilons[k], keys[k])
+        run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, results[k])
 
 
 def collect(
@@ -54,26 +75,19 @@ def collect(
     """
     if weights.shape != (spec.size,):
         raise ValueError(f"the weights of {spec} are [{spec.size}], not {weights.shape}")
-    (closing, grid_buffers), worlds = policy_buffers(spec, config), checked_worlds(episodes, limits, worlds)
-    packed = packed_genome(freeze(weights.astype(np.float32, copy=False)), spec.layers, grid_buffers)
-    simulations = simulations_on(road_maps, config)
-    workspaces = [make_workspace(simulation, spec.layers, 0, 0) for simulation in simulations]
-    longest = int(max(episodes["steps"].max(initial=0), limits.steps))
-    rows = empty(spec, longest + 1)
+    worlds, episodes = checked_worlds(episodes, limits, worlds), with_limits(episodes, limits)
+    buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config)
+    weights = freeze(weights.astype(np.float32, copy=False))
+    setups = freeze(episodes["start"]), freeze(episodes["target"]), freeze(episodes["steps"].astype(np.int64))
+    traffic = freeze(worlds.copy()) if worlds.shape[1] else None
+    exploration = freeze(epsilons.astype(np.float32)), freeze(keys.astype(np.uint64))
     results = np.zeros(len(episodes), dtype=RESULT)
-    parts = []
-    for k, episode in enumerate(episodes):
-        run_episode(
-            simulations[episode["map"]],
-            packed,
-            spec.layers,
-            episode_setup(episode, limits),
-            workspaces[episode["map"]],
-            worlds[k].copy() if worlds.shape[1] else None,
-            closing,
-            grid_buffers,
-            Recorder(rows, epsilons[k], keys[k]),
-            results[k],
+    # Room for episodes of any length: memory that is not written to is not taken.
+    experience = empty(spec, len(episodes), int(episodes["steps"].max(initial=0)) + 1)
+    for m in np.unique(episodes["map"]):
+        which = np.flatnonzero(episodes["map"] == m)
+        _collect(
+            simulations[m], weights, spec.layers, which, *setups, traffic, *buffers, *exploration, experience, results
         )
-        parts.append(Experience(*(array[: int(results[k]["steps"]) + 1].copy() for array in rows)))
-    return join(spec, parts), results
+    driven = np.arange(experience.actions.shape[1]) <= results["steps"][:, None]
+    return Experience(*(array[driven] for array in experience)), results

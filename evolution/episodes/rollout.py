@@ -291,15 +291,17 @@ def _rollout(
             rewound[i, 4] = back[STEERING]
 
 
-def episode_setup(episode: np.void, limits: Limits) -> EpisodeSetup:
-    """The EpisodeSetup of an EPISODE, with `limits` as defaults."""
-    target, steps = episode["target"] or limits.target, episode["steps"] or limits.steps
-    return EpisodeSetup(freeze(episode["start"].copy()), _F(target), int(steps))
+def with_limits(episodes: np.ndarray, limits: Limits) -> np.ndarray:
+    """A copy of EPISODE [e] with `limits` filled in where they have no target or time limit of their own."""
+    episodes = episodes.copy()
+    for name, limit in (("target", limits.target), ("steps", limits.steps)):
+        episodes[name][episodes[name] <= 0] = limit
+    return episodes
 
 
 def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
     """Target (m) of each episode: float64 [e]."""
-    return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
+    return with_limits(episodes, limits)["target"].astype(np.float64)
 
 
 def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | None) -> np.ndarray:
@@ -348,12 +350,12 @@ def evaluate(
     rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
     simulations = simulations_on(road_maps, config)
-    for column, episode in enumerate(episodes):
+    for column, episode in enumerate(with_limits(episodes, limits)):
         _rollout(
             simulations[episode["map"]],
             genomes,
             spec.layers,
-            episode_setup(episode, limits),
+            EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"])),
             freeze(worlds[column].copy()) if worlds.shape[1] else None,
             *buffers,
             int(episode["rewind"]),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.episodes.rollout import EPISODE, Limits, no_traffic
+from evolution.episodes.rollout import EPISODE, Limits, no_traffic, with_limits
 from gridsim.config import TrafficConfig
 from gridsim.maps.map import Map, sample_starts
 from gridsim.traffic.world import FIELDS, spawn
@@ -21,11 +21,8 @@ class Episodes(NamedTuple):
     worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
 
     def with_limits(self, limits: Limits) -> Episodes:
-        """These episodes, with `limits` filled in where they have no target or time limit of their own."""
-        rows = self.rows.copy()
-        rows["target"] = np.where(rows["target"] > 0, rows["target"], limits.target)
-        rows["steps"] = np.where(rows["steps"] > 0, rows["steps"], limits.steps)
-        return Episodes(self.maps, rows, self.worlds)
+        """`rollout.with_limits` of these episodes."""
+        return self._replace(rows=with_limits(self.rows, limits))
 
     def and_then(self, others: Episodes) -> Episodes:
         """Concatenate these and other episodes with the same number of cars."""
