@@ -39,7 +39,7 @@ from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CheckpointError
 from evolution.episodes.rollout import Limits, evaluate
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import PolicySpec, decide, encode, pack, packed_size, scratch_size
+from evolution.networks.policy import PolicySpec, decide, encode, pack, scratch_size
 from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed
 from gridsim.car.ego import DISTANCE
@@ -102,8 +102,7 @@ def vector_env(
         CARS, maps=maps, config=champion.sim, traffic=traffic, observation=observation, scenario=champion.scenario
     )
     layers = PolicySpec.parse(champion.policy).layers
-    packed = np.empty(packed_size(layers), dtype=np.float32)
-    pack(champion.genome, layers, packed)
+    packed = pack(champion.genome, layers)
     actions = np.zeros(CARS, dtype=np.int64)
     _, info = env.reset(seed=0)
     # As in a long run, the cars are spread over the length of their episodes, so that resets come evenly.

@@ -128,17 +128,11 @@ class Replay:
         return {name: ring[: len(self)] for name, ring in self._rings.items()}, {"rows_added": self.added}
 
     def restore(self, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-        """Restore a `state`. Raises: ValueError with one line if it is not one of such a replay."""
-        added = int(meta["rows_added"])
-        size = min(added, self.capacity)
+        """Restore a `state` of a replay of the same capacity and network."""
+        self.added = int(meta["rows_added"])
         for name, ring in self._rings.items():
-            array, shape = arrays[name], (size, *ring.shape[1:])
-            if array.dtype != ring.dtype or array.shape != shape:
-                raise ValueError(f"a saved replay's {name} are {array.dtype} {array.shape}, not {ring.dtype} {shape}")
-        for name, ring in self._rings.items():
-            ring[:size] = arrays[name]
-        self._drawable[:size] = arrays["actions"] != NO_ACTION
-        self.added = added
+            ring[: len(self)] = arrays[name]
+        self._drawable[: len(self)] = arrays["actions"] != NO_ACTION
         self._exclude_incomplete_stacks()
 
 

@@ -22,7 +22,6 @@ from evolution.networks.policy import (
     decide,
     encode,
     pack,
-    packed_size,
     scratch_size,
 )
 from gridsim.car.ego import COS, DISTANCE, FIELDS, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y, drive, look, place
@@ -151,11 +150,7 @@ def make_workspace(simulation, layers, rows, cars):
 @njit
 def packed_genome(genome, layers, grid_buffers):
     """A genome as its network's kernel reads it."""
-    if grid_buffers is not None:
-        return genome
-    packed = np.empty(packed_size(layers), dtype=np.float32)
-    pack(genome, layers, packed)
-    return packed
+    return pack(genome, layers) if grid_buffers is None else genome
 
 
 class Recorder(NamedTuple):
@@ -291,17 +286,17 @@ def _rollout(
             rewound[i, 4] = back[STEERING]
 
 
+def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
+    """Target (m) of each episode: float64 [e]."""
+    return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
+
+
 def with_limits(episodes: np.ndarray, limits: Limits) -> np.ndarray:
     """A copy of EPISODE [e] with `limits` filled in where they have no target or time limit of their own."""
     episodes = episodes.copy()
-    for name, limit in (("target", limits.target), ("steps", limits.steps)):
-        episodes[name][episodes[name] <= 0] = limit
+    episodes["target"] = targets(episodes, limits)
+    episodes["steps"] = np.where(episodes["steps"] > 0, episodes["steps"], limits.steps)
     return episodes
-
-
-def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
-    """Target (m) of each episode: float64 [e]."""
-    return with_limits(episodes, limits)["target"].astype(np.float64)
 
 
 def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | None) -> np.ndarray:

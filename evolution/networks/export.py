@@ -34,14 +34,12 @@ from evolution.networks.policy import (
     PolicySpec,
 )
 from gridsim.config import SimConfig
-from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN, centres
+from gridsim.sensing.grid import CELLS, FREE
 
 if TYPE_CHECKING:
     import torch
 
     Layers = list[tuple[torch.Tensor, torch.Tensor]]
-
-_ROAD = 8.0  # m, width of the straight road of `example`
 
 
 def layers_of(spec: PolicySpec, genome: torch.Tensor) -> Layers:
@@ -126,19 +124,13 @@ def _squash(x: torch.Tensor) -> torch.Tensor:
 
 
 def example(spec: PolicySpec, config: SimConfig) -> np.ndarray:
-    """Example inputs of `to_torch`'s module, float32 [2, inputs]: a straight road, at standstill and at 10 m/s."""
+    """Example inputs of `to_torch`'s module, float32 [2, inputs]: nothing in sight, at standstill and at 10 m/s."""
     speeds = np.array([0.0, 10.0], dtype=np.float32)
-    half = math.radians(config.sensors.field_of_view / 2)
+    observations = np.zeros((2, spec.inputs), dtype=np.float32)  # wheels straight ahead
     if isinstance(spec, CnnSpec):
-        ahead, left = centres()
-        grid = np.where(np.abs(left) < _ROAD / 2, FREE, OCCUPIED)
-        grid[np.abs(left) > _ROAD / 2 + 1.0] = UNKNOWN
-        grid[np.abs(np.arctan2(left, ahead)) > half] = UNKNOWN
-        return np.stack([np.append(np.tile(grid.ravel(), spec.frames), speed) for speed in speeds], dtype=np.float32)
+        observations[:, :-1], observations[:, -1] = FREE, speeds
+        return observations
     assert isinstance(spec, MlpSpec)
-    across = np.abs(np.sin(np.linspace(-half, half, RAYS)))
-    reach = config.sensors.range
-    observations = np.zeros((2, spec.inputs), dtype=np.float32)  # cars that stand still, wheels straight ahead
-    observations[:, :RAYS] = np.minimum(_ROAD / 2 / np.maximum(across, 1e-6), reach) / reach
+    observations[:, :RAYS] = 1.0
     observations[:, 2 * RAYS if spec.motion else RAYS] = speeds / config.vehicle.speed_limit
     return observations

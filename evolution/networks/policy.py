@@ -231,13 +231,10 @@ BLOCK = 8  # a layer's outputs are padded to whole blocks
 _dense_64, _dense_16, _dense_8 = tile(1, 64, False), tile(1, 16, False, 2), tile(1, 8, False, 4)
 
 
-@njit
-def packed_size(layers):
-    """Length of a genome packed by `pack`."""
-    size = 0
-    for k in range(layers.shape[0] - 1):
-        size += (layers[k] + 1) * ((layers[k + 1] + BLOCK - 1) // BLOCK * BLOCK)
-    return size
+@leaf
+def _padded(units):
+    """The next multiple of BLOCK."""
+    return (units + BLOCK - 1) // BLOCK * BLOCK
 
 
 @njit
@@ -250,16 +247,19 @@ def scratch_size(layers):
 
 
 @njit
-def pack(genome, layers, packed):
-    """Pack a genome for `forward`: for each layer the biases, then a row of weights for each input.
+def pack(genome, layers):
+    """A genome as `forward` reads it: float32, for each layer the biases, then a row of weights for each input.
 
     Rows are padded with zeros to whole blocks.
     """
-    packed[:] = _F(0.0)
+    size = 0
+    for k in range(layers.shape[0] - 1):
+        size += (layers[k] + 1) * _padded(layers[k + 1])
+    packed = np.zeros(size, dtype=np.float32)
     at, to = 0, 0
     for k in range(layers.shape[0] - 1):
         n, m = layers[k], layers[k + 1]
-        width = (m + BLOCK - 1) // BLOCK * BLOCK
+        width = _padded(m)
         for j in range(m):
             packed[to + j] = genome[at + n * m + j]
         for i in range(n):
@@ -267,6 +267,7 @@ def pack(genome, layers, packed):
                 packed[to + (i + 1) * width + j] = genome[at + i * m + j]
         at += (n + 1) * m
         to += (n + 1) * width
+    return packed
 
 
 @leaf
@@ -281,7 +282,7 @@ def forward(packed, layers, scratch):
     last = layers.shape[0] - 2
     for k in range(last + 1):
         n, m = layers[k], layers[k + 1]
-        width = (m + BLOCK - 1) // BLOCK * BLOCK
+        width = _padded(m)
         target = half - source
         unit = 0
         while width - unit >= 64:
@@ -348,8 +349,7 @@ def act_on(
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
-    packed = np.empty(packed_size(spec.layers), dtype=np.float32)
-    pack(np.ascontiguousarray(genome), spec.layers, packed)
+    packed = pack(np.ascontiguousarray(genome), spec.layers)
     closing = many[:, RAYS : 2 * RAYS] * _F(speed_limit) if spec.motion else None
     speeds = many[:, 2 * RAYS if spec.motion else RAYS] * _F(speed_limit)
     angles = many[:, -1] * _F(steering_limit)

@@ -15,7 +15,7 @@ from evolution.episodes.collecting import collect
 from evolution.episodes.rollout import Limits, evaluate, no_traffic
 from evolution.episodes.starts import lane_starts
 from evolution.networks import convnet
-from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, packed_size, scratch_size
+from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
 from gridsim.car.ego import STEERING, End
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
@@ -115,9 +115,7 @@ class Slow:
         simulator = Simulator([self.scenario], 1, CONFIG, of.limits.target, of.limits.steps, traffic=len(world))
         ranges, speeds = simulator.reset(episode["start"][None], worlds=world[None] if len(world) else None)
         stack = np.zeros((1, spec.frames if isinstance(spec, CnnSpec) else 1, CELLS, CELLS), dtype=np.uint8)
-        packed = np.zeros(packed_size(spec.layers), dtype=F)
-        if isinstance(spec, MlpSpec):
-            pack(of.weights, spec.layers, packed)
+        packed = pack(of.weights, spec.layers) if isinstance(spec, MlpSpec) else of.weights
         scratch, base = np.zeros(scratch_size(spec.layers), dtype=F), draw(int(of.keys[0]), 0)
         motion = isinstance(spec, MlpSpec) and spec.motion
         self.inputs: list[np.ndarray] = []

@@ -56,16 +56,10 @@ def test_the_example_is_something_that_may_be_seen(text):
     assert shown.shape == (2, spec.inputs)
     assert shown.dtype == F
     if isinstance(spec, CnnSpec):
-        grid = shown[0, : CELLS * CELLS].reshape(CELLS, CELLS)
-        assert set(np.unique(grid)) == {UNKNOWN, FREE, OCCUPIED}
-        assert grid[0, CELLS // 2] == FREE  # straight ahead
-        assert (grid == grid[:, ::-1]).all()
+        assert (shown[:, :-1] == FREE).all()
         assert shown[:, -1].tolist() == [0.0, 10.0]
     elif isinstance(spec, MlpSpec):
-        ranges = shown[0, :31]
-        assert ranges[15] == 1.0
-        assert ranges[0] == pytest.approx(4.0 / np.sin(np.radians(60.0)) / 50.0)
-        assert (ranges == ranges[::-1]).all()
+        assert (shown[:, :31] == 1.0).all()
         fast = 10.0 / SimConfig().vehicle.speed_limit
         assert shown[1, 31:] == pytest.approx([0.0] * (31 * spec.motion) + [fast] + [0.0] * spec.steering)
 

@@ -19,7 +19,6 @@ from evolution.networks.policy import (
     forward,
     gene_scales,
     pack,
-    packed_size,
     scratch_size,
     squash,
 )
@@ -33,8 +32,7 @@ TEXTS = [
 
 
 def kernel_outputs(spec, genome, inputs, junk=0.0):
-    packed = np.full(packed_size(spec.layers), junk, dtype=F)
-    pack(genome, spec.layers, packed)
+    packed = pack(genome, spec.layers)
     scratch = np.full(scratch_size(spec.layers), junk, dtype=F)
     scratch[: spec.inputs] = inputs
     at = int(forward(packed, spec.layers, scratch))

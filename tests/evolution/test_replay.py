@@ -154,10 +154,3 @@ def test_other_keys_draw_others_and_the_same_key_the_same():
     drawn = [numbers(replay.sample(key, 16).observations).tolist() for key in (0, 1, 2, 1, 2**64 - 1)]
     assert drawn[1] == drawn[3]
     assert len({tuple(rows) for rows in drawn}) == 4
-
-
-@pytest.mark.parametrize("other", [Replay(RAYS, 63, 0.9), Replay(PolicySpec.parse("mlp:3+motion"), 64, 0.9)])
-def test_a_state_of_other_arguments_is_refused(other):
-    with pytest.raises(ValueError, match=r"^a saved replay[^\n]+$"):
-        other.restore(*filled().state())
-    assert len(other) == 0

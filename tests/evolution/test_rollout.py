@@ -9,7 +9,7 @@ from cluster.runs.champion import load_champion
 from cluster.workers.worker import Task, Worker
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack, packed_size
+from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, End, X, Y
 from gridsim.config import SimConfig
@@ -90,8 +90,7 @@ class Wheel:
     """A genome that drives the cars of a `Simulator`."""
 
     def __init__(self, spec, genome):
-        self.layers, self.packed = spec.layers, np.empty(packed_size(spec.layers), dtype=F)
-        pack(genome, spec.layers, self.packed)
+        self.layers, self.packed = spec.layers, pack(genome, spec.layers)
 
     def __call__(self, ranges, speeds):
         actions = np.zeros(len(ranges), dtype=np.int64)
