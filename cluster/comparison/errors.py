@@ -13,8 +13,8 @@ from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED
-from gridsim.reference.errors import TURN, Driven, Series, driven, error_series, error_series_beside, poses_of
-from gridsim.view.drive import Drive, DriveError, read_drive, replay
+from gridsim.reference.errors import TURN, Driven, Series, driven, error_series, error_series_beside
+from gridsim.view.drive import Drive, DriveError, poses_of, read_drive, replay
 
 _SHORTEST = 1.0  # m that must be left of a recording for another start
 _MAX_DRIFT = 0.5  # m from a recorded position to the replayed one

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from gridsim.car.ego import SPEED, X, Y
 from gridsim.maps.map import Map
-from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS
+from gridsim.maps.roads import node_clearance
 
 if TYPE_CHECKING:
     from cluster.comparison.tables import Group
@@ -76,7 +76,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], 
 
     figure, (axis,) = _figure(8.6, 7.6)
     road = scenario.road
-    nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
+    nodes = node_clearance(road)
     width, height = float(road.width), float(road.height)
     extent = (0.0, width, 0.0, height)
     axis.set_facecolor(_WALL)

@@ -184,12 +184,18 @@ def _clearance_nodes(lines, arcs, columns, rows):
     return field
 
 
-def _pack(nodes: np.ndarray) -> np.ndarray:
-    """Pack clearance (m) [rows, columns] into the four-corner words that `clearance` reads."""
+def pack_field(nodes: np.ndarray) -> np.ndarray:
+    """`Road.field` of the clearance (m) at the nodes [rows, columns]."""
     units = (nodes - _F(FIELD_FLOOR)) * _F(FIELD_UNITS) + _F(0.5)
     here = np.clip(units, 0.0, 255.0).astype(np.uint8)
     right, above = np.roll(here, -1, axis=1), np.roll(here, -1, axis=0)
-    return np.stack([here, right, above, np.roll(right, -1, axis=0)], axis=-1).view("<u4").ravel()
+    return freeze(np.stack([here, right, above, np.roll(right, -1, axis=0)], axis=-1).view("<u4").ravel())
+
+
+def node_clearance(road: Road) -> np.ndarray:
+    """Clearance (m) at the nodes of a road's field: float32 [rows, columns]."""
+    units = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns))
+    return units.astype(np.float32) / _F(FIELD_UNITS) + _F(FIELD_FLOOR)
 
 
 def _rows_on_road(nodes: np.ndarray) -> np.ndarray:
@@ -311,7 +317,7 @@ def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range:
     start_row = _rows_on_road(nodes)
     start = _ray_starts(nodes, start_row, _F(ray_range))
     return Road(
-        field=freeze(_pack(nodes)),
+        field=pack_field(nodes),
         start_row=freeze(start_row),
         start=freeze(np.concatenate([start, start[:, :HEADING_WRAP]], axis=1).ravel()),
         columns=np.uint32(columns),

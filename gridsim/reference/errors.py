@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
 from gridsim.config import VehicleConfig
 from gridsim.maps.map import Map
 from gridsim.reference.profile import BRAKING, WINDOW, arc_length, profile
@@ -90,14 +89,8 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     }
 
 
-def poses_of(states: np.ndarray) -> np.ndarray:
-    """Poses float32 [n, 5] of states [n, ego.FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
-    heading = np.arctan2(states[:, SIN], states[:, COS])
-    return np.stack([states[:, X], states[:, Y], heading, states[:, SPEED], states[:, STEERING]], axis=1)
-
-
 def driven(poses: np.ndarray, road_map: Map) -> Driven:
-    """A drive's path from its poses [n, 5] at the control steps, as `poses_of` gives them.
+    """A drive's path from its poses [n, 5] at the control steps, as `view.drive.poses_of` gives them.
 
     Reversing, and the same metres driven again, are left out, because a reference only drives forward. So is standing,
     where steering has no effect: a path from rest begins after the first control step that moves the car.

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, STEPS, End, X, Y
+from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
@@ -86,9 +86,11 @@ def _key(road_map: Map, episode: int) -> int:
     return int(np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
 
 
-def pose(car: np.ndarray) -> np.ndarray:
-    """The pose float32 [5] of a state [FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
-    return np.array([car[X], car[Y], np.arctan2(car[SIN], car[COS]), car[SPEED], car[STEERING]], dtype=np.float32)
+def poses_of(states: np.ndarray) -> np.ndarray:
+    """Poses float32 [..., 5] of states [..., FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
+    poses = states[..., [X, Y, SIN, SPEED, STEERING]]
+    poses[..., 2] = np.arctan2(states[..., SIN], states[..., COS])
+    return poses
 
 
 def action_for(keys: set[str], speed: float) -> Action:
@@ -209,21 +211,24 @@ def replay(drive: Drive, road_map: Map, config: SimConfig | None = None) -> tupl
     Raises: DriveError with one line if an episode ends too early, which means that the map is another one.
     """
     simulator = _simulator(road_map, config, drive.traffic)
-    n, rays = len(drive), simulator.config.sensors.rays
-    poses, cars = np.empty((n, 5), np.float32), np.empty((n, FIELDS), np.float32)
-    views = np.empty((n, rays), np.float32)
-    worlds = np.empty((n, *simulator.state.worlds.shape[1:]), np.float32)
+    n = len(drive)
+    begins = np.diff(drive.episodes, prepend=-1) != 0
+    rows = []
     for k in range(n):
-        if k == 0 or drive.episodes[k] != drive.episodes[k - 1]:
+        if begins[k]:
             ranges, _ = simulator.reset(drive.poses[k : k + 1], keys=_key(road_map, int(drive.episodes[k])))
-            poses[k] = drive.poses[k]
         else:
             ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
-            poses[k] = pose(simulator.state.cars[0])
             if ends[0] != End.RUNNING:
                 raise DriveError(f"replayed, the drive ends at row {k} of {n}: it was driven on another map")
-        cars[k], views[k], worlds[k] = simulator.state.cars[0], ranges[0], simulator.state.worlds[0]
-    return poses, cars, views, worlds
+        rows.append((simulator.state.cars[0].copy(), ranges[0].copy(), simulator.state.worlds[0].copy()))
+    cars, views, worlds = (np.stack(column) for column in zip(*rows, strict=True))
+    return np.where(begins[:, None], drive.poses, poses_of(cars)), cars, views, worlds
+
+
+def _present(world: np.ndarray) -> np.ndarray:
+    """The cars [n, world.FIELDS] of a world that are on a lane: a copy."""
+    return world[world[:, LANE] >= 0.0]
 
 
 def drive(
@@ -259,18 +264,16 @@ def drive(
                 episode += 1
             ranges, _ = simulator.reset(start[None], keys=_key(road_map, episode))
             path = [start[:2].copy()]
-        before, view = simulator.state.cars[0].copy(), ranges[0]
-        there = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
+        before, view, there = simulator.state.cars[0].copy(), ranges[0], _present(simulator.state.worlds[0])
         ended = simulator.state.ends[0] != End.RUNNING
         if not ended:
             step = int(before[STEPS])
             action = action_for(held, float(before[SPEED]))
             if recorder is not None:
-                recorder.write(step, start if step == 0 else pose(before), action, episode)
+                recorder.write(step, start if step == 0 else poses_of(before), action, episode)
             ranges, _, _, _ = simulator.step(np.array([int(action)]))
             steps += 1
-        after = simulator.state.cars[0]
-        then = simulator.state.worlds[0][simulator.state.worlds[0, :, LANE] >= 0.0]
+        after, then = simulator.state.cars[0], _present(simulator.state.worlds[0])
         best = max(best, float(after[DISTANCE]))
         for k in range(1, pictures + 1):
             part = k / pictures

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-from gridsim.jit import leaf, njit
-from gridsim.maps.map import Map
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, freeze
+from gridsim.jit import njit
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, Road, clearance, node_clearance, pack_field
 
 GROUND = (226, 231, 218)
 GROUND_OTHER = (220, 226, 211)  # of every other square, so that motion is visible
@@ -27,95 +26,61 @@ RAY, PATH = (92, 225, 200), (233, 172, 86)
 FREE, OCCUPIED, UNKNOWN = (92, 225, 200), (255, 70, 90), (16, 18, 24)
 HUD = (20, 22, 28)
 
-BLOCK = 8  # pixels, side of the blocks that are tested together
-SQUARE = 32  # cells of the field, side of the ground's squares
+SQUARE = 16.0  # m, side of the ground's squares
 EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and half that line's width
 VERGE_WIDTH = 0.7  # m
 DIP = 1.0  # m from the edge beyond which dips of the clearance are removed
 
-_F, _I, _U = np.float32, np.int32, np.uint32
+_F = np.float32
+_COLOURS = np.array([GROUND, GROUND_OTHER, VERGE, ASPHALT, EDGE_LINE], dtype=np.float32)
 SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, corner radius, red, green, blue, opacity
 
 
-@leaf
-def _clear(field, columns, rows, wrap, turn, x, y):
-    """Clearance (m) at a place in cells of the field, counted from `turn` tiles before the first; off the map, wall."""
-    ix, iy = _I(x), _I(y)
-    mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
-    if not wrap and (_U(ix - _I(turn) * _I(columns)) > mask_x or _U(iy - _I(turn) * _I(rows)) > mask_y):
-        return _F(FIELD_FLOOR)
-    ux, uy = x - _F(ix), y - _F(iy)
-    word = field[_U((_U(iy) & mask_y) * _U(columns) + (_U(ix) & mask_x))]
-    q00, q10 = _F(_I(word & _U(255))), _F(_I((word >> _U(8)) & _U(255)))
-    q01, q11 = _F(_I((word >> _U(16)) & _U(255))), _F(_I(word >> _U(24)))
-    low, high = q00 + ux * (q10 - q00), q01 + ux * (q11 - q01)
-    return (low + uy * (high - low)) * _F(1.0 / FIELD_UNITS) + _F(FIELD_FLOOR)
-
-
 @njit(nogil=True)
-def draw_ground(field, columns, rows, wrap, turn, origin, step_x, step_y, pixels_per_m, colours, image):
+def draw_ground(road, repeats, origin, step_x, step_y, pixels_per_m, image):
     """Ground and road.
 
-    Args: packed field with its sides; whether it repeats; position of the first pixel's centre and the steps to the
-    next pixel to the right and below, float64 [2], in cells of the field from `turn` tiles before the first, so that
-    none is below 0; pixels_per_m; colours float32 [5, 3]: ground, its other squares, verge, asphalt, edge line.
+    Args: a `smoothed` road; whether it repeats beyond its sides, or there is wall; place of the first pixel's centre
+    and steps to the next pixel to the right and below, float64 [2] in m.
     Writes: image uint8 [h, w, 3].
     """
     zero, half, one = _F(0.0), _F(0.5), _F(1.0)
     scale = _F(pixels_per_m)
-    line_half = _F(EDGE_HALF) * scale
+    line_at, line_half = _F(EDGE_AT) * scale, _F(EDGE_HALF) * scale
     inner = _F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge beyond which there is only asphalt
     outer = -max(_F(VERGE_WIDTH), one / scale)  # ... and only ground
-    reach = _F(0.75 * BLOCK) / scale  # m from a block's middle to its corners; clearance changes no faster than that
-    ax, ay, bx, by = _F(step_x[0]), _F(step_x[1]), _F(step_y[0]), _F(step_y[1])
-    for top in range(0, image.shape[0], BLOCK):
-        for left in range(0, image.shape[1], BLOCK):
-            x0 = _F(origin[0] + left * step_x[0] + top * step_y[0])
-            y0 = _F(origin[1] + left * step_x[1] + top * step_y[1])
-            middle = _F((BLOCK - 1) / 2)
-            clear = _clear(field, columns, rows, wrap, turn, x0 + middle * (ax + bx), y0 + middle * (ay + by))
-            known = clear > inner + reach or clear < outer - reach
-            for j in range(top, min(top + BLOCK, image.shape[0])):
-                for i in range(left, min(left + BLOCK, image.shape[1])):
-                    across, down = _F(i - left), _F(j - top)
-                    x, y = x0 + across * ax + down * bx, y0 + across * ay + down * by
-                    if not known:
-                        clear = _clear(field, columns, rows, wrap, turn, x, y)
-                    if clear > inner:
-                        for c in range(3):
-                            image[j, i, c] = np.uint8(colours[3, c])
-                        continue
-                    base = (_I(x) // _I(SQUARE) + _I(y) // _I(SQUARE)) & 1
-                    if clear < outer:
-                        for c in range(3):
-                            image[j, i, c] = np.uint8(colours[base, c])
-                        continue
-                    edge = clear * scale  # pixels from the road's edge, positive on it
-                    road = min(max(edge + half, zero), one)
-                    verge = min(max(one + clear * _F(1.0 / VERGE_WIDTH), zero), one)
-                    off = abs(edge - _F(EDGE_AT) * scale)
-                    line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * _F(0.85)
-                    for c in range(3):
-                        value = colours[base, c]
-                        value += verge * (colours[2, c] - value)
-                        value += road * (colours[3, c] - value)
-                        value += line * (colours[4, c] - value)
-                        image[j, i, c] = np.uint8(value + half)
+    for j in range(image.shape[0]):
+        for i in range(image.shape[1]):
+            x = _F(origin[0] + i * step_x[0] + j * step_y[0])
+            y = _F(origin[1] + i * step_x[1] + j * step_y[1])
+            inside = zero <= x and x < road.width and zero <= y and y < road.height
+            clear = clearance(road, x, y) if repeats or inside else _F(FIELD_FLOOR)
+            ground = (np.int32(np.floor(x / _F(SQUARE))) + np.int32(np.floor(y / _F(SQUARE)))) & 1
+            if clear > inner or clear < outer:
+                for c in range(3):
+                    image[j, i, c] = np.uint8(_COLOURS[3 if clear > inner else ground, c])
+                continue
+            edge = clear * scale  # pixels from the road's edge, positive on it
+            off = abs(edge - line_at)
+            verge = min(max(one + clear * _F(1.0 / VERGE_WIDTH), zero), one)
+            asphalt = min(max(edge + half, zero), one)
+            line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * _F(0.85)
+            for c in range(3):
+                value = _COLOURS[ground, c]
+                value += verge * (_COLOURS[2, c] - value)
+                value += asphalt * (_COLOURS[3, c] - value)
+                value += line * (_COLOURS[4, c] - value)
+                image[j, i, c] = np.uint8(value + half)
 
 
-def smoothed(road_map: Map) -> np.ndarray:
-    """The map's clearance field without dips away from the edges, packed as in `Road`.
+def smoothed(road: Road) -> Road:
+    """A road without dips of the clearance away from the edges.
 
     The clearance dips where strips meet, in the middle of a junction even to 0, which would be drawn as an edge.
     """
-    road = road_map.road
-    nodes = (road.field & np.uint32(255)).astype(np.uint8).reshape(int(road.rows), int(road.columns))
+    nodes = node_clearance(road)
     least = minimum_filter(nodes, 2 * round(DIP * CELLS_PER_M) + 1, mode="wrap")
-    inside = least > round((-FIELD_FLOOR - 0.1) * FIELD_UNITS)
-    shown = np.where(inside, np.maximum(nodes, round((DIP - FIELD_FLOOR) * FIELD_UNITS)), nodes).astype(np.uint32)
-    right = np.roll(shown, -1, axis=1)
-    low, high = shown | right << 8, np.roll(shown, -1, axis=0) | np.roll(right, -1, axis=0) << 8
-    return freeze((low | high << 16).ravel())
+    return road._replace(field=pack_field(np.where(least > -0.09, np.maximum(nodes, DIP), nodes)))
 
 
 @njit(nogil=True)

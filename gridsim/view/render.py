@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-import time
 from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from gridsim.car.ego import COS, SIN, STEERING, X, Y
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
-from gridsim.maps.roads import CELLS_PER_M, freeze
+from gridsim.maps.roads import freeze
 from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
@@ -30,7 +29,8 @@ from gridsim.view.marks import lane_marks
 if TYPE_CHECKING:
     import pygame
 
-CAR_AT = 0.74  # height of the car in a picture that follows it, as a share from the top
+METRES = 52.0  # m, height of a picture
+CAR_AT = 0.74  # height of the car in a picture, as a share from the top
 GRID_CELL = 0.5  # m, of the occupancy grid
 
 
@@ -39,45 +39,22 @@ class NoDisplayError(GridSimError):
 
 
 class Renderer:
-    """Draws pictures of one map.
+    """Draws pictures of one map around a car, whose heading is upwards. A torus repeats without a seam."""
 
-    A view that follows the car has its heading upwards, and the map, if it is a torus, repeats without a seam. The view
-    of the whole map has north upwards.
-    """
-
-    def __init__(
-        self,
-        road_map: Map,
-        size: tuple[int, int] = (640, 480),
-        metres: float = 52.0,
-        follow: bool = True,
-        config: SimConfig | None = None,
-    ):
-        """Prepare pictures of `size` (width, height in pixels).
-
-        Args: metres: height of a picture that follows the car; follow: whether it does, or shows the whole map.
-        Raises: ValueError with one line if a number is out of range.
-        """
+    def __init__(self, road_map: Map, size: tuple[int, int] = (640, 480), config: SimConfig | None = None):
+        """Prepare pictures of `size` (width, height in pixels)."""
         width, height = size
-        if not (16 <= width <= 8192 and 16 <= height <= 8192):
-            raise ValueError(f"a picture is 16 to 8192 pixels wide and high, not {width} x {height}")
-        if not 1.0 <= metres <= 10_000.0:
-            raise ValueError(f"a picture shows 1 to 10,000 metres, not {metres}")
-        self.road_map, self.size, self.follow = road_map, (int(width), int(height)), follow
+        self.road_map, self.size = road_map, size
         self.config = config or SimConfig()
         self._constants = constants(self.config)
         road = road_map.road
-        self._field = paint.smoothed(road_map)
+        self._road = paint.smoothed(road)
         self._world = np.array([road.width, road.height], dtype=np.float64)
-        self.pixels_per_m = height / metres if follow else min(width / self._world[0], height / self._world[1])
-        self._anchor = np.array([width / 2, height * (CAR_AT if follow else 0.5)])
+        self.pixels_per_m = height / METRES
+        self._anchor = np.array([width / 2, height * CAR_AT])
         self._centre, self._up = self._world / 2, np.array([0.0, 1.0])
         self._marks = lane_marks(road_map)
-        blocks = getattr(road_map.strips, "blocks", None)  # parked cars
-        self._blocks = np.zeros((0, 5)) if blocks is None else np.asarray(blocks, dtype=np.float64)
-        self._colours = freeze(
-            np.array([paint.GROUND, paint.GROUND_OTHER, paint.VERGE, paint.ASPHALT, paint.EDGE_LINE], dtype=np.float32)
-        )
+        self._parked = road_map.strips.blocks
         vehicle, k = self.config.vehicle, self._constants
         self._outline = (vehicle.length, vehicle.width, float(k.front_axle), float(k.rear_axle))
         self._other = paint.car_parts(*self._outline, 0.0, paint.OTHER)
@@ -88,7 +65,7 @@ class Renderer:
         On a torus, the copy of a point that is nearest to the view's centre.
         """
         offset = np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre
-        if self.road_map.torus and self.follow:
+        if self.road_map.torus:
             offset -= np.round(offset / self._world) * self._world
         return self._anchor + self._turn(offset) * self.pixels_per_m
 
@@ -123,20 +100,13 @@ class Renderer:
         """
         width, height = self.size
         position, heading = np.asarray(car[[X, Y]], np.float64), np.asarray(car[[COS, SIN]], np.float64)
-        if self.follow:
-            self._centre, self._up = position, heading / max(math.hypot(*heading), 1e-9)
+        self._centre, self._up = position, heading / max(math.hypot(*heading), 1e-9)
         image = np.empty((height, width, 3), dtype=np.uint8)
         right = np.array([self._up[1], -self._up[0]])
         metre = 1.0 / self.pixels_per_m
         origin = self._centre - (self._anchor[0] - 0.5) * metre * right + (self._anchor[1] - 0.5) * metre * self._up
-        road = self.road_map.road
-        # Just enough tiles to keep positions positive: float32 positions then stay exact to a millimetre or two.
-        turn = 1 + math.ceil(math.hypot(width, height) * metre / self._world.min())
-        paint.draw_ground(
-            self._field, road.columns, road.rows, self.road_map.torus and self.follow, turn,
-            (origin + turn * self._world) * CELLS_PER_M, right * metre * CELLS_PER_M, -self._up * metre * CELLS_PER_M,
-            self.pixels_per_m, self._colours, image,
-        )  # fmt: skip
+        steps = right * metre, -self._up * metre
+        paint.draw_ground(self._road, self.road_map.torus, origin, *steps, self.pixels_per_m, image)
         shapes = [self._mark_shapes(), self._block_shapes()]
         if grid is not None:
             shapes.append(self._grid_shapes(position, heading, np.asarray(grid)))
@@ -192,7 +162,7 @@ class Renderer:
     def _block_shapes(self) -> np.ndarray:
         """Parked cars, with the length and width of their blocks."""
         shapes = [np.zeros((0, paint.SHAPE), dtype=np.float32)]
-        for x, y, turn, a, b in self._blocks[self._near(self.pixel(self._blocks[:, :2]), 8.0 * self.pixels_per_m)]:
+        for x, y, turn, a, b in self._parked[self._near(self.pixel(self._parked[:, :2]), 8.0 * self.pixels_per_m)]:
             parts = paint.car_parts(2 * a, 2 * b, 0.62 * a, 0.62 * a, 0.0, paint.PARKED)
             shapes.append(self._placed(parts, np.array([[x, y]]), np.array([[math.cos(turn), math.sin(turn)]])))
         return np.concatenate(shapes)
@@ -330,21 +300,16 @@ class Window:
                 f"no window can be opened ({error}): set DISPLAY to a running display, or use what needs no window"
             ) from error
         pygame.display.set_caption(caption)
-        self._due = 0.0
+        self._clock = pygame.time.Clock()
         self.closed = False
 
-    def show(self, image: np.ndarray, fps: float = 0.0) -> None:
-        """Show a picture uint8 [h, w, 3], and wait to keep a rate of `fps` (0: do not wait)."""
+    def show(self, image: np.ndarray, fps: float) -> None:
+        """Show a picture uint8 [h, w, 3], and wait to keep a rate of `fps`."""
         pygame = self._pygame
         height, width = image.shape[:2]
         self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB"), (0, 0))
         pygame.display.flip()
-        if fps > 0:
-            now = time.perf_counter()
-            if not now - 0.25 < self._due < now + 1.0:  # the first picture, or one after a pause
-                self._due = now
-            time.sleep(max(self._due - now, 0.0))
-            self._due += 1.0 / fps
+        self._clock.tick(fps)
 
     def keys(self) -> tuple[set[str], set[str]]:
         """Names of the keys pressed since the last call, and of those held now or pressed since.

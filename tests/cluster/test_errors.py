@@ -16,10 +16,10 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig, VehicleConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.reference.errors import APART, TURN, Series, driven, error_series, error_series_beside, poses_of
+from gridsim.reference.errors import APART, TURN, Series, driven, error_series, error_series_beside
 from gridsim.reference.errors import errors as errors_of
 from gridsim.reference.profile import BRAKING, LATERAL, profile, top_speed
-from gridsim.view.drive import DriveError, Recorder
+from gridsim.view.drive import DriveError, Recorder, poses_of
 
 INTERVAL = REGISTRY["seamless"].speed_interval
 TOP = top_speed(INTERVAL)

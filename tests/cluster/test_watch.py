@@ -24,7 +24,7 @@ from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import Recorder, pose, without_idle_limit
+from gridsim.view.drive import Recorder, poses_of, without_idle_limit
 from gridsim.view.render import Renderer
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
@@ -55,7 +55,7 @@ def drive(driver):
 
 def test_recording_is_the_environments_drive(driver, drive):
     env = driver.make_env(maps=[drive.scenario])
-    start = np.array([*pose(drive.cars[0])])
+    start = np.array([*poses_of(drive.cars[0])])
     observation, _ = env.reset(seed=0, options={"map_seed": drive.scenario.seed, "start": start})
     for _ in range(60):
         observation, _, _, _, info = env.step(driver.act(observation))
@@ -153,7 +153,7 @@ def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
         for episode, steps in enumerate((16, 11)):
             simulator.reset(start[None])
             for k in range(steps):
-                recorder.write(k, start if k == 0 else pose(simulator.state.cars[0]), 0, episode)
+                recorder.write(k, start if k == 0 else poses_of(simulator.state.cars[0]), 0, episode)
                 simulator.step(np.array([0]))
     for arguments, pictures in (([], 25), (["--seconds", 2], 20)):
         film = ["drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]

@@ -17,7 +17,16 @@ from gridsim.car.vehicle import Action
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import COLUMNS, DriveError, Recorder, action_for, pose, read_drive, replay, without_idle_limit
+from gridsim.view.drive import (
+    COLUMNS,
+    DriveError,
+    Recorder,
+    action_for,
+    poses_of,
+    read_drive,
+    replay,
+    without_idle_limit,
+)
 
 COMMAND = [sys.executable, "-c", "from cluster.commands.entry import drive_main; drive_main()"]
 
@@ -39,7 +48,7 @@ def recorded(scenario, tmp_path_factory):
         for episode in range(2):
             simulator.reset(start[None])
             for step in range(60):
-                here = start if step == 0 else pose(simulator.state.cars[0])
+                here = start if step == 0 else poses_of(simulator.state.cars[0])
                 action = int(rng.choice([0, 0, 1, 2, 3, 4, 5, 6, 7]))
                 recorder.write(step, here, action, episode)
                 poses.append(here)

@@ -81,7 +81,7 @@ def test_every_pixel_is_road_where_the_map_has_road(scenario):
 
 def test_car_covers_its_own_outline(scenario, state):
     car, _ = state
-    renderer = Renderer(scenario, (640, 480), metres=30.0)
+    renderer = Renderer(scenario, (1280, 960))
     without = renderer.draw(car_at(car[X] + 100.0, car[Y], 0.0))  # moves the view; drawn again below with the car
     image = renderer.draw(car)
     assert (image != without).any()
@@ -137,8 +137,7 @@ def test_rays_end_where_the_ranges_say(scenario, state):
 
 def test_grid_is_drawn_ahead_with_left_on_the_left(scenario, state):
     car, _ = state
-    renderer = Renderer(scenario, (640, 480), metres=60.0)
-    plain = renderer.draw(car)
+    renderer = Renderer(scenario, (640, 480))
     grid = np.full((80, 80), 127, dtype=np.uint8)
     grid[40, 10] = 255  # 19.75 m ahead of the front axle, 14.75 m to the left
     image = renderer.draw(car, grid=grid)
@@ -147,10 +146,9 @@ def test_grid_is_drawn_ahead_with_left_on_the_left(scenario, state):
     row, column = np.unravel_index(car_free.argmax(), car_free.shape)
     assert 480 * render.CAR_AT - row == pytest.approx((1.25 + 19.75) * renderer.pixels_per_m, abs=4)
     assert 320 - column == pytest.approx(14.75 * renderer.pixels_per_m, abs=4)
-    assert (image[:10] == plain[:10]).all()  # beyond 41 m there is no grid
 
 
-def test_path_text_and_map_view(scenario, state):
+def test_path_and_text(scenario, state):
     car, _ = state
     renderer = Renderer(scenario, (640, 480))
     path = np.array([car[[X, Y]] - k * 0.5 * car[[COS, SIN]] for k in range(16)])
@@ -160,11 +158,6 @@ def test_path_text_and_map_view(scenario, state):
     assert distance(plain[behind, 318:322], paint.PATH).min() > 60
     assert (image[450:, 16:120].max(axis=-1) > 230).sum() > 40  # bright letters
     assert (image[6:40, 16:120].max(axis=-1) > 230).sum() > 40
-    whole = Renderer(scenario, (256, 256), follow=False)
-    image = whole.draw(car)
-    row, column = np.nonzero(distance(image, paint.EGO) < 60)
-    assert column.mean() == pytest.approx(car[X] * whole.pixels_per_m, abs=2.5)
-    assert 256 - row.mean() == pytest.approx(car[Y] * whole.pixels_per_m, abs=2.5)
 
 
 def test_view_repeats_over_the_torus(scenario):
@@ -204,15 +197,6 @@ def test_between_goes_over_the_seam_and_keeps_the_heading_a_unit(scenario):
     assert np.hypot(half[SIN], half[COS]) == pytest.approx(1.0, abs=1e-6)
     assert half[SPEED] == pytest.approx(2.0)
     assert interpolate(a, b, 0.0, scenario) == pytest.approx(a)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [({"size": (8, 480)}, "pixels"), ({"metres": 0.0}, "metres"), ({"metres": float("nan")}, "metres")],
-)
-def test_wrong_numbers_are_one_line(scenario, arguments, expected):
-    with pytest.raises(ValueError, match=expected):
-        Renderer(scenario, **arguments)
 
 
 WINDOW = "from gridsim.view.render import NoDisplayError, Window\ntry:\n    Window((320, 240))\n    print('open')\n" + (
