@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -38,8 +39,8 @@ class ExactRoad:
         self.lines = np.array(strips.lines, dtype=np.float64).reshape(-1, 5)
         self.arcs = np.array(pieces, dtype=np.float64).reshape(-1, 6)
         self.blocks = np.array(strips.blocks, dtype=np.float64).reshape(-1, 5)
-        self._bounds: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
+    @cached_property
     def _boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Bounding boxes of lines, arcs and blocks, [4, n]: x from, x to, y from, y to."""
         lines, arcs = self.lines, self.arcs
@@ -58,22 +59,17 @@ class ExactRoad:
 
     def _near(self, x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lines, arcs and blocks, with their repetitions over the torus, that may come within `radius` of a point."""
-        if self._bounds is None:
-            self._bounds = self._boxes()
-        found_lines: list[np.ndarray] = []
-        found_arcs: list[np.ndarray] = []
-        found_blocks: list[np.ndarray] = []
+        found: tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]] = ([], [], [])
         for dx in self._shifts(x, radius, self.width):
             for dy in self._shifts(y, radius, self.height):
-                for items, box, found, shift in (
-                    (self.lines, self._bounds[0], found_lines, [dx, dy, dx, dy, 0.0]),
-                    (self.arcs, self._bounds[1], found_arcs, [dx, dy, 0.0, 0.0, 0.0, 0.0]),
-                    (self.blocks, self._bounds[2], found_blocks, [dx, dy, 0.0, 0.0, 0.0]),
-                ):
+                moved = ([dx, dy, dx, dy, 0.0], [dx, dy, 0.0, 0.0, 0.0, 0.0], [dx, dy, 0.0, 0.0, 0.0])
+                kinds = (self.lines, self.arcs, self.blocks)
+                for items, box, shift, near in zip(kinds, self._boxes, moved, found, strict=True):
                     away_x = np.maximum(np.maximum(box[0] + dx - x, x - box[1] - dx), 0.0)
                     away_y = np.maximum(np.maximum(box[2] + dy - y, y - box[3] - dy), 0.0)
-                    found.append(items[away_x**2 + away_y**2 <= radius**2] + shift)
-        return np.concatenate(found_lines), np.concatenate(found_arcs), np.concatenate(found_blocks)
+                    near.append(items[away_x**2 + away_y**2 <= radius**2] + shift)
+        lines, arcs, blocks = map(np.concatenate, found)
+        return lines, arcs, blocks
 
     def _shifts(self, at: float, radius: float, side: float) -> Iterator[float]:
         if not self.torus:
@@ -85,13 +81,9 @@ class ExactRoad:
 
     def _groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
         """Yield indices of points that lie together, and the middle of their square."""
-        square = np.floor(points / GROUP)
-        key = square[:, 0] * 1e6 + square[:, 1]
-        order = np.argsort(key, kind="stable")
-        for chosen in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
-            if len(chosen):
-                x, y = (square[chosen[0]] + 0.5) * GROUP
-                yield chosen, float(x), float(y)
+        squares, of = np.unique(np.floor(points / GROUP), axis=0, return_inverse=True)
+        for k, (x, y) in enumerate((squares + 0.5) * GROUP):
+            yield np.flatnonzero(of == k), float(x), float(y)
 
     def clearance(self, points: np.ndarray, deepest: float = 3.0) -> np.ndarray:
         """Greatest (half width - distance to the centre line) at points [n, 2], in m, or the distance to the nearest
@@ -103,26 +95,22 @@ class ExactRoad:
             far = max(deepest, self.lines[:, 4].max(initial=0.0), self.arcs[:, 5].max(initial=0.0))
             lines, arcs, blocks = self._near(x, y, far + GROUP * math.sqrt(0.5))
             p = points[chosen, None, :]
-            best = [np.full(len(chosen), -deepest)]
-            if len(lines):
-                a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4]
-                along = np.einsum("nki,ki->nk", p - a, b - a) / np.maximum(((b - a) ** 2).sum(axis=1), 1e-300)
-                nearest = a + np.clip(along, 0.0, 1.0)[..., None] * (b - a)
-                best.append((w - np.linalg.norm(p - nearest, axis=2)).max(axis=1))
-            if len(arcs):
-                centre, radius, first, sweep, w = arcs[:, 0:2], arcs[:, 2], arcs[:, 3], arcs[:, 4], arcs[:, 5]
-                q = p - centre
-                # The nearest point of an arc has the angle of the point, or that of the nearer end.
-                beyond = (np.arctan2(q[..., 1], q[..., 0]) - first) % (2 * np.pi)
-                after_end = beyond - sweep
-                angle = np.where(after_end <= 0, beyond, np.where(after_end < 2 * np.pi - beyond, sweep, 0.0)) + first
-                nearest = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-                best.append((w - np.linalg.norm(q - nearest, axis=2)).max(axis=1))
-            result[chosen] = np.max(best, axis=0)
-            if len(blocks):
-                beyond = np.abs(_in_frame(p - blocks[:, 0:2], blocks[:, 2])) - blocks[:, 3:5]
-                signed = np.linalg.norm(np.maximum(beyond, 0.0), axis=2) + np.minimum(beyond.max(axis=2), 0.0)
-                result[chosen] = np.maximum(np.minimum(result[chosen], signed.min(axis=1)), -deepest)
+            a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4]
+            along = np.vecdot(p - a, b - a) / np.maximum(((b - a) ** 2).sum(axis=1), 1e-300)
+            nearest = a + np.clip(along, 0.0, 1.0)[..., None] * (b - a)
+            to_lines = w - np.linalg.norm(p - nearest, axis=2)
+            centre, radius, first, sweep, w = arcs[:, 0:2], arcs[:, 2], arcs[:, 3], arcs[:, 4], arcs[:, 5]
+            q = p - centre
+            # The nearest point of an arc has the angle of the point, or that of the nearer end.
+            beyond = (np.arctan2(q[..., 1], q[..., 0]) - first) % (2 * np.pi)
+            after_end = beyond - sweep
+            angle = np.where(after_end <= 0, beyond, np.where(after_end < 2 * np.pi - beyond, sweep, 0.0)) + first
+            nearest = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            to_arcs = w - np.linalg.norm(q - nearest, axis=2)
+            beyond = np.abs(_in_frame(p - blocks[:, 0:2], blocks[:, 2])) - blocks[:, 3:5]
+            to_blocks = np.linalg.norm(np.maximum(beyond, 0.0), axis=2) + np.minimum(beyond.max(axis=2), 0.0)
+            on_strips = np.concatenate([to_lines, to_arcs], axis=1).max(axis=1, initial=-deepest)
+            result[chosen] = np.maximum(np.minimum(on_strips, to_blocks.min(axis=1, initial=np.inf)), -deepest)
         return result
 
     def cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:
@@ -143,30 +131,18 @@ class ExactRoad:
             lines, arcs, blocks = self._near(x, y, reach + GROUP * math.sqrt(0.5))
             p, d = origins[chosen, None, :], np.stack([np.cos(angles[chosen]), np.sin(angles[chosen])], axis=-1)
             d = d[:, None, :]
-            inside = []
-            if len(lines):
-                inside.append(_in_capsule(p, d, lines))
-            if len(arcs):
-                inside += _in_annular_sector(p, d, arcs)
-            if not inside:
-                continue
-            low = np.concatenate([i[0] for i in inside], axis=1)
-            high = np.concatenate([i[1] for i in inside], axis=1)
+            inside = [_in_capsule(p, d, lines), *_in_annular_sector(p, d, arcs)]
+            low, high = (np.concatenate(ends, axis=1) for ends in zip(*inside, strict=True))
             # Within the union as long as some strip that was entered before is not left yet.
-            t = np.zeros(len(chosen))
-            while True:
-                further = np.where(low <= t[:, None] + 1e-9, high, 0.0).max(axis=1)
-                further = np.maximum(further, t)
-                if (further <= t + 1e-9).all():
-                    break
-                t = further
-            if len(blocks):
-                q, e = _in_frame(p - blocks[:, 0:2], blocks[:, 2]), _in_frame(d, blocks[:, 2])
-                half = blocks[:, 3:5]
-                enter, leave = _meet(*(_between(q[..., k], e[..., k], -half[:, k], half[:, k]) for k in (0, 1)))
-                hit = np.where(leave > 0.0, np.maximum(enter, 0.0), np.inf)
-                t = np.minimum(t, hit.min(axis=1))
-            result[chosen] = np.minimum(t, reach)
+            before, t = np.full(len(chosen), -1.0), np.zeros(len(chosen))
+            while (t > before + 1e-9).any():
+                before = t
+                t = np.maximum(t, np.where(low <= t[:, None] + 1e-9, high, 0.0).max(axis=1, initial=0.0))
+            q, e = _in_frame(p - blocks[:, 0:2], blocks[:, 2]), _in_frame(d, blocks[:, 2])
+            half = blocks[:, 3:5]
+            enter, leave = _meet(*(_between(q[..., k], e[..., k], -half[:, k], half[:, k]) for k in (0, 1)))
+            hit = np.where(leave > 0.0, np.maximum(enter, 0.0), np.inf)
+            result[chosen] = np.minimum(t, hit.min(axis=1, initial=reach))
         return result
 
     def outline_on_road(self, poses: np.ndarray, half_length: float, half_width: float) -> np.ndarray:
@@ -175,17 +151,11 @@ class ExactRoad:
         Each side is a ray from one corner to the next: the outline is on the road if all four arrive.
         """
         poses = np.asarray(poses, dtype=np.float64)
-        x, y, heading = poses.T
-        on = np.ones(len(poses), dtype=bool)
-        turn = 0.0
-        for along, across in ((-1, -1), (1, -1), (1, 1), (-1, 1)):  # counter-clockwise, from the rear right
-            u, v = along * half_length, across * half_width
-            corner = np.stack(
-                [x + u * np.cos(heading) - v * np.sin(heading), y + u * np.sin(heading) + v * np.cos(heading)], axis=1
-            )
-            side = 2 * (half_length if along == across else half_width)
-            on &= self.cast(corner, (heading + turn)[:, None], side)[:, 0] >= side - 1e-7
-            turn += math.pi / 2
+        on, corner = np.ones(len(poses), dtype=bool), _outline(poses, half_length, half_width)
+        for k in range(4):  # counter-clockwise, from the front right
+            side = 2 * (half_width, half_length)[k % 2]
+            angle = poses[:, 2] + (k + 1) * math.pi / 2
+            on &= self.cast(corner[:, k], angle[:, None], side)[:, 0] >= side - 1e-7
         return on
 
     def widened(self, margin: float) -> ExactRoad:
@@ -204,10 +174,6 @@ def _in_frame(vectors: np.ndarray, heading: np.ndarray) -> np.ndarray:
     return np.stack([x * c + y * s, y * c - x * s], axis=-1)
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
-
-
 def _between(p: np.ndarray, d: np.ndarray, low: float | np.ndarray, high: float | np.ndarray) -> tuple:
     """Where low <= p + t d <= high: t from, t to; (inf, -inf) where nowhere."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -221,8 +187,8 @@ def _between(p: np.ndarray, d: np.ndarray, low: float | np.ndarray, high: float 
 
 def _in_disc(p: np.ndarray, d: np.ndarray, radius: np.ndarray) -> tuple:
     """Where |p + t d| <= radius, for unit vectors d."""
-    b = _dot(p, d)
-    root = b * b - _dot(p, p) + np.where(radius > 0, radius, 0.0) ** 2
+    b = np.vecdot(p, d)
+    root = b * b - np.vecdot(p, p) + np.where(radius > 0, radius, 0.0) ** 2
     hit = (root >= 0) & (radius > 0)
     root = np.sqrt(np.maximum(root, 0.0))
     return np.where(hit, -b - root, np.inf), np.where(hit, -b + root, -np.inf)
@@ -243,8 +209,8 @@ def _in_capsule(p: np.ndarray, d: np.ndarray, lines: np.ndarray) -> tuple:
     v = np.stack([-u[:, 1], u[:, 0]], axis=1)
     q = p - a
     box = _meet(
-        _between(_dot(q, u), _dot(d, u), 0.0, length),
-        _between(_dot(q, v), _dot(d, v), -w, w),
+        _between(np.vecdot(q, u), np.vecdot(d, u), 0.0, length),
+        _between(np.vecdot(q, v), np.vecdot(d, v), -w, w),
     )
     parts = (box, _in_disc(q, d, w), _in_disc(p - b, d, w))
     return np.minimum.reduce([i[0] for i in parts]), np.maximum.reduce([i[1] for i in parts])
@@ -258,8 +224,8 @@ def _in_annular_sector(p: np.ndarray, d: np.ndarray, arcs: np.ndarray) -> list[t
     e1 = np.stack([np.cos(last), np.sin(last)], axis=1)
     n0, n1 = np.stack([-e0[:, 1], e0[:, 0]], axis=1), np.stack([e1[:, 1], -e1[:, 0]], axis=1)
     sector = _meet(
-        _between(_dot(q, n0), _dot(d, n0), 0.0, np.inf),
-        _between(_dot(q, n1), _dot(d, n1), 0.0, np.inf),
+        _between(np.vecdot(q, n0), np.vecdot(d, n0), 0.0, np.inf),
+        _between(np.vecdot(q, n1), np.vecdot(d, n1), 0.0, np.inf),
     )
     outer = _meet(sector, _in_disc(q, d, radius + w))
     hole = _in_disc(q, d, radius - w)
@@ -464,7 +430,11 @@ def drive(
 
 def corners(config: SimConfig, poses: np.ndarray, margin: float = 0.0) -> np.ndarray:
     """Corners [n, 4, 2], counter-clockwise, of cars at poses [n, 3] (x, y, heading), a margin (m) larger all round."""
-    a, b = config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin
+    return _outline(poses, config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin)
+
+
+def _outline(poses: np.ndarray, a: float, b: float) -> np.ndarray:
+    """Corners [n, 4, 2] of rectangles of half lengths a and half widths b (m)."""
     own = np.array([[a, -b], [a, b], [-a, b], [-a, -b]])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
