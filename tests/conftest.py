@@ -7,7 +7,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sysconfig
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -34,8 +33,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No deadline: an example that comes first may compile a kernel. CI's examples are the same in every run.
 settings.register_profile("gridsim", settings.get_profile("ci" if os.environ.get("CI") else "default"), deadline=None)
 settings.load_profile("gridsim")
-
-Command = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture(autouse=True)
@@ -100,27 +97,6 @@ def maps() -> dict[str, list[Map]]:
 def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows that nobody sees."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
-@pytest.fixture
-def command(tmp_path: Path) -> Command:
-    """Run an installed console script in the test's empty folder: `command("gridsim-evolve", "--seed", 1)`.
-
-    Keywords but `timeout_s` are set in its environment. Nothing is asserted of how it ends.
-    """
-
-    def run(name: str, *arguments: object, timeout_s: float = 300, **environment: str) -> subprocess.CompletedProcess:
-        return subprocess.run(
-            [Path(sysconfig.get_path("scripts")) / name, *map(str, arguments)],
-            cwd=tmp_path,
-            env={**os.environ, **environment},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=timeout_s,
-        )
-
-    return run
 
 
 @pytest.fixture

@@ -26,6 +26,8 @@ from packaging.utils import canonicalize_name
 from cluster.commands import cli, common
 from cluster.runs.settings import DqnSettings, EvolveSettings
 from cluster.workers.kernels import everything_by_default
+from cluster.workers.pool import PoolError
+from cluster.workers.ray_session import check_address
 from gridsim.maps.scenarios import REGISTRY
 
 ROOT = Path(__file__).parents[1]
@@ -245,7 +247,9 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 
 @pytest.mark.e2e
-def test_the_services_come_up_and_a_run_is_evolved_on_them_and_tracked(services: Services) -> None:
+def test_the_services_come_up_and_a_run_is_evolved_on_them_and_tracked(
+    services: Services, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`docker compose up`, and the guide's `exec head gridsim-evolve`, with processes in place of containers."""
     services.start("mlflow")
     services.start("head")
@@ -263,8 +267,10 @@ def test_the_services_come_up_and_a_run_is_evolved_on_them_and_tracked(services:
     summary = json.loads((services.folder / "runs/composed/summary.json").read_text())
     assert summary["workers"] == 1
     assert summary["mlflow_run_id"], "the server has it"
-    refused = finish(
-        "gridsim-evolve", "--address", address, "--workers", "1", "--name", "refused", cwd=services.folder,
-        **{**environment, "RAY_AUTH_TOKEN": "f" * 64},
-    )  # fmt: skip
-    assert refused.returncode != 0, "with another token nobody is let in"
+    with pytest.raises(
+        PoolError, match=rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
+    ):
+        check_address(address)
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", TOKEN)
+    assert check_address(address) == address

@@ -108,13 +108,23 @@ SMALL = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds"
 
 
 @pytest.mark.e2e
-def test_a_killed_comparison_goes_on_without_repeating_what_is_finished(tmp_path):
+def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_what_is_finished(tmp_path):
     folder = tmp_path / "runs" / "c"
     first, second = folder / "curved-evolution-s0", folder / "curved-random-s0"
-    process = start("gridsim-compare", *SMALL, "--budget", "100M", "--generations", "3", cwd=tmp_path)
-    wait_until(lambda: second.exists() or process.poll() is not None, 240)
-    process.kill()
-    assert process.communicate()
+    process = start("gridsim-compare", *SMALL, "--budget", "1h", "--generations", "3", cwd=tmp_path)
+    try:
+        wait_until(lambda: second.exists() or process.poll() is not None, 240)
+        process.send_signal(signal.SIGINT)
+        errors = process.communicate(timeout=120)[1]
+        assert process.returncode == 130, errors
+        assert "gridsim-compare --resume runs/c" in errors
+        assert "| curved | random search | missing |" in (folder / "table.md").read_text()
+        assert "| curved | evolution | 1 |" in (folder / "table.md").read_text()
+        process = start("gridsim-compare", "--resume", "runs/c", "--workers", "0", cwd=tmp_path)
+        wait_until(lambda: (second / "checkpoint.npz").exists() or process.poll() is not None, 240)
+    finally:
+        process.kill()
+        process.communicate()
     before = {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.rglob("*") if path.is_file()}
     assert "summary.json" in before
 
@@ -135,19 +145,3 @@ def test_a_killed_comparison_goes_on_without_repeating_what_is_finished(tmp_path
     assert all(found[path.name].data.tags["mlflow.parentRunId"] == parent for path in (first, second))
     assert found["c"].info.status == "FINISHED"
     assert found["c"].data.metrics["runs_done"] == 2
-
-
-@pytest.mark.e2e
-def test_ctrl_c_keeps_what_is_done(tmp_path):
-    process = start("gridsim-compare", *SMALL, "--budget", "1h", "--generations", "2", cwd=tmp_path)
-    folder = tmp_path / "runs" / "c"
-    try:
-        wait_until(lambda: (folder / "curved-random-s0").exists() or process.poll() is not None, 240)
-        process.send_signal(signal.SIGINT)
-        errors = process.communicate(timeout=120)[1]
-    finally:
-        process.kill()
-    assert process.returncode == 130, errors
-    assert "gridsim-compare --resume runs/c" in errors
-    assert "| curved | random search | missing |" in (folder / "table.md").read_text()
-    assert "| curved | evolution | 1 |" in (folder / "table.md").read_text()

@@ -1,12 +1,10 @@
 """The DQN's loop in this process: when it learns, converges, diverges and ends, and what it refuses."""
 
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cluster.commands.cli import DqnFlags, dqn_main
 from cluster.runs.settings import DqnSettings, SettingsError
 from cluster.training import dqn as dqn_loop
 from cluster.training.dqn import Dqn
@@ -139,14 +137,6 @@ def test_settings_that_no_run_can_have(changes, words):
 @pytest.mark.parametrize("observation", ["rays", "grid"])
 def test_the_default_replay_fits_a_checkpoint(observation):
     DqnSettings(observation=observation).check()
-
-
-@pytest.mark.parametrize("flag", DqnFlags.removed)
-def test_a_removed_flag_is_refused_with_the_reason(flag, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["gridsim-dqn", flag])
-    with pytest.raises(SystemExit, match="2"):
-        dqn_main()
-    assert capsys.readouterr().err.startswith(f"gridsim-dqn: error: {flag} was removed: {DqnFlags.removed[flag]}\n")
 
 
 class Losing(SerialPool):

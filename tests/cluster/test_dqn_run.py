@@ -9,10 +9,9 @@ import time
 
 import numpy as np
 import pytest
-import torch
 from commands import BIN, finish, ray_workers, rows, start, summary, wait_until
 
-from cluster.runs.checkpoint import load, save
+from cluster.runs.checkpoint import load
 
 SMALL = [
     *("--scenario", "curved", "--traffic", "2", "--policy", "mlp:12", "--seed", "5"),
@@ -47,39 +46,32 @@ def same(run, reference):
     return True
 
 
-def test_killed_workers_and_a_killed_process_change_nothing(reference, tmp_path):
+def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, tmp_path):
     run = tmp_path / "runs/k"
     process = start("gridsim-dqn", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)
     try:
         wait_until(lambda: (run / "history.csv").exists() and len(rows(run)) >= 1)
-        victims = ray_workers(process.pid)
-        os.kill(victims[0], signal.SIGKILL)
-        wait_until(lambda: len(rows(run)) >= 3)
+        os.kill(ray_workers(process.pid)[0], signal.SIGKILL)
+        wait_until(lambda: len(rows(run)) >= 2)
+        time.sleep(0.3)  # in the midst of an evaluation's updates
+        os.kill(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 130
+        assert f"continue with: {BIN}/gridsim-dqn --resume runs/k" in err
+        assert "replay_actions" in load(run / "checkpoint.npz")[0]
+        saved = len(rows(run))
+        process = start("gridsim-dqn", "--resume", "runs/k", "--workers", "1", cwd=tmp_path)
+        wait_until(lambda: len(rows(run)) > saved)
     finally:
         os.kill(process.pid, signal.SIGKILL)
         process.communicate()
     assert not (run / "summary.json").exists()
-    done = dqn("--resume", str(run), "--workers", "1", cwd=tmp_path)
+    done = dqn("--resume", str(run), "--workers", "0", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert same(run, reference)
     again = dqn("--resume", str(run), cwd=tmp_path)
     assert (again.returncode, again.stderr) == (0, "")
     assert "is finished" in again.stdout
-
-
-def test_ctrl_c_saves(reference, tmp_path):
-    run = tmp_path / "runs/c"
-    process = start("gridsim-dqn", "--workers", "1", "--name", "c", *SMALL, cwd=tmp_path)
-    wait_until(lambda: (run / "history.csv").exists() and len(rows(run)) >= 2)
-    time.sleep(0.3)
-    os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert f"continue with: {BIN}/gridsim-dqn --resume runs/c" in err
-    assert "replay_actions" in load(run / "checkpoint.npz")[0]
-    done = dqn("--resume", "runs/c", "--workers", "0", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert same(run, reference)
 
 
 def test_run_keeps_the_contracts(reference):
@@ -102,6 +94,9 @@ def test_run_keeps_the_contracts(reference):
         history = client.get_metric_history(found["mlflow_run_id"], name)
         assert [m.step for m in history] == list(range(found["evaluations"]))
     assert logged.data.params["discount"]
+    done = finish("gridsim-evaluate", str(reference), "--json", cwd=reference.parent)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == found["held_out"]
 
 
 def test_an_ended_run_keeps_no_replay_and_can_be_extended(reference, tmp_path):
@@ -111,37 +106,10 @@ def test_an_ended_run_keeps_no_replay_and_can_be_extended(reference, tmp_path):
     assert not [name for name in load(reference / "checkpoint.npz")[0] if name.startswith("replay_")]
     run = tmp_path / "runs/ref"
     shutil.copytree(reference, run)
-    done = dqn("--resume", "runs/ref", "--workers", "0", "--car-steps", "500000", cwd=tmp_path)
+    done = dqn("--resume", "runs/ref", "--workers", "0", "--car-steps", "400000", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    assert summary(run)["car_steps"] >= 500_000
+    assert summary(run)["car_steps"] >= 400_000
     assert summary(run)["updates"] > summary(reference)["updates"]
-
-
-def test_the_champion_is_one_like_any_other(reference):
-    done = finish("gridsim-evaluate", str(reference), "--json", cwd=reference.parent)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == summary(reference)["held_out"]
-
-
-@pytest.mark.parametrize(
-    ("command", "flags", "words"),
-    [
-        ("gridsim-dqn", ["--resume", "ref", "--car-steps", "1000"], "--car-steps 1000 contradicts the run's"),
-        ("gridsim-dqn", ["--resume", "ref", "--discount", "0.9"], "--discount 0.9 contradicts the run's"),
-        ("gridsim-evolve", ["--resume", "ref"], "is a run of gridsim-dqn; give it to that command"),
-        ("gridsim-dqn", ["--device", "cuda"], "--device cuda"),
-        ("gridsim-dqn", ["--generations", "3"], "--generations"),
-    ],
-)
-def test_wrong_use_is_one_clear_line(reference, command, flags, words):
-    if flags == ["--device", "cuda"] and torch.cuda.is_available():
-        pytest.skip("there is such a device")
-    done = finish(command, "--workers", "0", *flags, cwd=reference.parent)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f"{command}: error: ")
-    assert words in done.stderr
-    assert len(done.stderr.splitlines()) <= 3
-    assert [path.name for path in reference.parent.iterdir()] == ["ref"]
 
 
 def test_a_run_that_diverges_says_so(tmp_path):
@@ -149,12 +117,3 @@ def test_a_run_that_diverges_says_so(tmp_path):
     assert done.returncode == 1
     assert re.fullmatch(r"gridsim-dqn: error: the Q network diverged at update \d+: [^\n]*\n", done.stderr)
     assert not (tmp_path / "runs").exists()
-
-
-def test_a_champion_without_numbers_is_no_start(reference, tmp_path):
-    arrays, meta = load(reference / "champion.npz")
-    arrays["genome"][7] = np.nan
-    save(tmp_path / "c.npz", arrays, meta)
-    done = dqn("--init", "c.npz", *SMALL, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("gridsim-dqn: error: --init c.npz: some of its genes are no numbers")

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import BIN, all_in_mlflow, end, finish, importable, ray_workers, rows, start, summary, wait_until
+from commands import BIN, all_in_mlflow, answers, end, finish, importable, ray_workers, rows, start, summary, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
 from cluster.runs.settings import EvolveSettings
@@ -33,7 +33,8 @@ from gridsim.maps.map import Map
 pytestmark = pytest.mark.e2e
 
 LONG_S = 300.0  # what takes seconds where nothing else runs
-KILLS = int(os.environ.get("GRIDSIM_KILLS", "3"))
+PATIENCE_S = 25  # a host takes ten to come up
+KILLS = int(os.environ.get("GRIDSIM_KILLS", "2"))
 ROAD = ["--scenario", "curved", "--traffic", "2"]
 SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5"]
 
@@ -103,7 +104,7 @@ def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
     asked = Evolution(settings, SerialPool(maps.build), maps).search.ask()
     who = asked.key, int(asked.recipes["seed"][4])
     found = []
-    for workers in (0, 1, 2):
+    for workers in (0, 2):
         pool = (
             RayPool(workers, maps.build, worker_factory=functools.partial(Deadly, *who))
             if workers
@@ -121,7 +122,7 @@ def test_a_member_that_always_kills_is_lost_and_the_run_goes_on() -> None:
             assert evolution.lost_chunks == len(warned) == 1
             assert warned[0].startswith("generation 0, evolve: member 4 (new of rows 0 and 0, seed ")
     maps.close()
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]
 
 
 class Stopping(Answering):
@@ -169,12 +170,12 @@ def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> No
     wait_until(lambda: not psutil.pid_exists(pid), 30)
 
 
-def test_ten_workers_killed_at_random_moments_change_nothing(reference: Path, tmp_path: Path) -> None:
+def test_workers_killed_at_random_moments_change_nothing(reference: Path, tmp_path: Path) -> None:
     process = start("gridsim-evolve", "--workers", "2", "--patience", "300", "--name", "k", *SMALL, cwd=tmp_path)
     run, rng, killed = tmp_path / "runs/k", random.Random(0), 0
     try:
         wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
-        while killed < 10 and process.poll() is None:
+        while killed < 5 and process.poll() is None:
             time.sleep(rng.uniform(0.0, 0.6))
             for pid in rng.sample(victims := ray_workers(process.pid), min(len(victims), 1)):
                 with contextlib.suppress(ProcessLookupError):
@@ -200,7 +201,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     """It waits for the first host, takes in the second, goes on without the first, and is resumed without any."""
     address, _ = cluster(0)
     run = tmp_path / "runs/h"
-    arguments = ("--workers", "2", "--address", address, "--patience", "40", "--name", "h", *SMALL)
+    arguments = ("--workers", "2", "--address", address, "--patience", str(PATIENCE_S), "--name", "h", *SMALL)
     process = start("gridsim-evolve", *arguments, cwd=tmp_path)
     try:
         _, first = cluster(1, address)
@@ -215,13 +216,14 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
         end(second)
         killed = time.monotonic()
         _, err = process.communicate(timeout=LONG_S)
-        assert time.monotonic() - killed > 39, err
+        assert time.monotonic() - killed > PATIENCE_S - 1, err
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 1
+    assert answers(address), "the run left, the cluster stays"
     assert err.splitlines()[0].startswith(
-        "gridsim-evolve: error: there has been no worker for 40 s (--patience): Ray has"
+        f"gridsim-evolve: error: there has been no worker for {PATIENCE_S} s (--patience): Ray has"
     )
     assert err.splitlines()[1:] == [f"continue with: {BIN}/gridsim-evolve --resume runs/h"]
     done = finish("gridsim-evolve", "--workers", "0", "--resume", "runs/h", cwd=tmp_path)

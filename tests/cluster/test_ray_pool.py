@@ -328,27 +328,14 @@ def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
     cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, _ = cluster(2, PYTHONPATH=importable(__file__))
-    for name in (address, "auto"):
-        monkeypatch.setenv("RAY_ADDRESS", address)
-        with contextlib.closing(RayPool(4, never_built, name, worker_factory=Answering)) as pool:
-            assert pool.address == address
-            assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
-            wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2)
-            processes = [psutil.Process(pid) for pid in pool.pids()]
-        assert gone(processes) == []
-        check_address(address)
-
-
-def test_a_cluster_that_wants_a_token(
-    cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    address, _ = cluster(2, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0123456789abcdef" * 4)
-    with pytest.raises(
-        PoolError, match=rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
-    ):
-        check_address(address)
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # whose it is, Ray finds out
-    assert check_address(address) == address
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with contextlib.closing(RayPool(4, never_built, "auto", worker_factory=Answering)) as pool:
+        assert pool.address == address
+        assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
+        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2)
+        processes = [psutil.Process(pid) for pid in pool.pids()]
+    assert gone(processes) == []
+    check_address(address)
 
 
 @pytest.mark.parametrize("workers", [0, -1])

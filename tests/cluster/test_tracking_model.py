@@ -2,11 +2,8 @@
 
 import contextlib
 import dataclasses
-import io
 import os
 import sqlite3
-import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,7 +33,7 @@ def champion_model(seed=1, success_rate=0.5, policy="mlp:6,7"):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:6,7+motion+steering", "cnn:8,8,8@2"])
+@pytest.mark.parametrize("policy", ["mlp:6,7+motion+steering", "cnn:8,8,8@2"])
 def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
     import mlflow.pytorch
     from mlflow.models import Model
@@ -70,49 +67,6 @@ def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
     assert os.listdir(tmp_path) == ["model"]
 
 
-class Evil:
-    """What a pickle may hold."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (Path(self.path),)
-
-
-def poisoned(model, evil):
-    """Replace the example inputs in a model's archive by a pickle that does as it likes."""
-    record = io.BytesIO()
-    torch.save(evil, record)
-    content = {}
-    with zipfile.ZipFile(model) as archive:
-        for info in archive.infolist():
-            content[info.filename] = archive.read(info)
-    (victim,) = (name for name in content if "sample_inputs" in name)
-    content[victim] = record.getvalue()
-    with zipfile.ZipFile(model, "w", zipfile.ZIP_STORED) as archive:
-        for name, data in content.items():
-            archive.writestr(name, data)
-
-
-@pytest.mark.e2e
-def test_a_hostile_model_is_refused_where_users_load_models(tmp_path, monkeypatch):
-    """GridSim loads none; this is what its docs say of `mlflow.pytorch.load_model`, which users call."""
-    import mlflow.pytorch
-    from mlflow.exceptions import MlflowException
-
-    monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
-    write_model(tmp_path / "model", champion_model())
-    poisoned(tmp_path / "model/data/model.pt2", Evil(str(tmp_path / "touched")))
-    with pytest.raises(MlflowException, match="disallowed"):
-        mlflow.pytorch.load_model(str(tmp_path / "model"))
-    assert not (tmp_path / "touched").exists()
-    monkeypatch.delenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION")
-    with contextlib.suppress(Exception):
-        mlflow.pytorch.load_model(str(tmp_path / "model"))
-    assert (tmp_path / "touched").exists()  # so that the test knows it if the poison has lost its power
-
-
 def logged(uri, folder, model, key="the-key"):
     """A run that logs a row and a champion; returns its id and what its tracker said in the end."""
     begun = tracker(uri, 1, key=key)
@@ -122,7 +76,7 @@ def logged(uri, folder, model, key="the-key"):
 
 
 @pytest.mark.e2e
-def test_a_champion_is_registered_once(uri, tmp_path):
+def test_a_champion_is_registered_once_and_the_best_has_an_alias(uri, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     run_id, said = logged(uri, folder, champion_model(1))
@@ -141,18 +95,12 @@ def test_a_champion_is_registered_once(uri, tmp_path):
     assert logged(uri, folder, champion_model(1)) == (run_id, None)  # a killed run goes on, and ends again
     assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns == before
-    assert logged(uri, folder, champion_model(2)) == (run_id, None)  # it was extended, and has another champion
+    assert client(uri).get_model_version_by_alias(NAME, "best").version == 1
+    assert logged(uri, folder, champion_model(2, 0.75)) == (run_id, None)  # it was extended, and has a better champion
     assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {1, 2}
     assert (folder / "model/data/model.pt2").stat().st_mtime_ns != before
-
-
-@pytest.mark.e2e
-def test_the_best_version_has_an_alias(uri, tmp_path):
-    best = []
-    for seed, success_rate in enumerate((0.5, 0.75, 0.75, 0.25)):
-        assert logged(uri, tmp_path, champion_model(seed, success_rate), key=f"key-{seed}")[1] is None
-        best.append(int(client(uri).get_model_version_by_alias(NAME, "best").version))
-    assert best == [1, 2, 2, 2]
+    assert logged(uri, tmp_path, champion_model(3, 0.75), key="another")[1] is None  # no better
+    assert client(uri).get_model_version_by_alias(NAME, "best").version == 2
 
 
 def test_without_torch_everything_else_is_logged(uri, tmp_path):

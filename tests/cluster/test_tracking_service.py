@@ -42,7 +42,8 @@ def served(tmp_path_factory, empty_database):
     runs, said = {}, {}
 
     def begun(name):
-        return query(cwd / "served.db", "SELECT count(*) FROM runs WHERE name LIKE ?", f"{name}%")[0][0]
+        rows_of = "SELECT count(*) FROM metrics JOIN runs USING (run_uuid) WHERE name LIKE ?"
+        return query(cwd / "served.db", rows_of, f"{name}%")[0][0]
 
     def lines(name):
         history = cwd / "runs" / name / "history.csv"

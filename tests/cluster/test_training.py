@@ -17,7 +17,7 @@ from cluster.workers.pool import PoolError, SerialPool
 from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
-from evolution.search.breeding import RECIPE, Kind, breed
+from evolution.search.breeding import Kind, breed
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 from gridsim.car.ego import End
@@ -129,15 +129,6 @@ def test_a_search_is_what_was_asked_for(maps):
         assert evolution.search.seed == settings.seed
 
 
-def test_a_run_may_begin_with_a_champion(maps):
-    genome = np.random.default_rng(3).normal(size=GENES).astype(np.float32)
-    for settings in (SETTINGS, TWO):
-        evolution = Evolution(settings, SerialPool(maps.build), maps, genome)
-        go_on(evolution)
-        assert evolution.elites[0].tobytes() == genome.tobytes()
-        assert np.isfinite(list(evolution.history[0].values())).all()
-
-
 def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     arrays, _ = load(halfway)
     worlds = arrays["crash_worlds"]
@@ -220,15 +211,6 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert evolution.champion.success_rate == (validation.results["end"] == End.SUCCESS).mean()
     assert outcome.whole()
     tell(score)
-
-
-def test_the_elite_of_a_generation_is_the_centre_before_it(maps):
-    evolution = begin(maps)
-    go_on(evolution)
-    for _ in range(2):
-        centre = evolution.search.centre.astype(np.float32)
-        go_on(evolution)
-        assert evolution.elites[-1].tobytes() == centre.tobytes()
 
 
 def test_a_candidate_is_validated_when_the_leader_does_well(maps):
@@ -392,32 +374,6 @@ def test_a_candidate_lost_in_validation_is_no_champion(maps):
     assert evolution.champion is None
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("settings", [SETTINGS, TWO], ids=["all", "two"])
-def test_a_fitness_that_is_no_number_loses(maps, settings, bad):
-    def some(results, target):
-        score = results["distance"].sum(axis=1).astype(float)
-        if len(score) > 1:
-            score[: len(score) // 2] = bad
-        return score
-
-    evolution = begin(maps, settings)
-    evolution.score = some
-    go_on(evolution)
-    bred = breed_first(maps, settings)
-    assert evolution.elites[0].tobytes() in {genome.tobytes() for genome in bred[16:]}
-    assert np.isfinite(list(evolution.history[0].values())).all()
-    go_on(evolution)
-    assert np.isfinite(list(evolution.history[1].values())).all()
-
-
-def breed_first(maps, settings):
-    """The members of a run's first generation."""
-    search = begin(maps, settings).search
-    assert search.ask().recipes.dtype == RECIPE
-    return search.genomes(np.arange(settings.population))
-
-
 def test_a_fitness_that_never_is_a_number_does_not_end_a_run(maps):
     evolution = begin(maps)
     evolution.score = lambda results, target: np.full(len(results), np.nan)
@@ -426,19 +382,3 @@ def test_a_fitness_that_never_is_a_number_does_not_end_a_run(maps):
     assert [row["fitness/mean"] for row in evolution.history] == [-1.0, -1.0]
     resumed = begin(maps)
     resumed.restore(*evolution.state())
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        lambda results, target: results["distance"],
-        lambda results, target: results["distance"].sum(axis=1)[:-1],
-        lambda results, target: 1.0,
-        lambda results, target: results["distance"].sum(axis=1)[:, None],
-    ],
-)
-def test_a_fitness_of_another_shape_is_refused_in_one_line(maps, wrong):
-    evolution = begin(maps)
-    evolution.score = wrong
-    with pytest.raises(ValueError, match=r"^a fitness returns one number a member, \[32\], not [^\n]*$"):
-        evolution.step()

@@ -234,26 +234,6 @@ def test_a_network_without_numbers_leaves_whole_rows(scenarios: list[Map], drive
     assert (results["distance"] == 0.0).all()
 
 
-def test_a_network_that_loses_its_numbers_on_the_way(scenarios: list[Map], driver: np.ndarray) -> None:
-    """Speeding up until 5 m/s, where infinities meet: the episode ends IDLE there, in its last step's row too."""
-    spec = MlpSpec((2,))
-    weights = np.zeros(spec.size, dtype=F)
-    hidden, outputs = weights[:66], weights[66:]
-    hidden[2 * 31] = 10.0  # the speed to the first unit, which is above 0 from 5 m/s on
-    hidden[64:] = 5.0, 1.0
-    outputs[1], outputs[8 + 1], outputs[16] = math.inf, -math.inf, 1.0  # of the second action, and of the first
-    of = asked("mlp:2", scenarios, driver, 8, 0.0, 0)._replace(spec=spec, weights=weights)
-    experience, results = collect(*of)
-    wanted, _, _ = evaluate(spec, weights[None], scenarios, of.episodes, LIMITS, CONFIG)
-    assert results.tobytes() == wanted[0].tobytes()
-    lost = [(x, r) for x, r in zip(cut_up(experience), results, strict=True) if r["end"] == End.IDLE]
-    assert len(lost) > 3
-    for episode, result in lost:
-        assert result["steps"] == 17
-        assert episode.actions.tolist() == [0] * 17 + [NO_ACTION]
-        assert episode.ends.tolist() == [0] * 16 + [End.IDLE, 0]
-
-
 # --- Exploring -------------------------------------------------------------------------------------------------------
 
 

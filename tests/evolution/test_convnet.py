@@ -8,14 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evolution.episodes.rollout import Limits, evaluate, trajectory
-from evolution.episodes.starts import lane_starts
 from evolution.networks import convnet
-from evolution.networks.dense import plain_tile, vector_tile
 from evolution.networks.policy import CnnSpec, PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation, breed
-from gridsim.config import SensorConfig, SimConfig
-from gridsim.maps.scenarios import build
+from gridsim.config import SimConfig
 from gridsim.sensing.grid import grid_table, grids, push_frames
 
 torch = pytest.importorskip("torch")
@@ -100,39 +96,6 @@ def test_forward_is_pytorchs(text):
         assert decide(genome, spec.layers, F(speed), room) == int(seen.argmax())
 
 
-@pytest.mark.parametrize(
-    ("positions", "lanes", "chains"),
-    [(10, 8, 1), (8, 16, 1), (1, 8, 1), (1, 32, 1), (1, 64, 1), (1, 16, 2), (1, 8, 4), (3, 8, 3)],
-)
-@pytest.mark.parametrize("rectify", [False, True])
-def test_vector_code_is_the_plain_tile(positions, lanes, chains, rectify):
-    plain, vector = (make(positions, lanes, rectify, chains) for make in (plain_tile, vector_tile))
-
-    @numba.njit
-    def compiled(x, run, w, y):
-        vector(x, 3, 2, 2, 50, 3, 11, run, w, 1, lanes + 4, 2, y, 6, lanes + 1)
-
-    rng = np.random.default_rng(3)
-    x, w = rng.normal(size=300).astype(F), rng.normal(size=2 + 55 * (lanes + 4)).astype(F)
-    for run in (0, 1, 3, 4, 9):
-        wanted, seen = (np.full(20 + positions * (lanes + 1), 7.0, dtype=F) for _ in range(2))
-        plain(x, 3, 2, 2, 50, 3, 11, run, w, 1, lanes + 4, 2, wanted, 6, lanes + 1)
-        compiled(x, run, w, seen)
-        assert seen == pytest.approx(wanted, abs=1e-4)
-        assert (seen == 0).any() == rectify
-    x[4] = math.nan
-    compiled(x, 9, w, seen)
-    assert np.isnan(seen).any()
-
-
-@pytest.mark.parametrize("chains", [1, 4])
-def test_a_tile_of_one_run_is_a_dense_layer(chains):
-    rng = np.random.default_rng(3)
-    x, w, y = rng.normal(size=7).astype(F), rng.normal(size=(8, 16)).astype(F), np.zeros(16, dtype=F)
-    plain_tile(1, 16, False, chains)(x, 0, 0, 1, 0, 1, 0, 7, w.ravel(), 16, 16, 0, y, 0, 0)
-    assert y == pytest.approx(w[0] + x @ w[1:].astype(float), abs=2e-5)
-
-
 def test_a_gene_that_is_not_a_number_is_no_action():
     """Also a weight whose input is exactly 0, from a rectified unit."""
     spec, rng = cnn("cnn:8,8,16@1"), np.random.default_rng(4)
@@ -160,21 +123,6 @@ def test_frames_are_the_last_ones_newest_last(begins):
 
 
 # --- In the rollout --------------------------------------------------------------------------------------------------
-
-
-def test_a_rewound_state_is_on_the_way_for_any_number_of_rays():
-    maps, limits, config = [build("seamless", 1)], Limits(80.0, 100), SimConfig(sensors=SensorConfig(rays=61))
-    episodes, _ = lane_starts(maps, np.zeros(6, dtype=int), np.random.default_rng(6))
-    episodes["rewind"] = 10
-    spec = cnn("cnn:8,8,8@1")
-    genomes = new_genomes(spec, 16, seed=9)
-    results, rewound, _ = evaluate(spec, genomes, maps, episodes, limits, config)
-    member, column = np.unravel_index(results["steps"].argmax(), results.shape)
-    row, states, _ = trajectory(spec, genomes[member], maps[0], episodes[column]["start"], limits, config)
-    assert row == results[member, column]
-    assert len(states) == row["steps"] + 1 > 20
-    assert rewound[member, column, :2] == pytest.approx(states[-11, :2])
-    assert rewound[member, column, 3] == states[-11, 4]
 
 
 # --- Acting on an environment's observations -------------------------------------------------------------------------

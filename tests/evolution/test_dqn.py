@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from evolution.dqn.experience import NO_ACTION, Experience
-from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, device_of, new_weights, tanh
+from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, new_weights, tanh
 from evolution.dqn.replay import Batch, Replay
 from evolution.networks import policy
 from evolution.networks.policy import PolicySpec
@@ -118,11 +118,6 @@ def test_targets_by_hand():
     assert loss.item() == pytest.approx(np.mean([2 * (size - 1) for size in (2.5, 12.5, 7.5)]))  # Huber's
 
 
-def test_small_errors_count_by_their_square():
-    loss, _ = learner_of(biased([0, 0, 2.6, 0, 0, 0, 0, 0])).loss(fixed_batch([0, 0]))
-    assert loss.item() == pytest.approx(0.4**2 / 2, rel=1e-5)
-
-
 # --- Gradients -------------------------------------------------------------------------------------------------------
 
 
@@ -142,15 +137,6 @@ def test_gradients_are_those_of_finite_differences(text):
         learner.online.genome.sub_(direction, alpha=side * 2e-3)
     slope = (ends[1] - ends[0]) / 4e-3
     assert slope == pytest.approx(torch.linalg.vector_norm(gradient).item(), rel=0.02)
-
-
-def test_only_the_chosen_action_and_only_the_network_get_gradients():
-    learner = learner_of()
-    batch = random_batch(SPEC, 16)._replace(actions=np.full(16, 5))
-    assert not learner.targets(batch).requires_grad
-    weights, biases = torch.autograd.grad(learner.loss(batch)[0], learner._leaves)[-2:]
-    for gradient in (weights.abs().sum(0), biases):
-        assert gradient.nonzero().tolist() == [[5]]
 
 
 def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
@@ -237,14 +223,6 @@ def test_seeds_differ_and_repeat():
 
 
 # --- What is refused -------------------------------------------------------------------------------------------------
-
-
-def test_devices():
-    assert device_of("cpu").type == "cpu"
-    assert device_of("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
-    if not torch.cuda.is_available():
-        with pytest.raises(ValueError, match=r"^PyTorch finds no device 'cuda' here; use --device cpu$"):
-            DqnLearner(SPEC, DqnConfig(), seed=1, device="cuda")
 
 
 def test_a_network_that_diverged_is_reported_and_left_as_it_was():

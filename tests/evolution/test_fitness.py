@@ -63,12 +63,6 @@ def test_further_and_better_paced_is_never_worse(drives, which, more):
         assert elements(further, TARGET)[0, 0] > elements(row, TARGET)[0, 0]
 
 
-def test_pace_counts():
-    """The same way at a speed within the interval is worth more than outside of it."""
-    ranked = scalar(results([[100.0]] * 3, [[0.0], [50.0], [100.0]]), TARGET)
-    assert (np.diff(ranked) > 0.05).all()
-
-
 def test_the_first_bend_is_worth_as_much_as_a_long_way_later():
     value = scalar(results([[0.0], [20.0], [400.0], [420.0]], [[0.0], [20.0], [400.0], [420.0]]), TARGET)
     assert value[1] - value[0] > 5 * (value[3] - value[2])
