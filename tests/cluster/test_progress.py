@@ -94,3 +94,10 @@ def test_a_comparison_shows_the_same(width):
     assert line.startswith("run 0/3  ETA 3:0")
     assert "  12 generations  success 37%  " in line
     assert ("roundabout-two-parents-s0" in line) == (width >= 80)
+
+
+def test_a_terminal_shows_it_live():
+    file = io.StringIO()
+    with progress.Line(Console(width=40, force_terminal=True, color_system=None, file=file)) as line:
+        line.head, line.facts, line.rest = "12/30 generations", "success 37%", WORDS
+    assert "12/30 generations  success 37%  240 gen…" in file.getvalue()

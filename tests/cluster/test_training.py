@@ -129,6 +129,15 @@ def test_a_search_is_what_was_asked_for(maps):
         assert evolution.search.seed == settings.seed
 
 
+def test_a_run_may_begin_with_a_champion(maps):
+    genome = np.random.default_rng(3).normal(size=GENES).astype(np.float32)
+    for settings in (SETTINGS, TWO):
+        evolution = Evolution(settings, SerialPool(maps.build), maps, genome)
+        go_on(evolution)
+        assert evolution.elites[0].tobytes() == genome.tobytes()
+        assert np.isfinite(list(evolution.history[0].values())).all()
+
+
 def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
     arrays, _ = load(halfway)
     worlds = arrays["crash_worlds"]

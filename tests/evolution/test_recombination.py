@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from searching import first_gene, leader, told
 
-from evolution.networks.policy import PolicySpec
+from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
 from evolution.search.base import SearchConfig, ranks, tournament_weights
 from evolution.search.breeding import Kind, Mutation, breed
@@ -76,6 +76,21 @@ def test_mirrored_pairs_meet_the_same_episodes(data):
     assert (of[pairs[:, 0]] == of[pairs[:, 1]]).all()
     assert (seeds[pairs[:, 0]] == seeds[pairs[:, 1]]).all()
     assert len(set(seeds[children[::2]].tolist())) == len(children[::2])
+
+
+@pytest.mark.parametrize("spec", [SPEC, CNN], ids=str)
+def test_members_lie_about_the_centre_as_far_as_its_steps_say(spec):
+    config = SearchConfig(population=402, groups=1, sigma=0.3)
+    search = begun(config, spec=spec)
+    free, bound, source, _ = symmetry(spec)
+    search.variances = 10.0 ** np.random.default_rng(1).uniform(-2, 2, spec.size)
+    search.variances[bound] = search.variances[source]
+    wanted = 0.3 * gene_scales(spec) * np.sqrt(search.variances)
+    np.testing.assert_allclose(search.steps(), wanted)
+    search.ask()
+    noise = ((search.genomes(np.arange(2, 402)) - search.centre) / wanted)[:, free]
+    assert np.abs(noise.std(axis=0) - 1.0).max() < 6.0 / np.sqrt(400)
+    assert np.abs(noise[::2] + noise[1::2]).max() < 1e-2
 
 
 @pytest.mark.parametrize("champion", [False, True])
