@@ -13,8 +13,8 @@ import numpy as np
 
 from cluster.runs.champion import Champion
 from evolution.episodes.rollout import Limits, trajectory
-from evolution.networks.policy import PolicySpec
-from gridsim.car.ego import DISTANCE, SPEED, End, X, Y
+from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
+from gridsim.car.ego import DISTANCE, SPEED, STEERING, End, X, Y
 from gridsim.envs.simulator import views
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -44,6 +44,7 @@ class Recording:
         boxes: float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine).
         end: how it ended; RUNNING where the recording did.
         period: s from state to state.
+        outputs: float32 [steps + 1, 8], the network's for each action; None where they are unknown.
     """
 
     scenario: Map
@@ -52,6 +53,7 @@ class Recording:
     boxes: np.ndarray
     end: End
     period: float
+    outputs: np.ndarray | None = None
 
     @property
     def seconds(self) -> float:
@@ -74,8 +76,11 @@ def record(
     end = End(int(result["end"]))
     if end == End.TIME and steps < round(episode.time_limit / episode.control_period):
         end = End.RUNNING
-    ranges = views(scenario, cars, worlds, champion.sim)
-    return Recording(scenario, cars, ranges, other_cars(worlds), end, episode.control_period)
+    ranges, closing = views(scenario, cars, worlds, champion.sim)
+    outputs = None
+    if isinstance(spec, MlpSpec):
+        outputs = outputs_of(spec, champion.genome, ranges, closing, cars[:, SPEED], cars[:, STEERING])
+    return Recording(scenario, cars, ranges, other_cars(worlds), end, episode.control_period, outputs)
 
 
 def other_cars(worlds: np.ndarray) -> np.ndarray:

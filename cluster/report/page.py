@@ -41,14 +41,12 @@ class Shown:
         label: whose it is.
         short: the same, beside its car.
         drive: the recording.
-        outputs: float32 [steps + 1, 8], the network's, or None.
         stride: control steps from moment to moment of the page; rays and outputs are shown if it is 1.
     """
 
     label: str
     short: str
     drive: Recording
-    outputs: np.ndarray | None = None
     stride: int = 1
 
     def packed(self) -> dict[str, object]:
@@ -67,10 +65,10 @@ class Shown:
         if self.stride == 1:
             rays = drive.ranges.shape[1]
             channels += [ray * 100.0 for ray in drive.ranges.T]
-            if self.outputs is not None:
-                outputs = self.outputs.shape[1]
-                low, high = self.outputs.min(axis=1, keepdims=True), self.outputs.max(axis=1, keepdims=True)
-                channels += list(((self.outputs - low) / np.maximum(high - low, 1e-9) * (TURN - 1)).T)
+            if drive.outputs is not None:
+                outputs = drive.outputs.shape[1]
+                low, high = drive.outputs.min(axis=1, keepdims=True), drive.outputs.max(axis=1, keepdims=True)
+                channels += list(((drive.outputs - low) / np.maximum(high - low, 1e-9) * (TURN - 1)).T)
         numbers = np.rint(channels).astype(np.int64).astype("<u2")
         series = np.diff(numbers, axis=1, prepend=np.zeros((len(numbers), 1), dtype="<u2"))
         return {

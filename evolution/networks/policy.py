@@ -324,11 +324,26 @@ def decide(packed, layers, scratch):
 
 
 @njit
-def _act_on(packed, layers, ranges, closing, speeds, angles, actions):
+def _outputs(packed, layers, ranges, closing, speeds, angles, outputs):
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for n in range(ranges.shape[0]):
         encode(ranges[n], None if closing is None else closing[n], speeds[n], angles[n], scratch)
-        actions[n] = decide(packed, layers, scratch)
+        first = forward(packed, layers, scratch)
+        outputs[n] = scratch[first : first + outputs.shape[1]]
+
+
+def outputs_of(
+    spec: MlpSpec, genome: np.ndarray, ranges: np.ndarray, closing: np.ndarray, speeds: np.ndarray, angles: np.ndarray
+) -> np.ndarray:
+    """Outputs float32 [n, 8] of a perceptron, one for each action.
+
+    Args: ranges float32 [n, 31], m; closing speeds float32 [n, 31], m/s, without motion of any shape; speeds float32
+    [n], m/s; steering angles float32 [n], rad.
+    """
+    outputs = np.empty((len(ranges), spec.outputs), dtype=np.float32)
+    packed = pack(np.ascontiguousarray(genome), spec.layers)
+    _outputs(packed, spec.layers, ranges, closing if spec.motion else None, speeds, angles, outputs)
+    return outputs
 
 
 def act_on(
@@ -349,10 +364,9 @@ def act_on(
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
-    packed = pack(np.ascontiguousarray(genome), spec.layers)
-    closing = many[:, RAYS : 2 * RAYS] * _F(speed_limit) if spec.motion else None
+    closing = many[:, RAYS : 2 * RAYS] * _F(speed_limit)
     speeds = many[:, 2 * RAYS if spec.motion else RAYS] * _F(speed_limit)
     angles = many[:, -1] * _F(steering_limit)
-    actions = np.empty(len(many), dtype=np.int64)
-    _act_on(packed, spec.layers, many[:, :RAYS] * _F(reach), closing, speeds, angles, actions)
+    outputs = outputs_of(spec, genome, many[:, :RAYS] * _F(reach), closing, speeds, angles)
+    actions = np.where(np.isnan(outputs).any(axis=1), -1, outputs.argmax(axis=1))
     return int(actions[0]) if np.ndim(observation) == 1 else actions

@@ -276,19 +276,25 @@ class Simulator:
 
 
 @njit(nogil=True)
-def _views(road, constants, fan, cars, worlds, ranges):
+def _views(road, constants, fan, cars, worlds, ranges, closing):
     beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for i in range(cars.shape[0]):
-        look(road, constants, fan, cars[i], worlds[i], beams, ranges[i], None)
+        look(road, constants, fan, cars[i], worlds[i], beams, ranges[i], closing[i])
 
 
-def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> np.ndarray:
-    """Ranges float32 [n, rays] (m) that cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS]."""
+def views(
+    scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """What cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS].
+
+    Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].
+    """
     k = constants(config)
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    _views(scenario.road, k, rays, np.ascontiguousarray(cars), np.ascontiguousarray(worlds), ranges)
-    return ranges
+    closing = np.zeros_like(ranges)
+    _views(scenario.road, k, rays, np.ascontiguousarray(cars), np.ascontiguousarray(worlds), ranges, closing)
+    return ranges, closing
 
 
 def _visit_cells(road: Road) -> int:

@@ -13,7 +13,9 @@ from browser import Browser, needs_chromium
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
 from cluster.runs.champion import load_champion
-from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, X, Y
+from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, X, Y
+from gridsim.car.vehicle import act
+from gridsim.config import constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import spawn
@@ -36,10 +38,8 @@ def channels(drive):
 
 
 def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
-    champion, drive, *_ = shown_drives()
-    outputs = np.random.default_rng(2).normal(size=(len(drive.cars), 8)).astype(np.float32)
+    champion, drive, *shown = shown_drives()
     title = "</script><script>alert(1)</script>"  # a name of the user's own
-    shown = [Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive, outputs)]
     write_page(tmp_path / "drive.html", title, shown, champion.sim)
     assert (tmp_path / "drive.html").stat().st_size < 1_500_000
     assert "http://" not in (tmp_path / "drive.html").read_text()
@@ -59,7 +59,11 @@ def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
         assert each["period"] == pytest.approx(0.1 * stride)
     first = 5 + 3 * boxes.shape[1]
     np.testing.assert_allclose(found[first : first + 31].T / 100, drive.ranges, atol=0.006)
-    assert (found[first + 31 :].argmax(axis=0) == outputs.argmax(axis=1)).all()
+    chosen = found[first + 31 :].argmax(axis=0)
+    constant = constants(champion.sim)
+    for action, car, following in zip(chosen, drive.cars, drive.cars[1:], strict=False):
+        _, angle = act(constant, action, car[SPEED], car[STEERING])
+        assert angle == following[STEERING], "the greatest output is what it did"
 
 
 def shown_drives():
@@ -95,5 +99,8 @@ def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
         browser.wait_for(f"{text('clock')} === '0:06.0'")
         ghosts = browser.run("let n = 0; const was = ghost; ghost = (...a) => { n++; was(...a); }; draw(); n")
         assert ghosts == 1
+        assert browser.run("document.querySelectorAll('#outputs .chosen').length") == 0, "an elite's are not shown"
+        browser.run("choose(1)")
+        browser.wait_for("document.querySelectorAll('#outputs .chosen').length === 1")
         assert browser.faults == []
         assert {url for url in browser.requests if not url.startswith("data:")} == {path.as_uri()}

@@ -163,8 +163,8 @@ def test_the_reward_among_traffic_is_the_papers(maps: Maps) -> None:
         state = env.simulator.state
         for i in range(8):
             cars, road = state.cars[i : i + 1], maps["highway"][state.maps[i]]
-            ranges = views(road, cars, state.worlds[i : i + 1], env.config)[0]
-            nearer += ranges.min() < views(road, cars, state.worlds[i : i + 1, :0], env.config)[0].min()
+            ranges = views(road, cars, state.worlds[i : i + 1], env.config)[0][0]
+            nearer += ranges.min() < views(road, cars, state.worlds[i : i + 1, :0], env.config)[0][0].min()
             expected = (
                 0.15 * min((cars[0, DISTANCE] - before[i, DISTANCE]) / (25.0 * 0.1), 1.0)
                 + 0.15 * min(max(cars[0, SPEED] / 25.0, 0.0), 1.0)
