@@ -74,9 +74,6 @@ def test_large_values_can_be_saved_and_taken_up_again(loop):
     again = loop(learning_rate=1e30)
     again.restore(*learning.state())
     assert again.counts() == learning.counts()
-    for other in (loop(policy="mlp:5"), loop(replay=3999)):
-        with pytest.raises(ValueError, match=r"^a saved |^its "):
-            other.restore(*learning.state())
 
 
 @pytest.mark.parametrize("gene", [np.nan, np.inf])
