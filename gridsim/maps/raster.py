@@ -76,7 +76,7 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
     used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
     first = [0 if torus else min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
     per_node = [n / side if torus else _NODE / resolution for n, side in zip(free.shape, (rows, columns), strict=True)]
-    nodes = np.empty((rows, columns), dtype=np.float32)
+    nodes = np.full((rows, columns), FIELD_FLOOR, dtype=np.float32)
     for j in range(0, rows, _TILE):
         for i in range(0, columns, _TILE):
             index, window, at = [], [], []
@@ -89,8 +89,10 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
                 window.append(slice(low, high))
                 at.append((pixel + halo - low) * cut - 0.5)
             part = padded[window[0], window[1]]
-            distance = np.float32(_DEEPEST if part.any() else FIELD_FLOOR)
-            if part.any() and not part.all():
+            if not part.any():
+                continue
+            distance = np.float32(_DEEPEST)
+            if not part.all():
                 signed = _signed(part.repeat(cut, axis=0).repeat(cut, axis=1), resolution / cut)
                 distance = ndimage.map_coordinates(signed, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest")
             nodes[np.ix_(*index)] = np.clip(distance, FIELD_FLOOR, _DEEPEST)

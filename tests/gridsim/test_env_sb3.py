@@ -1,5 +1,7 @@
 """Learners of others: Stable-Baselines3 on the vector environment and in processes of its own, and EvoTorch."""
 
+import doctest
+
 import gymnasium
 import numpy as np
 import pytest
@@ -8,19 +10,20 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from gridsim.envs import sb3
 from gridsim.envs.sb3 import SB3VecEnv
 
 
 def test_it_tells_sb3_what_the_vector_environment_tells():
-    sb3 = SB3VecEnv("GridSim/Curved-v0", num_envs=4, max_episode_steps=20)
+    cars = SB3VecEnv("GridSim/Curved-v0", num_envs=4, max_episode_steps=20)
     own = gymnasium.make_vec("GridSim/Curved-v0", 4, autoreset_mode=AutoresetMode.SAME_STEP, max_episode_steps=20)
-    sb3.seed(3)
-    observations, (expected, _) = sb3.reset(), own.reset(seed=3)
+    cars.seed(3)
+    observations, (expected, _) = cars.reset(), own.reset(seed=3)
     returns = np.zeros(4)
     for step in range(1, 41):
         np.testing.assert_array_equal(observations, expected)
         actions = np.full(4, 4)  # none: nobody ends before the time
-        observations, rewards, dones, infos = sb3.step(actions)
+        observations, rewards, dones, infos = cars.step(actions)
         expected, own_rewards, terminated, truncated, info = own.step(actions)
         np.testing.assert_array_equal(rewards, own_rewards)
         np.testing.assert_array_equal(dones, terminated | truncated)
@@ -32,7 +35,7 @@ def test_it_tells_sb3_what_the_vector_environment_tells():
             assert infos[i]["episode"]["r"] == pytest.approx(returns[i], abs=1e-4)
             assert infos[i]["episode"]["l"] <= min(step, 20)
             returns[i] = 0.0
-    sb3.close()
+    cars.close()
     own.close()
 
 
@@ -44,6 +47,11 @@ def test_its_learners_learn_on_rays_and_pictures():
     assert DQN("MlpPolicy", few, buffer_size=1000, learning_starts=50).learn(200).num_timesteps >= 200
     pictures = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="image")
     assert PPO("CnnPolicy", pictures, n_steps=8, batch_size=16, n_epochs=1).learn(64).num_timesteps == 64
+
+
+def test_the_modules_example_runs():
+    done = doctest.testmod(sb3)
+    assert (done.attempted, done.failed) == (4, 0)
 
 
 def test_sb3s_own_processes_find_the_environment_by_its_modules_name():
