@@ -35,13 +35,9 @@ OFF_ROAD, ROAD = (223, 228, 220), (112, 120, 126)  # colours
 
 @dataclass(frozen=True)
 class Shown:
-    """A drive on a page.
+    """A drive on a page: the driver's name, a shorter one beside its car, and the recording.
 
-    Attributes:
-        label: whose it is.
-        short: the same, beside its car.
-        drive: the recording.
-        stride: control steps from moment to moment of the page; rays and outputs are shown if it is 1.
+    `stride` counts control steps from moment to moment of the page; rays and outputs are shown if it is 1.
     """
 
     label: str

@@ -23,7 +23,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from cluster.tracking.address import TrackingError, shown, sqlite_path
 from cluster.tracking.commit import git_commit
@@ -77,19 +77,16 @@ def quiet() -> None:
             logger.propagate = False
 
 
-@dataclass(frozen=True)
-class Row:
-    """Metrics of one step.
+class Row(NamedTuple):
+    """Metrics of one step, `wall_s` after the run's start, pauses left out, or else at `logged_ms` since the epoch.
 
-    Attributes:
-        wall_s: seconds after the run's start, pauses left out; None: `logged_ms` counts.
-        logged_ms: ms since the epoch; fixed, so that a repeated request is the same one.
+    Times are fixed, so that a repeated request is the same one.
     """
 
     step: int
     metrics: Mapping[str, float]
-    wall_s: float | None = None
-    logged_ms: int = field(default_factory=lambda: time.time_ns() // 1_000_000)
+    wall_s: float | None
+    logged_ms: int
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ CLOSE_S, STOP_S = 60.0, 15.0  # that closing takes at most, for a finished run a
 class Tracker:
     """One MLflow run, found or created, and filled by a background thread, which starts with the first row.
 
-    On resume hand over the whole history: what MLflow has is skipped. An identity that this store does not know means
-    a new run, which gets every row.
+    A resumed run hands over its whole history, and what MLflow has is skipped. A store without this run gets a new one.
 
     Attributes:
         run_id: MLflow's id of the run, or None as long as there is none.
@@ -73,7 +72,7 @@ class Tracker:
 
     def log_row(self, step: int, row: Mapping[str, float], wall_s: float | None = None) -> None:
         """Send metrics of a step, of `wall_s` after the run's start, or of now. MLflow's run ends with the last one."""
-        self._rows.append(Row(step, row, wall_s))
+        self._rows.append(Row(step, row, wall_s, time.time_ns() // 1_000_000))
         self._wall_s = wall_s
         self._notify()
 
@@ -83,10 +82,7 @@ class Tracker:
         self._notify()
 
     def log_model(self, folder: Path, model: Model) -> None:
-        """Write the champion as a torch model into a run's folder, send it, and register it.
-
-        What is there of the same champion is not written again, and what is registered is not registered again.
-        """
+        """Write the champion as a torch model into a run's folder, send it and register it, unless that is done."""
         self._model = folder, model
         self._notify()
 
