@@ -1,6 +1,6 @@
 """The city: narrow irregular blocks on a torus, plain crossings with tight corners, parked cars in bays at the kerb.
 
-Streets run along the axes at irregular distances. Some pieces are missing, which makes T junctions and bends. A bay
+Streets run along the axes at irregular distances. Each lacks one piece, which makes T junctions and bends. A bay
 widens the road on one side of a street; the cars parked in it are blocks that do not reach into the lanes.
 """
 
@@ -22,7 +22,6 @@ CORNER = (8.0, 10.0)  # m, radius of the roads' centre lines round a corner, dra
 # For each axis, the number of streets and the least distance between them (m). The way round the smallest block,
 # corners cut, is longer than the 200 m within which the same ground does not count again.
 GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
-MISSING = 0.2  # share of the pieces of streets between crossings, at most
 BAY_SHARE = 0.6  # of the sides of streets have a bay
 BAY_DEPTH = 2.0  # m
 BAY_LENGTH = 12.0  # m, at least, without its ends
@@ -41,21 +40,18 @@ def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray
 
 
 def street_graph(rng: np.random.Generator, columns: int, rows: int) -> np.ndarray:
-    """Open edges bool [rows, columns, 4] (east, north, west, south): connected, and two or more at each node."""
-    edges = np.ones((rows, columns, 4), dtype=bool)
-    pairs = [(j, i, d) for j in range(rows) for i in range(columns) for d in (0, 1)]
-    left = int(MISSING * len(pairs))
-    for k in rng.permutation(len(pairs)):
-        j, i, d = pairs[k]
-        dx, dy = DIRECTIONS[d]
-        other = ((j + dy) % rows, (i + dx) % columns)
-        if left and edges[j, i].sum() > 2 and edges[other].sum() > 2:
-            edges[j, i, d] = edges[other][d + 2] = False
-            if not components(edges).any():  # all are in part 0
-                left -= 1
-            else:
-                edges[j, i, d] = edges[other][d + 2] = True
-    return edges
+    """Open edges bool [rows, columns, 4] (east, north, west, south): connected, and two or more at each node.
+
+    Each street lacks one piece: whoever does not steer meets a wall.
+    """
+    while True:
+        edges = np.ones((rows, columns, 4), dtype=bool)
+        j, i = np.arange(rows), rng.integers(columns, size=rows)
+        edges[j, i, 0] = edges[j, (i + 1) % columns, 2] = False
+        j, i = rng.integers(rows, size=columns), np.arange(columns)
+        edges[j, i, 1] = edges[(j + 1) % rows, i, 3] = False
+        if not components(edges).any():  # all are in part 0
+            return edges
 
 
 def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tuple[float, float, float]]:

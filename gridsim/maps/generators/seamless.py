@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from gridsim.maps.generators.squares import DIRECTIONS, Layout, Pieces, components, rotated
+from gridsim.maps.generators.squares import DIRECTIONS, Layout, Pieces, components, goes_round, rotated
 from gridsim.maps.roads import Lanes, Strips
 
 TILE = 32.0  # m, side of a tile
@@ -57,7 +57,10 @@ def _neighbour(tile: int, direction: int) -> int:
 
 
 def tile_graph(rng: np.random.Generator) -> np.ndarray:
-    """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends."""
+    """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends.
+
+    No straight road closes round the torus: whoever does not steer leaves it.
+    """
     while True:
         edges = np.zeros((TILES * TILES, 4), dtype=bool)
         pairs = [(tile, d) for tile in range(TILES * TILES) for d in (0, 1)]
@@ -70,10 +73,11 @@ def tile_graph(rng: np.random.Generator) -> np.ndarray:
             for tile in ends:
                 for d in np.flatnonzero(edges[tile]):
                     edges[tile, d] = edges[_neighbour(int(tile), int(d)), (d + 2) % 4] = False
-        part = components(edges.reshape(TILES, TILES, 4))
+        squares = edges.reshape(TILES, TILES, 4)
+        part = components(squares)
         largest = part == np.bincount(part).argmax()
         edges[~largest] = False
-        if largest.sum() >= TILES * TILES // 2:
+        if largest.sum() >= TILES * TILES // 2 and not goes_round(squares):
             return edges
 
 
