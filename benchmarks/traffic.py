@@ -81,7 +81,7 @@ def measure(scenario: str, cars: int, seeds: int, hours: float) -> dict[str, flo
     for seed in range(seeds):
         network = build(scenario, HELD_OUT_SEED + seed, sim).network
         start = np.full((1, 5), 1e6, dtype=np.float32)
-        world = spawn(network, start, cars, np.array([seed], dtype=np.uint64), sim.traffic)[0]
+        world = spawn(network, start, cars, np.array([seed], dtype=np.uint64), sim)[0]
         there = max(int((world[:, LANE] >= 0).sum()), 1)
         stood = np.zeros(cars, dtype=np.int64)
         means = []

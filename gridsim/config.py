@@ -30,15 +30,14 @@ SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of 
 SPAWN_SPEED = _F(0.5)  # of the desired speed, at the start of an episode
 LANE_CHANGE_PERIOD = _F(10.0)  # control steps between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a change of lanes
-NEIGHBOUR_LANE = _F(3.75)  # m to the middle of a neighbouring lane; only the highway has them
-NEIGHBOUR_HALF_WIDTH = _F(2.8)  # m from that middle within which the ego car counts as on that lane ...
-NEIGHBOUR_WIDENING = _F(0.004)  # 1/m, and so much more per square metre of distance, since roads bend
+NEIGHBOUR_WIDENING = _F(0.004)  # m for each square metre of distance, added to the ego car's lane, since roads bend
 LOOK_AHEAD = _F(8.0)  # m that a car looks ahead at standstill, beyond the jam distance ...
 LOOK_AHEAD_TIME = _F(1.5)  # s, and the way it drives in that time, beside its comfortable braking distance
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 # m before a junction's line at which a car waits; if longer, its rear might be in a junction behind
 STOP_LINE_GAP = _F(0.25)
-EGO_DODGE_SLOPE = _F(0.12)  # m to the right for each m of way, on a path that dodges the oncoming ego car
+SWERVE_RADIUS = _F(16.0)  # m, of the arcs by which a car moves sideways, at least; as tight as bends are
+STEEPEST_SWERVE = _F(0.2)  # m sideways for each m of way, at most
 PATH_SAMPLE = _F(1.25)  # m between points of a path that are tested; below half a car's width plus CAUTION
 
 # How traffic meets the ego car.
@@ -48,7 +47,6 @@ SAME_WAY_COSINE = _F(0.3)  # of the angle between headings above which both go t
 FORESIGHT = _F(3.0)  # s for which a car predicts the ego car's motion
 FORESIGHT_STEP = _F(0.25)  # s between predicted positions, at least
 EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predicted collision
-CONTACT_DISTANCE = _F(6.0)  # m between the middles of two cars within which they may touch
 
 # Junctions.
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
@@ -109,10 +107,10 @@ class TrafficConfig:
     politeness: float = 0.2  # p of MOBIL
     threshold: float = 0.2  # m/s2 that a change of lanes must gain
     safe_braking: float = 3.0  # m/s2 of braking that a change of lanes may force on the car behind
-    lane_change_speed: float = 1.25  # m/s sideways: three seconds for a lane
+    lane_change_speed: float = 1.25  # m/s sideways, at most
     kerb: float = 1.3  # m from the middle of a car that moves to the right to the road's edge, at least
     give_way: float = 0.9  # m that a car moves to the right for oncoming cars, at most
-    taper: float = 0.15  # m to the right for each m of way, while it does
+    taper: float = 0.1  # m to the right for each m of way, while it does
     apart: float = 2.35  # m between the middles of two lanes, below which cars on them may touch
     spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
     spawn_gap_ego: float = 22.0  # m between a car and the ego car at the start, at least

@@ -203,7 +203,7 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
         traffic = champion.traffic if road == champion.scenario else default_traffic(road)
         if flags.traffic != -1:
             traffic = flags.traffic
-        world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim.traffic)[0]
+        world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim)[0]
         yield record(champion, scenario, start, seconds, world), f"{name}    {label(road)}, map {scenario.seed:,}"
 
 

@@ -90,7 +90,7 @@ def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np
     """The smallest drive: configuration, a map without a road, a genome of zeros, an episode, its traffic, limits."""
     config, genome = SimConfig(), np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)
     road, episodes = blank(config), np.zeros(1, dtype=EPISODE)
-    worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config.traffic)
+    worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config)
     return config, road, genome, episodes, worlds, Limits(1.0, STEPS)
 
 
@@ -120,7 +120,7 @@ def compile_roads(scenario: str, traffic: int) -> None:
     """The same for building a scenario's maps."""
     road = build(scenario, 0)
     starts = sample_starts(road, 1, np.random.default_rng(0))
-    spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig().traffic)
+    spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig())
 
 
 def everything_by_default() -> list[RunSettings]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution.episodes.rollout import EPISODE, Limits, no_traffic, with_limits
-from gridsim.config import TrafficConfig
+from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
 from gridsim.traffic.world import FIELDS, spawn
 
@@ -40,7 +40,7 @@ def lane_starts(
     maps: np.ndarray,
     rng: np.random.Generator,
     traffic: int = 0,
-    config: TrafficConfig | None = None,
+    config: SimConfig | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
 
@@ -57,5 +57,5 @@ def lane_starts(
         for m in np.unique(maps):
             of = np.flatnonzero(episodes["map"] == m)
             starts = episodes["start"][of]
-            worlds[of] = spawn(road_maps[m].network, starts, traffic, keys[of], config or TrafficConfig())
+            worlds[of] = spawn(road_maps[m].network, starts, traffic, keys[of], config or SimConfig())
     return episodes, worlds

@@ -236,7 +236,7 @@ class Simulator:
         spawned = np.empty(shape, dtype=np.float32)
         for m in np.unique(maps):
             of = np.flatnonzero(maps == m)
-            spawned[of] = spawn(self.scenarios[m].network, starts[of], shape[1], keys[of], self.config.traffic)
+            spawned[of] = spawn(self.scenarios[m].network, starts[of], shape[1], keys[of], self.config)
         return spawned
 
     def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:

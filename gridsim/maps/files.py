@@ -361,7 +361,7 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
         road=make_road(nodes, file.speed, config.sensors.range),
         lanes=lanes,
         strips=Strips.of(),
-        network=make_network(lanes, width, height, 0.0, config.traffic),
+        network=make_network(lanes, width, height, 0.0, config),
         torus=file.torus,
         starts=freeze(starts),
     )

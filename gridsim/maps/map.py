@@ -92,7 +92,7 @@ def blank(config: SimConfig) -> Map:
         speed_low=f(0.0),
         speed_high=f(1.0),
     )
-    return Map("blank", 0, road, lanes, Strips.of(), make_network(lanes, side, side, 1.0, config.traffic))
+    return Map("blank", 0, road, lanes, Strips.of(), make_network(lanes, side, side, 1.0, config))
 
 
 @njit

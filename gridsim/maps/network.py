@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import TrafficConfig
+from gridsim.config import SimConfig
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import Lanes, freeze
 
 _F, _N = np.float32, np.uint64
 _HALF, _NEXT = _F(0.5), _N(1)
+_ALONG_SIDE = np.linspace(-1.0, 1.0, 9)  # points of a car's side that are checked, as shares of its half length
 _ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 
 
@@ -84,6 +86,30 @@ def _ease(offsets, steps, successors, slope, room):
                     room[onward] = min(room[onward], room[last] + slope * steps[lane])
 
 
+def _room_on_right(lanes: Lanes, config: SimConfig, clearance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """How far (m) a car at each point of the lanes can move to the right, by its right side; found by bisection."""
+    vehicle, traffic = config.vehicle, config.traffic
+    k, counts = np.arange(len(lanes.points)), np.diff(lanes.offsets)
+    before = np.maximum(k - 1, np.repeat(lanes.offsets[:-1], counts))
+    after = np.minimum(k + 1, np.repeat(lanes.offsets[1:] - 1, counts))
+    forward = lanes.points[after] - lanes.points[before]
+    forward /= np.hypot(*forward.T)[:, None]
+    right = np.stack([forward[:, 1], -forward[:, 0]], axis=1)
+    low: np.ndarray = np.zeros(len(k), dtype=np.float32)
+    high: np.ndarray = np.full(len(k), traffic.give_way, dtype=np.float32)
+    tried = high
+    for _ in range(7):
+        middle = lanes.points + tried[:, None] * right
+        gap = clearance(freeze(middle.astype(np.float32))) - vehicle.width / 2
+        side = middle + vehicle.width / 2 * right
+        for share in _ALONG_SIDE:
+            gap = np.minimum(gap, clearance(freeze((side + share * vehicle.length / 2 * forward).astype(np.float32))))
+        fits = gap >= traffic.kerb - vehicle.width / 2
+        low, high = np.where(fits, tried, low), np.where(fits, high, tried)
+        tried = (low + high) / 2
+    return low
+
+
 @njit
 def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, height, apart, clear):
     """For each crossing, how far along the other lane (m) its last point within `apart` m of this lane is."""
@@ -117,27 +143,29 @@ def make_network(
     width: float,
     height: float,
     speed_limit: float,
-    config: TrafficConfig,
-    clearances: np.ndarray | None = None,
+    config: SimConfig,
+    clearance: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Network:
     """The network of a map's lanes; `speed_limit` (m/s) is the scenario's.
 
-    Args: clearances float32 [points], m from the lanes' points to the road's edge. Without them, `room` is 0.
+    Args: clearance of points float32 [n, 2] (m), float32 [n] as `roads.clearances`. Without it, `room` is 0.
     """
-    f = np.float32
+    f, traffic = np.float32, config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
     sides = f(width), f(height)
     speeds, room = np.empty(len(points), dtype=np.float32), np.zeros(len(points), dtype=np.float32)
     clear = np.zeros(len(lanes.crossings), dtype=np.float32)
     if len(lanes):
-        _speed_profile(points, offsets, steps, successors, f(speed_limit), f(config.lateral), f(config.comfort), speeds)
+        _speed_profile(
+            points, offsets, steps, successors, f(speed_limit), f(traffic.lateral), f(traffic.comfort), speeds
+        )
         crossing = lanes.crossing_offsets, lanes.crossings
-        _clear_points(points, offsets, steps, *crossing, *sides, f(config.apart), clear)
-    if clearances is not None:
+        _clear_points(points, offsets, steps, *crossing, *sides, f(traffic.apart), clear)
+    if clearance is not None:
         beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
-        room = np.clip(clearances - f(config.kerb), 0.0, config.give_way).astype(np.float32)
+        room = _room_on_right(lanes, config, clearance)
         room[np.repeat(beside, np.diff(offsets))] = 0.0
-        _ease(offsets, steps, successors, f(config.taper), room)
+        _ease(offsets, steps, successors, f(traffic.taper), room)
     found = {"speeds": speeds, "clear": clear, "room": room, "boxes": _boxes(points, offsets)}
     frozen = {name: freeze(array) for name, array in found.items()}
     return Network(**vars(lanes), **frozen, width=sides[0], height=sides[1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -95,5 +96,5 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     nodes = clearance_nodes(strips, width, height)
     road = make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls)
     top = TRAFFIC_PACE * sum(spec.speed_interval)
-    network = make_network(lanes, width, height, top, config.traffic, clearances(road, lanes.points))
+    network = make_network(lanes, width, height, top, config, partial(clearances, road))
     return Map(name, seed, road, lanes, strips, network)

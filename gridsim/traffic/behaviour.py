@@ -15,23 +15,22 @@ import numpy as np
 
 from gridsim.config import (
     CAUTION,
-    EGO_DODGE_SLOPE,
     LANE_CHANGE_PERIOD,
     LANE_CHANGE_SIGHT,
     LOOK_AHEAD,
     LOOK_AHEAD_TIME,
-    NEIGHBOUR_HALF_WIDTH,
-    NEIGHBOUR_LANE,
     NEIGHBOUR_WIDENING,
     PATH_SAMPLE,
+    STEEPEST_SWERVE,
     STOP_LINE_GAP,
+    SWERVE_RADIUS,
     Constants,
     SimConfig,
     constants,
 )
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
-from gridsim.traffic.encounters import meets_ego, room_to_right, shifted_right, way_to_ego_collision
+from gridsim.traffic.encounters import meets_ego, room_to_right, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import (
     ACCELERATION,
@@ -50,6 +49,7 @@ from gridsim.traffic.world import (
     SIN,
     SPEED,
     SPEED_FACTOR,
+    SWAY,
     X,
     Y,
     choose_lane,
@@ -58,8 +58,6 @@ from gridsim.traffic.world import (
 
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
-
-_REACH = _F(5.0)  # m beyond a car's horizon to search, since positions are of cars' middles and gaps end at their rears
 
 
 class Drivers(NamedTuple):
@@ -73,6 +71,8 @@ class Drivers(NamedTuple):
     politeness: np.float32
     threshold: np.float32  # m/s2
     safe: np.float32  # m/s2
+    lateral: np.float32  # m/s2
+    give_way: np.float32  # m
     shift: np.float32  # m/s
     half_length: np.float32  # m
     half_width: np.float32  # m
@@ -92,6 +92,8 @@ def drivers(sim: SimConfig) -> Drivers:
         politeness=f(config.politeness),
         threshold=f(config.threshold),
         safe=f(config.safe_braking),
+        lateral=f(config.lateral),
+        give_way=f(config.give_way),
         shift=f(config.lane_change_speed),
         half_length=f(sim.vehicle.length / 2),
         half_width=f(sim.vehicle.width / 2),
@@ -139,20 +141,41 @@ def _ahead(network, car, other):
 
 
 @leaf
-def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
+def _swerve(drivers, speed, shift, sway, place, way):
+    """Move sideways from `shift` towards `place` (m, left of the lane) over `way` m: (shift, sway) after it.
+
+    The path bends no harder than SWERVE_RADIUS and the lateral acceleration of traffic in bends allow.
+    """
+    bend = min(_ONE / SWERVE_RADIUS, drivers.lateral / max(speed * speed, _ONE))
+    steepest = min(STEEPEST_SWERVE, drivers.shift / max(speed, _ONE))
+    left = place - shift
+    # By this slope it arrives along the lane, with half the bend.
+    wanted = math.copysign(min(math.sqrt(bend * abs(left)), steepest), left)
+    after = min(max(wanted, sway - bend * way), sway + bend * way)
+    moved = _HALF * (sway + after) * way
+    if abs(left - moved) < _F(0.01) or (moved * left > _ZERO and abs(moved) > abs(left)):
+        return place, _ZERO
+    return shift + moved, after
+
+
+@leaf
+def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
     """Way (m) along a car's path to where a car at (x, y) with a heading blocks it; 1e9 if it does not.
 
-    Tests points of the path from the car's front up to `horizon` m. The path lies as far to the right of the lane as
-    the car is now, and moves further right, by `more` m for each m of way, as far as there is room.
+    Tests points of the path from the car's front up to `horizon` m. The path moves from the car's place to `furthest`
+    (m to the right), or as far as there is room; on a road with several lanes there is none, and it ends in the lane.
     """
-    right = max(-car[SHIFT], _ZERO)
+    shift, sway = car[SHIFT], car[SWAY]
+    aside_by = furthest > _ZERO or shift != _ZERO
+    swerved = _ZERO  # way up to which shift and sway are known
     half_length = drivers.half_length + drivers.half_width + CAUTION
     half_width = drivers.half_width + drivers.half_width + CAUTION
     lane = _I(car[LANE])
     travelled = drivers.half_length
     along = car[ALONG] + travelled
-    reach_x = abs(cosine) * half_length + abs(sine) * half_width
-    reach_y = abs(sine) * half_length + abs(cosine) * half_width
+    beside = max(abs(shift), min(furthest, drivers.give_way))  # the path's distance from the lane, at most
+    reach_x = abs(cosine) * half_length + abs(sine) * half_width + beside
+    reach_y = abs(sine) * half_length + abs(cosine) * half_width + beside
     for _ in range(3):
         if travelled > horizon:
             return _F(1e9)
@@ -170,9 +193,11 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, more):
                     return _F(1e9)
                 k = first + _N(_I(along / step))
                 px, py = network.points[k, 0], network.points[k, 1]
-                aside_by = min(network.room[k], right + more * travelled)
-                if aside_by > _ZERO:
-                    px, py = shifted_right(network, k, k + _N(1) if along + step <= length else k - _N(1), aside_by)
+                if aside_by:
+                    place = -min(network.room[k], furthest)
+                    shift, sway = _swerve(drivers, car[SPEED], shift, sway, place, travelled - swerved)
+                    swerved = travelled
+                    px, py = shifted_right(network, k, k + _N(1) if along + step <= length else k - _N(1), -shift)
                 dx, dy = wrapped_any(px - x, network.width), wrapped_any(py - y, network.height)
                 forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
@@ -196,16 +221,18 @@ def update_gap(network, drivers, car, other, is_ego):
     at = _F(1e9)
     dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
     forward = dx * car[COS] + dy * car[SIN]
-    done = forward < _F(-6.0)  # a car behind is no obstacle
+    done = forward < _F(-3.0) * drivers.half_length  # a car behind is no obstacle
     if not is_ego:
         lane = _N(_I(other[LANE]))
         at = _ahead(network, car, other) - drivers.half_length
-        # Nor is a car that keeps to its lane on a road with several lanes.
-        done = done or at < _F(1e8) or (other[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0)
+        # Nor is a car in another lane, if neither changes lanes.
+        keep = other[SHIFT] == _ZERO and car[SHIFT] == _ZERO
+        done = done or at < _F(1e8) or (keep and max(network.left[lane], network.right[lane]) >= 0)
+    right = max(-car[SHIFT], _ZERO)
     if not done:
         near = min(car[HORIZON], car[GAP])  # only obstacles nearer than the nearest so far matter
-        more = EGO_DODGE_SLOPE if is_ego and meets_ego(network, car, other) else _ZERO
-        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, more)
+        furthest = _F(1e9) if is_ego and meets_ego(network, car, other) else right
+        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, furthest)
     if at < car[GAP]:
         car[GAP], car[LEAD_SPEED] = at, along
     if is_ego and not done and other[SPEED] > _ONE:
@@ -215,7 +242,7 @@ def update_gap(network, drivers, car, other, is_ego):
             # The ego car's position in a second, as it may be about to cut in.
             x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
             near = min(car[HORIZON], car[GAP])
-            at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, _ZERO)
+            at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, right)
         if at < car[GAP]:
             car[GAP], car[LEAD_SPEED] = at, along
 
@@ -228,16 +255,18 @@ def _find_gaps(network, drivers, world, ego):
         speed = world[i, SPEED]
         world[i, HORIZON] = horizon(drivers, speed)
         world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
+    # Searched beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
+    beyond = _F(2.0) * (drivers.half_length + CAUTION)
     ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
-        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + _REACH
+        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + beyond
         for j in range(i):
             if world[j, LANE] < _ZERO:
                 continue
             dx, dy = torus_distance(world[j, X] - x, network.width), torus_distance(world[j, Y] - y, network.height)
-            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + _REACH
+            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + beyond
             if squared < far * far:
                 update_gap(network, drivers, world[i], world[j], False)
             if squared < other_far * other_far:
@@ -269,20 +298,46 @@ def change_lanes(network, drivers, world, i, ego):
         _choose_neighbour(network, drivers, world, i, ego)
 
 
+@leaf
+def _way_between(network, lane, along, other):
+    """Way (m) from a place on a lane to a car on it, or on the piece after or before it; else 1e9."""
+    there, place = _I(other[LANE]), other[ALONG]
+    if there == lane:
+        return place - along
+    if network.successors[lane, 0] == there:
+        return lane_length(network, lane) - along + place
+    if network.successors[there, 0] == lane:
+        return place - along - lane_length(network, there)
+    return _F(1e9)
+
+
+@leaf
+def _lanes_apart(network, lane, along, target):
+    """Distance (m) between a lane and its neighbour."""
+    k = _I(along / network.steps[lane])
+    one, other = network.offsets[lane] + k, network.offsets[target] + k
+    dx = wrapped_any(network.points[other, 0] - network.points[one, 0], network.width)
+    dy = wrapped_any(network.points[other, 1] - network.points[one, 1], network.height)
+    return math.sqrt(dx * dx + dy * dy)
+
+
 @njit(_nrt=False)
 def _choose_neighbour(network, drivers, world, i, ego):
-    """MOBIL (Kesting et al. 2007). Not inlined: calls are expensive but rare."""
+    """MOBIL (Kesting et al. 2007, equations 1 and 2). Not inlined: calls are expensive but rare."""
     car = world[i]
     lane = _I(car[LANE])
-    mine = car[ACCELERATION]
+    own_length = _F(2.0) * drivers.half_length
+    desired = _desired(network, car)
     best, gain = _I(-1), drivers.threshold
     for side in range(2):
         target = network.left[lane] if side == 0 else network.right[lane]
         if target < 0:
             continue
         along = car[ALONG] / network.steps[lane] * network.steps[target]
-        # The gaps to the next cars ahead and behind in the target lane.
+        apart = _lanes_apart(network, lane, car[ALONG], target)
+        # The gaps to the next cars ahead and behind in the target lane, and to the one behind in its own.
         front, front_speed, rear, rear_speed, rear_desired = _F(1e9), _ZERO, _F(1e9), _ZERO, _ONE
+        left_behind, left_speed, left_desired = _F(1e9), _ZERO, _ONE
         free = True
         for j in range(world.shape[0] + 1):
             if j == i:
@@ -295,80 +350,75 @@ def _choose_neighbour(network, drivers, world, i, ego):
             if dx * dx + dy * dy > LANE_CHANGE_SIGHT * LANE_CHANGE_SIGHT:
                 continue
             if j < world.shape[0]:
-                there = _I(other[LANE])
-                place = other[ALONG]
-                ahead = _F(1e9)
-                if there == target:
-                    ahead = place - along
-                elif network.successors[target, 0] == there:
-                    ahead = lane_length(network, target) - along + place
-                elif network.successors[there, 0] == target:
-                    ahead = along + lane_length(network, there) - place
-                    ahead = -ahead
-                elif there != lane and other[SHIFT] != _ZERO and dx * dx + dy * dy < _F(400.0):
+                ahead = _way_between(network, target, along, other)
+                behind = -_way_between(network, lane, car[ALONG], other)
+                changes = ahead > _F(1e8) and behind < _F(-1e8) and other[SHIFT] != _ZERO
+                if changes and dx * dx + dy * dy < _F(400.0):
                     free = False  # another car is changing lanes, to or from the target lane
-                if ahead > _F(1e8):
-                    continue
+                wish = _desired(network, other)
             else:
-                ahead = dx * car[COS] + dy * car[SIN]  # the ego car is on no lane
+                forward = dx * car[COS] + dy * car[SIN]  # the ego car is on no lane
                 aside = dy * car[COS] - dx * car[SIN]
-                sideways = NEIGHBOUR_LANE if side == 0 else -NEIGHBOUR_LANE
-                if abs(aside - sideways) > NEIGHBOUR_HALF_WIDTH + NEIGHBOUR_WIDENING * ahead * ahead:
-                    continue
-            if abs(ahead) < _F(2.0) * drivers.half_length + drivers.jam:
+                reach = _HALF * apart + drivers.half_width + NEIGHBOUR_WIDENING * forward * forward
+                sideways = apart if side == 0 else -apart
+                ahead = forward if abs(aside - sideways) <= reach else _F(1e9)
+                behind = -forward if abs(aside) <= reach else _F(-1e9)
+                wish = other[SPEED]
+            if abs(ahead) < own_length + drivers.jam:
                 free = False
-            if ahead >= _ZERO and ahead < front:
+            if _ZERO <= ahead < front:
                 front, front_speed = ahead, other[SPEED]
             if ahead < _ZERO and -ahead < rear:
-                rear, rear_speed = -ahead, other[SPEED]
-                rear_desired = _desired(network, other) if j < world.shape[0] else other[SPEED]
+                rear, rear_speed, rear_desired = -ahead, other[SPEED], wish
+            if _ZERO < behind < left_behind:
+                left_behind, left_speed, left_desired = behind, other[SPEED], wish
         if not free:
             continue
-        desired = _desired(network, car)
-        there = idm(drivers, car[SPEED], desired, front - _F(2.0) * drivers.half_length, front_speed)
-        behind = _ZERO
-        lost = _ZERO
+        there = idm(drivers, car[SPEED], desired, front - own_length, front_speed)
+        others = _ZERO  # m/s2 that the followers gain
+        new_follower = _ZERO
         if rear < _F(1e8):
-            behind = idm(drivers, rear_speed, rear_desired, rear - _F(2.0) * drivers.half_length, car[SPEED])
-            alone = idm(drivers, rear_speed, rear_desired, _F(1e9), _ZERO)
-            lost = max(alone - behind, _ZERO)
-        if behind < -drivers.safe or there < -drivers.safe:
+            new_follower = idm(drivers, rear_speed, rear_desired, rear - own_length, car[SPEED])
+            others += new_follower - idm(drivers, rear_speed, rear_desired, rear + front - own_length, front_speed)
+        if left_behind < _F(1e8):
+            gap = left_behind - drivers.half_length + car[GAP]
+            others += idm(drivers, left_speed, left_desired, gap, car[LEAD_SPEED])
+            others -= idm(drivers, left_speed, left_desired, left_behind - own_length, car[SPEED])
+        if new_follower < -drivers.safe or there < -drivers.safe:
             continue
-        advantage = there - mine - drivers.politeness * lost
+        advantage = there - car[ACCELERATION] + drivers.politeness * others
         if advantage > gain:
             best, gain = _I(target), advantage
     if best >= 0:
-        toward = _ONE if best == network.left[lane] else -_ONE
-        car[ALONG] = car[ALONG] / network.steps[lane] * network.steps[best]
-        first, second = network.offsets[lane], network.offsets[best]
-        k = _I(car[ALONG] / network.steps[best])
-        dx = network.points[second + k, 0] - network.points[first + k, 0]
-        dy = network.points[second + k, 1] - network.points[first + k, 1]
-        dx, dy = wrapped_any(dx, network.width), wrapped_any(dy, network.height)
-        car[SHIFT] = -toward * math.sqrt(dx * dx + dy * dy)
+        along, onward, beyond = car[ALONG], car[NEXT], car[SECOND_NEXT]
+        apart = _lanes_apart(network, lane, along, best)
+        car[SHIFT] = -apart if best == network.left[lane] else apart
+        car[ALONG] = along / network.steps[lane] * network.steps[best]
         car[LANE] = _F(best)
         car[NEXT] = _F(choose_lane(network, best, car))
         car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
+        # On its way over it must not touch whoever is ahead in its own lane.
+        car[GAP], car[LEAD_SPEED] = _F(1e9), _ZERO
+        for j in range(world.shape[0]):
+            if j != i and world[j, LANE] >= _ZERO:
+                update_gap(network, drivers, car, world[j], False)
+        if ego[COS] != _ZERO or ego[SIN] != _ZERO:
+            update_gap(network, drivers, car, ego, True)
+        if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe:
+            car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO
 
 
 @leaf
 def _move(network, drivers, car, ego):
     """Move one car for a control period along its lane, and sideways: to the right for the ego car, or back."""
-    after = max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
-    car[ALONG] += _HALF * (car[SPEED] + after) * drivers.dt
+    before, after = car[SPEED], max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
+    car[ALONG] += _HALF * (before + after) * drivers.dt
     car[SPEED] = after
-    sway, place = _ZERO, _ZERO
-    if meets_ego(network, car, ego):
-        place = -room_to_right(network, car)
-    if car[SHIFT] != place:
-        slide = min(drivers.shift * drivers.dt, abs(car[SHIFT] - place)) * min(after, _ONE)
-        if car[SHIFT] > place:
-            slide = -slide
-        car[SHIFT] += slide
-        if abs(car[SHIFT] - place) < _F(1e-3):
-            car[SHIFT] = place
-        sway = slide / max(after * drivers.dt, _F(0.1))
-        sway = min(max(sway, _F(-0.2)), _F(0.2))
+    place = -room_to_right(network, car) if meets_ego(network, car, ego) else _ZERO
+    shift = car[SHIFT]
+    if shift != place or car[SWAY] != _ZERO:
+        way = _HALF * (before + after) * drivers.dt
+        car[SHIFT], car[SWAY] = _swerve(drivers, after, shift, car[SWAY], place, way)
     length = lane_length(network, _I(car[LANE]))
     if car[ALONG] >= length:
         lane = _I(car[LANE])
@@ -379,7 +429,10 @@ def _move(network, drivers, car, ego):
         car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
     elif car[JUNCTION_BEHIND] >= _ZERO and car[ALONG] > drivers.half_length + _ONE:
         car[JUNCTION_BEHIND] = -_ONE
-    set_pose(network, car, sway)
+    set_pose(network, car)
+    if car[SHIFT] != shift and touches_ego(network, drivers, car, ego):
+        car[SHIFT], car[SWAY] = shift, _ZERO  # beside the ego car it stays where it is
+        set_pose(network, car)
 
 
 @leaf

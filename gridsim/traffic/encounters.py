@@ -9,7 +9,6 @@ import numpy as np
 from gridsim.car.ego import STEERING
 from gridsim.car.vehicle import advance, path_curvature
 from gridsim.config import (
-    CONTACT_DISTANCE,
     EMERGENCY_BRAKING,
     FORESIGHT,
     FORESIGHT_STEP,
@@ -28,11 +27,21 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 @leaf
 def meets_ego(network, car, ego):
-    """Whether the ego car is near, ahead, and oncoming or crossing."""
-    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE:
+    """Whether the ego car is near, ahead, and oncoming or crossing, or was when the car moved over for it."""
+    same_way = car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO
+    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or same_way:
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
     return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > MEETING_OVER
+
+
+@leaf
+def touches_ego(network, drivers, car, ego):
+    """Whether a car touches the ego car, if there is one."""
+    if ego[COS] == _ZERO and ego[SIN] == _ZERO:
+        return False
+    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
+    return boxes_touch(drivers, dx, dy, car[COS], car[SIN], ego[COS], ego[SIN])
 
 
 @leaf
@@ -64,13 +73,14 @@ def way_to_ego_collision(network, drivers, car, ego):
     """
     lane = _I(car[LANE])
     length, begin = lane_length(network, lane), -car[ALONG]  # length of the lane, way to its beginning (m)
+    contact = _F(2.0) * math.sqrt(drivers.half_length * drivers.half_length + drivers.half_width * drivers.half_width)
     x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
     curvature = path_curvature(drivers.ego, speed, ego[STEERING])
     dx, dy = wrapped(x - car[X], network.width), wrapped(y - car[Y], network.height)
     t = _ZERO
     while True:
         # The earliest time at which they can touch.
-        hop = max((math.sqrt(dx * dx + dy * dy) - CONTACT_DISTANCE) / (car[SPEED] + abs(speed)), FORESIGHT_STEP)
+        hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
         if t > FORESIGHT:
             return _F(1e9)
@@ -90,7 +100,7 @@ def way_to_ego_collision(network, drivers, car, ego):
         px, py = shifted_right(network, k, k + _N(1), right)
         x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
         dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
-        if dx * dx + dy * dy > CONTACT_DISTANCE * CONTACT_DISTANCE:
+        if dx * dx + dy * dy > contact * contact:
             continue
         ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]
         ux, uy = ux - network.points[k, 0], uy - network.points[k, 1]

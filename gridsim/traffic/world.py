@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, TrafficConfig
+from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, STOP_LINE_GAP, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import Network, wrapped
@@ -36,15 +36,16 @@ HORIZON = 16  # m ahead that it looks in this step
 GAP = 17  # m from its middle to the nearest obstacle
 LEAD_SPEED = 18  # m/s, of that obstacle along its heading
 LANE_TIMER = 19  # control steps until its next decision on a change of lanes
-FIELDS = 20
+SWAY = 20  # m to the left of its lane for each m of way, while SHIFT changes
+FIELDS = 21
 
 _MOST = 1 << 24  # float32 represents all whole numbers up to it
 _FASTEST = 40.0  # m/s, above any car's speed; slow enough that no car skips a lane in a control period
 
 
 @leaf
-def set_pose(network, car, sway):
-    """Set a car's pose from LANE, ALONG and SHIFT; `sway` is its sideways speed relative to its speed."""
+def set_pose(network, car):
+    """Set a car's pose from LANE, ALONG, SHIFT and SWAY."""
     one, two = _U(1), _U(2)
     lane = _U(_I(car[LANE]))
     first = _U(network.offsets[lane])
@@ -65,6 +66,7 @@ def set_pose(network, car, sway):
     # NumPy's floor, because that of `math` returns int64, whose product with float32 is float64.
     car[X] = x - np.floor(x / network.width) * network.width
     car[Y] = y - np.floor(y / network.height) * network.height
+    sway = car[SWAY]
     if sway != _ZERO:
         norm = _ONE / math.sqrt(_ONE + sway * sway)
         tx, ty = (tx - sway * ty) * norm, (ty + sway * tx) * norm
@@ -100,8 +102,8 @@ def _is_free(network, world, n, x, y, apart):
 
 
 @njit(nogil=True)
-def _spawn(network, mileage, start, key, gap, ego_gap, world):
-    """Spawn a world [cars, FIELDS]: uniformly over the lanes outside junctions, apart from each other and the ego."""
+def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
+    """Spawn a world [cars, FIELDS]: uniformly over the lanes from `first` on, apart from each other and the ego."""
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
@@ -114,10 +116,8 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             metres = (bits >> _U(11)) * (1.0 / (1 << 53)) * mileage[-1]
             lane = np.searchsorted(mileage, metres, side="right") - 1
             lane = min(lane, len(mileage) - 2)
-            if network.crossing_offsets[lane + 1] > network.crossing_offsets[lane]:
-                continue
-            car[LANE], car[ALONG] = _F(lane), _F(metres - mileage[lane])
-            set_pose(network, car, _ZERO)
+            car[LANE], car[ALONG] = _F(lane), _F(first[lane] + metres - mileage[lane])
+            set_pose(network, car)
             dx, dy = car[X] - start[0], car[Y] - start[1]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
@@ -131,17 +131,24 @@ def _spawn(network, mileage, start, key, gap, ego_gap, world):
             car[LANE] = -_ONE
 
 
-def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: TrafficConfig) -> np.ndarray:
+def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
     """Worlds float32 [n, cars, FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
     Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
-    worlds = np.zeros((len(starts), cars, FIELDS), dtype=np.float32)
+    worlds, traffic = np.zeros((len(starts), cars, FIELDS), dtype=np.float32), config.traffic
     if cars and len(network.offsets) > 1:
+        half = config.vehicle.length / 2
         lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
-        mileage = np.concatenate([[0.0], np.cumsum(lengths)])
+        junction = np.diff(network.crossing_offsets) > 0
+        behind = np.isin(np.arange(len(lengths)), network.successors[junction])  # a junction
+        before = junction[network.successors[:, 0]]
+        first = np.where(behind, half, 0.0)
+        last = lengths - np.where(before, half + float(STOP_LINE_GAP), 0.0)
+        mileage = np.concatenate([[0.0], np.cumsum(np.where(junction, 0.0, np.maximum(last - first, 0.0)))])
+        gaps = _F(traffic.spawn_gap), _F(traffic.spawn_gap_ego)
         for world, start, key in zip(worlds, np.asarray(starts, dtype=np.float32), keys, strict=True):
-            _spawn(network, mileage, start, _U(key), _F(config.spawn_gap), _F(config.spawn_gap_ego), world)
+            _spawn(network, mileage, first, start, _U(key), *gaps, world)
     else:
         worlds[:, :, LANE] = -1.0
     return worlds

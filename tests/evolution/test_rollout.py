@@ -146,7 +146,7 @@ def test_a_key_stands_for_its_world(among):
     simulator = Simulator(maps, 9, CONFIG, traffic=CARS)
     simulator.reset(episodes["start"], episodes["map"], keys=keys)
     for k, episode in enumerate(episodes):
-        world = spawn(maps[episode["map"]].network, episode["start"][None], CARS, keys[k : k + 1], CONFIG.traffic)
+        world = spawn(maps[episode["map"]].network, episode["start"][None], CARS, keys[k : k + 1], CONFIG)
         assert simulator.state.worlds[k].tobytes() == world[0].tobytes()
 
 

@@ -7,6 +7,7 @@ import oracle
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pictures import crashes
 from scipy import stats
 
 from gridsim.car.ego import STEERING
@@ -14,6 +15,7 @@ from gridsim.car.vehicle import path_curvature
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
+from gridsim.maps.map import sample_starts
 from gridsim.maps.network import make_network, wrapped
 from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
@@ -25,6 +27,7 @@ from gridsim.traffic.world import (
     FIELDS,
     JUNCTION_BEHIND,
     LANE,
+    LANE_TIMER,
     NEXT,
     PERMIT,
     SECOND_NEXT,
@@ -50,8 +53,7 @@ def network_of(paths, width, height, limit=12.0, abreast=1, beside=None):
     lanes = lay_lanes(paths, width, height, abreast)
     for array in vars(lanes).values():
         freeze(array)
-    room = None if beside is None else beside(lanes.points).astype(F)
-    return make_network(lanes, width, height, limit, CONFIG.traffic, room)
+    return make_network(lanes, width, height, limit, CONFIG, beside)
 
 
 @pytest.fixture(scope="module")
@@ -378,6 +380,7 @@ def test_the_second_of_a_queue_has_no_permit_before_the_first():
 
 def test_a_fast_car_passes_a_slow_one(abreast):
     world = cars_on(abreast, (1, 200.0, 8.0, 0.5), (1, 150.0, 15.0, 1.0))
+    world[0, LANE_TIMER] = 1e6  # it does not give way
     history = watch(abreast, world, 60)
     assert 0 in history[:, 1, LANE]
     assert history[-200:, 1, SPEED] == pytest.approx(20.0, abs=0.3)
@@ -386,6 +389,45 @@ def test_a_fast_car_passes_a_slow_one(abreast):
     y = history[:, 1, Y].astype(float)
     assert np.abs(np.diff(y)).max() < CONFIG.traffic.lane_change_speed * DT + 1e-3
     assert y.max() == pytest.approx(35.75, abs=0.05)
+    heading = np.degrees(np.arctan2(history[:, 1, SIN], history[:, 1, COS]))
+    assert np.abs(heading).max() > 2.0
+    assert np.abs(np.diff(heading)).max() < 2.0  # and it turns as gently as in a bend
+
+
+@pytest.mark.parametrize(("behind", "gives_way"), [(40.0, False), (16.0, True)])
+def test_a_car_changes_lanes_for_who_is_held_up_behind(abreast, behind, gives_way):
+    """Equation 2 of Kesting et al. 2007: a car that gains nothing itself moves over for what its follower gains."""
+    world = cars_on(abreast, (1, 200.0, 8.0, 0.4), (1, 200.0 - behind, 8.0, 1.0))
+    world[1, LANE_TIMER] = 9.0
+    flow(abreast, D, world, NOBODY)
+    assert (world[0, LANE] == 0) == gives_way
+
+
+def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
+    """Its loss is against its present acceleration, behind a car of its own, and not against a free road."""
+    ahead, follower = (1, 214.8, 8.0, 0.4), (0, 186.0, 8.0, 2.0)
+    world = cars_on(abreast, ahead, (1, 200.0, 8.0, 0.8), follower, (0, 222.0, 8.0, 0.4))
+    world[[0, 2, 3], LANE_TIMER] = 9.0
+    flow(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
+    assert world[1, LANE] == 0
+
+
+@pytest.mark.parametrize("scenario", REGISTRY)
+def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario):
+    """Six starts among 24 cars, two minutes each; on the highway cars behind it change lanes."""
+    for seed in (3, 5, 6, 8, 10, 12):
+        here = build(scenario, HELD_OUT_SEED + seed)
+        start = sample_starts(here, 1, np.random.default_rng(seed))
+        world = spawn(here.network, start, 24, np.array([seed], dtype=np.uint64), CONFIG)[0]
+        stands = ego(start[0, 0] % here.network.width, start[0, 1] % here.network.height, start[0, 2])
+        history = watch(here.network, world, 120, stands)
+        cars = history[history[..., LANE] >= 0]
+        dx, dy = stands[X] - cars[:, X], stands[Y] - cars[:, Y]
+        for near in cars[dx**2 + dy**2 < 36.0]:
+            away = stands[[X, Y]] - near[[X, Y]]
+            assert not boxes_touch(K, *away, near[COS], near[SIN], stands[COS], stands[SIN])
+        poses = np.column_stack([cars[:, X], cars[:, Y], np.arctan2(cars[:, SIN], cars[:, COS])])
+        assert not crashes(here.road, poses).any()
 
 
 def test_a_car_boxed_in_stays(abreast):
@@ -400,7 +442,7 @@ def test_nobody_cuts_in_on_another(seed):
     """At each change of lanes on a dense highway neither the new follower nor the car itself has to brake harder than
     is safe, by the oracle's law and their places just before."""
     network = build("highway", seed).network
-    world = spawn(network, FAR[None], 30, np.array([seed], dtype=np.uint64), CONFIG.traffic)[0]
+    world = spawn(network, FAR[None], 30, np.array([seed], dtype=np.uint64), CONFIG)[0]
     history = watch(network, world, 300)
     lane, shift = history[:, :, LANE], history[:, :, SHIFT]
     changes = [(t, i) for t, i in np.argwhere((shift[1:] != 0) & (shift[:-1] == 0)) if lane[t + 1, i] >= 0]
@@ -437,17 +479,23 @@ def test_nobody_cuts_in_on_another(seed):
 def test_cars_spawn_uniformly_over_the_lanes_outside_junctions(scenario):
     network = build(scenario, 1).network
     keys = np.arange(4000, dtype=np.uint64)
-    cars = spawn(network, np.repeat(FAR[None], 4000, axis=0), 1, keys, CONFIG.traffic)[:, 0].astype(float)
+    cars = spawn(network, np.repeat(FAR[None], 4000, axis=0), 1, keys, CONFIG)[:, 0].astype(float)
     assert (cars[:, LANE] >= 0).mean() > 0.99
     cars = cars[cars[:, LANE] >= 0]
     lane = cars[:, LANE].astype(int)
     lengths = np.array([length_of(network, k) for k in range(len(network.steps))])
     free = np.diff(network.crossing_offsets) == 0
     assert free[lane].all()
+    # No part of a car is in a junction: neither its nose past the line nor its rear.
+    before = np.array([not free[network.successors[k, 0]] for k in range(len(free))])
+    behind = np.isin(np.arange(len(free)), network.successors[~free])
+    first, last = behind * LENGTH / 2, lengths - before * (LENGTH / 2 + 0.25)
+    assert (cars[:, ALONG] >= first[lane] - 1e-3).all()
+    assert (cars[:, ALONG] <= last[lane] + 1e-3).all()
     counts = np.bincount(lane, minlength=len(lengths))
-    expected = np.where(free, lengths, 0.0) / lengths[free].sum() * len(cars)
+    expected = np.where(free, last - first, 0.0) / (last - first)[free].sum() * len(cars)
     assert stats.chisquare(counts[free], expected[free]).pvalue > 1e-3
-    assert stats.kstest(cars[:, ALONG] / lengths[lane], "uniform").pvalue > 1e-3
+    assert stats.kstest((cars[:, ALONG] - first[lane]) / (last - first)[lane], "uniform").pvalue > 1e-3
     assert stats.kstest(cars[:, SPEED_FACTOR], "uniform", args=(0.9, 0.3)).pvalue > 1e-3
 
 
@@ -457,7 +505,7 @@ def test_spawned_cars_keep_their_distance(scenario):
     rng = np.random.default_rng(0)
     starts = np.zeros((40, 5), dtype=F)
     starts[:, :2] = network.points[rng.integers(len(network.points), size=40)] % [network.width, network.height]
-    worlds = spawn(network, starts, 12, np.arange(40, dtype=np.uint64), CONFIG.traffic).astype(float)
+    worlds = spawn(network, starts, 12, np.arange(40, dtype=np.uint64), CONFIG).astype(float)
     sides = np.array([network.width, network.height], dtype=float)
     for world, start in zip(worlds, starts, strict=True):
         here = world[world[:, LANE] >= 0][:, [X, Y]]
@@ -474,27 +522,23 @@ def test_spawned_cars_keep_their_distance(scenario):
 def test_the_same_key_gives_the_same_world_in_any_company():
     network = build("city", 0).network
     starts, keys = np.repeat(FAR[None], 6, axis=0), np.arange(6, dtype=np.uint64)
-    together = spawn(network, starts, 5, keys, CONFIG.traffic)
+    together = spawn(network, starts, 5, keys, CONFIG)
     for k in range(6):
-        assert (
-            spawn(network, starts[k : k + 1], 5, keys[k : k + 1], CONFIG.traffic)[0].tobytes() == together[k].tobytes()
-        )
+        assert spawn(network, starts[k : k + 1], 5, keys[k : k + 1], CONFIG)[0].tobytes() == together[k].tobytes()
     assert len({world.tobytes() for world in together}) == 6
-    assert spawn(network, starts[:1], 3, keys[:1], CONFIG.traffic)[0].tobytes() == together[0, :3].tobytes()
+    assert spawn(network, starts[:1], 3, keys[:1], CONFIG)[0].tobytes() == together[0, :3].tobytes()
 
 
 def test_more_cars_than_fit_leave_some_out(ring):
     small = network_of([Path(0.0, 32.0, 0.0, ((128.0, 0.0),))], 128.0, 64.0)
-    world = spawn(
-        small, np.array([[10.0, 32.0, 0, 0, 0]], dtype=F), 30, np.array([4], dtype=np.uint64), CONFIG.traffic
-    )[0]
+    world = spawn(small, np.array([[10.0, 32.0, 0, 0, 0]], dtype=F), 30, np.array([4], dtype=np.uint64), CONFIG)[0]
     absent = world[:, LANE] < 0
     assert 3 <= (~absent).sum() <= 84 / 14 + 1
     history = watch(small, world, 60)
     still = [X, Y, LANE, ALONG, SPEED]
     assert (history[:, absent][..., still] == world[absent][:, still]).all()  # they stay away
     assert history[:, ~absent, SPEED].max() > 5.0
-    assert (spawn(ring, FAR[None], 0, np.zeros(1, dtype=np.uint64), CONFIG.traffic)).shape == (1, 0, FIELDS)
+    assert (spawn(ring, FAR[None], 0, np.zeros(1, dtype=np.uint64), CONFIG)).shape == (1, 0, FIELDS)
 
 
 def open_road(network):
@@ -510,7 +554,7 @@ def test_traffic_alone_neither_crashes_nor_stops(scenario, seed, cars):
     is the same for hours."""
     network = build(scenario, seed).network
     world = spawn(
-        network, FAR[None], cars or REGISTRY[scenario].traffic or 6, np.array([seed], dtype=np.uint64), CONFIG.traffic
+        network, FAR[None], cars or REGISTRY[scenario].traffic or 6, np.array([seed], dtype=np.uint64), CONFIG
     )
     history = watch(network, world[0], 300).astype(float)
     there = history[0, :, LANE] >= 0

@@ -41,7 +41,7 @@ LANES, LENGTH = "lanes", "length"  # of the map, and m of the car's lane
 def test_what_traffic_comes_to_is_taken(name):
     """Forty seconds of a crowd, some of whom find no room."""
     network = build(name, 3).network
-    world = spawn(network, FAR, 150, np.array([4], dtype=np.uint64), CONFIG.traffic)[0]
+    world = spawn(network, FAR, 150, np.array([4], dtype=np.uint64), CONFIG)[0]
     assert (world[:, LANE] >= 0).sum() > 20
     for _ in range(400):
         check_worlds(world, network)
@@ -58,7 +58,7 @@ def maps_with_traffic():
     starts = np.concatenate([sample_starts(scenarios[k % 2], 1, rng) for k in range(4)])
     keys = np.arange(4, dtype=np.uint64)
     worlds = np.concatenate(
-        [spawn(scenarios[k % 2].network, starts[k : k + 1], 3, keys[k : k + 1], CONFIG.traffic) for k in range(4)]
+        [spawn(scenarios[k % 2].network, starts[k : k + 1], 3, keys[k : k + 1], CONFIG) for k in range(4)]
     )
     assert (worlds[..., LANE] >= 0).all()
     return scenarios, starts, worlds
