@@ -68,7 +68,7 @@ def rollout_rays(champion: Champion, maps: list[Map], runs: int, traffic: int = 
     """(car-steps/s, m/s driven) of the fused rollout of whole episodes."""
     spec, episode = PolicySpec.parse(champion.policy), champion.sim.episode
     rng = np.random.default_rng(0)
-    episodes, worlds = lane_starts(maps, np.arange(EPISODES) % len(maps), rng, traffic, champion.sim.traffic)
+    episodes, worlds = lane_starts(maps, np.arange(EPISODES) % len(maps), rng, traffic, champion.sim)
     limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
 
     def run() -> np.ndarray:

@@ -41,7 +41,7 @@ def main() -> int:
     for name, (number, start, seconds) in MOMENTS.items():
         scenario = build(name, HELD_OUT_SEED + number, champion.sim)
         rng = np.random.default_rng(scenario.seed)
-        episodes, worlds = lane_starts([scenario], np.zeros(STARTS, dtype=int), rng, TRAFFIC, champion.sim.traffic)
+        episodes, worlds = lane_starts([scenario], np.zeros(STARTS, dtype=int), rng, TRAFFIC, champion.sim)
         drive = record(champion, scenario, episodes["start"][start], seconds, worlds[start])
         drawn = picture(Renderer(scenario, SIZE, config=champion.sim), drive, seconds, name)
         # 256 colours are enough, and a third of the bytes.
