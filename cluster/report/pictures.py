@@ -66,7 +66,7 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
     for axis in axes:
         axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
-        axis.legend(frameon=False, fontsize=8)
+        axis.legend(loc="lower right", frameon=False, fontsize=8)
     figure.savefig(Path(path), dpi=100)
 
 
