@@ -465,23 +465,6 @@ def rays_to_boxes(
     return np.where(hit, way, np.inf).reshape(len(angles), -1).min(axis=1)
 
 
-def outlines_meet(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Whether rectangles [n, 4, 2] share ground with others [n, 4, 2]: bool [n].
-
-    An edge of one then crosses an edge of the other, or one lies within the other and so does its middle.
-    """
-    p, q = one[:, :, None], other[:, None]
-    r, s = np.roll(p, -1, axis=1) - p, np.roll(q, -1, axis=2) - q
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t, u = _cross(q - p, s) / _cross(r, s), _cross(q - p, r) / _cross(r, s)
-    crossing = (t >= 0.0) & (t <= 1.0) & (u >= 0.0) & (u <= 1.0)
-    within = [
-        (_cross(np.roll(a, -1, axis=1) - a, b.mean(axis=1, keepdims=True) - a) >= 0.0).all(axis=1)
-        for a, b in ((one, other), (other, one))
-    ]
-    return crossing.any(axis=(1, 2)) | within[0] | within[1]
-
-
 def overlap_area(one: np.ndarray, other: np.ndarray) -> float:
     """Area (m2) that two convex polygons [n, 2], counter-clockwise, share: Sutherland and Hodgman 1974."""
     kept = list(one)
