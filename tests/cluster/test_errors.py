@@ -233,7 +233,7 @@ def recorded(champion, tmp_path_factory):
 def test_champion_against_its_own_recording_is_zero(champion, recorded):
     found = errors(champion, reference=recorded / "own.csv")
     assert found["metres"] > 290.0
-    assert (found["velocity_max_mps"], found["steering_max_deg"]) == pytest.approx((0.0, 0.0), abs=1e-4)
+    assert (found["velocity_max_mps"], found["steering_max_deg"]) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
 def test_champion_begins_anew_where_it_leaves_the_recording(champion, recorded):

@@ -98,7 +98,7 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
 
 def test_drive_of_another_map_is_refused(recorded):
     drive = read_drive(recorded[0])
-    wrong = build("seamless", 41)  # where it starts, there is no road
+    wrong = build("seamless", 42)  # where it starts, there is no road
     with pytest.raises(DriveError, match="another map"):
         replay(drive, wrong)
 
