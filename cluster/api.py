@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
 from gridsim.config import SimConfig
 
-__all__ = ["Champion", "DqnSettings", "EvolveSettings", "evaluate", "evolve", "load_champion", "train_dqn"]
+__all__ = ["Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn"]
 
 Fitness = Callable[[np.ndarray, np.ndarray | float], np.ndarray]
 OnStep = Callable[[int, dict[str, float]], None]
@@ -62,6 +64,28 @@ def train_dqn(
     >>> champion, history = gridsim.train_dqn(scenario="curved", car_steps=1000)
     """
     return _train(settings or DqnSettings(**flags), workers, on_evaluation)
+
+
+def compare(*runs: str | os.PathLike[str], reference: str = "") -> list[dict[str, Any]]:
+    """Compare finished runs, as `gridsim-compare RUNS` does: figures of each, and its errors against the reference.
+
+    Args:
+        runs: their folders; a comparison's folder stands for all of its finished runs.
+        reference: a drive that gridsim-drive recorded; "" is the reference driver.
+
+    Returns: a row for each run: folder, scenario, learner, seed, traffic, and the figures as table.csv names them; nan
+    where an error is not known.
+    Raises: GridSimError with one line for what is no finished run.
+    """
+    from cluster.comparison.plan import read_runs
+    from cluster.comparison.results import errors_of
+
+    names = ("scenario", "learner", "seed", "traffic")
+    return [
+        {"run": str(run.folder), **{name: getattr(run.settings, name) for name in names}}
+        | {**run.figures, **errors_of(run, reference)}
+        for run in read_runs(map(Path, runs))
+    ]
 
 
 def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:

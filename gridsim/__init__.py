@@ -22,7 +22,7 @@ ENVIRONMENTS = {
 """The scenario of each environment id."""
 
 _API_MODULE = "cluster.api"
-_API = ("Champion", "DqnSettings", "EvolveSettings", "evaluate", "evolve", "load_champion", "train_dqn")
+_API = ("Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn")
 
 for _id, _scenario in ENVIRONMENTS.items():
     _register(

@@ -3,6 +3,7 @@
 from cluster.api import Champion as Champion
 from cluster.api import DqnSettings as DqnSettings
 from cluster.api import EvolveSettings as EvolveSettings
+from cluster.api import compare as compare
 from cluster.api import evaluate as evaluate
 from cluster.api import evolve as evolve
 from cluster.api import load_champion as load_champion

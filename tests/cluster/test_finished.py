@@ -6,6 +6,7 @@ import json
 import pytest
 from finished_runs import HELD_OUT, make_run
 
+import gridsim
 from cluster.comparison.results import ERROR_FIGURES, LEARNERS, ExperimentError, errors_of, read_run
 from gridsim.errors import GridSimError
 
@@ -17,6 +18,22 @@ def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path)
     other = dataclasses.replace(made, figures={**made.figures, "distance_m": 2000.0})
     with pytest.raises(ExperimentError, match="another version of GridSim made it"):
         errors_of(other, "")
+
+
+def test_runs_are_compared_from_python(tmp_path):
+    make_run(tmp_path / "a", "evolution", "curved", 1)
+    make_run(tmp_path / "b", "dqn", "curved", 2)
+    first, second = gridsim.compare(tmp_path / "a", tmp_path / "b")
+    assert (first["learner"], first["scenario"], first["seed"], first["success_rate"]) == (
+        "evolution",
+        "curved",
+        1,
+        0.5,
+    )
+    assert (second["run"], second["learner"], second["traffic"]) == (str(tmp_path / "b"), "dqn", 0)
+    assert set(ERROR_FIGURES) <= set(first)
+    with pytest.raises(GridSimError, match="no such folder"):
+        gridsim.compare(tmp_path / "c")
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
