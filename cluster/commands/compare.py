@@ -34,7 +34,7 @@ from cluster.commands.common import (
     short_path,
     warn_of_many_workers,
 )
-from cluster.commands.progress import Line, clock, way
+from cluster.commands.progress import Line, clock, progress_of
 from cluster.comparison import tables
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run, series_of
@@ -337,7 +337,7 @@ class Progress(Line):
 
     def row(self, steps: int, row: dict[str, float]) -> None:
         success = f"success {row['validation/success_rate']:.0%}"
-        self.note(f"{way(self._learning, bound=False)}  {success}", self._learning.describe(row))
+        self.note(f"{progress_of(self._learning, bound=False)}  {success}", self._learning.describe(row))
 
     def done(self, run: Run) -> None:
         error = run.figures["velocity_error_percent"]

@@ -84,14 +84,14 @@ class Progress(Line):
         self._learning = session.learning
         self._advance()
         settings = session.run.settings
-        verb = "continuing" if self._learning.way()[0] else self._learning.verb
+        verb = "continuing" if self._learning.progress()[0] else self._learning.verb
         what = f"{settings.policy} on {settings.scenario}, seed {settings.seed}"
         self.console.print(f"{verb} {what} -> {self._folder}", soft_wrap=True)
         return self
 
     def _advance(self) -> None:
-        done, total, _ = self._learning.way()
-        self.head = way(self._learning)
+        done, total, _ = self._learning.progress()
+        self.head = progress_of(self._learning)
         self.share = int(done) / total if total else None
 
     def row(self, step: int, row: dict[str, float]) -> None:
@@ -105,7 +105,7 @@ class Progress(Line):
 
     def _eta(self, car_steps: float) -> str:
         """When the run reaches the first of its bounds at the pace of the latest steps. It may be solved before."""
-        now, (done, total, _) = time.perf_counter(), self._learning.way()
+        now, (done, total, _) = time.perf_counter(), self._learning.progress()
         self._steps.append((now, done, car_steps))
         while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:
             self._steps.popleft()
@@ -125,9 +125,9 @@ class Progress(Line):
             self.console.print(text)
 
 
-def way(learning: Learning, bound: bool = True) -> str:
+def progress_of(learning: Learning, bound: bool = True) -> str:
     """How far a run is, in words: what is done, not which step is the next."""
-    done, total, unit = learning.way()
+    done, total, unit = learning.progress()
     of = f"/{total:g}" if total and bound else ""
     return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{done:.0f}{of} {unit}"
 

@@ -220,7 +220,7 @@ class Dqn(Learning):
             "converged": self.converged,
         }
 
-    def way(self) -> tuple[float, float, str]:
+    def progress(self) -> tuple[float, float, str]:
         s = self.settings
         if s.episodes and not s.car_steps:
             return self.episodes, s.episodes, "episodes"

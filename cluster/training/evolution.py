@@ -148,7 +148,7 @@ class Evolution(Learning):
     def summary(self) -> dict[str, Any]:
         return {"generations": self.generation}
 
-    def way(self) -> tuple[float, float, str]:
+    def progress(self) -> tuple[float, float, str]:
         s = self.settings
         if s.car_steps and not s.generations:
             return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
@@ -156,7 +156,7 @@ class Evolution(Learning):
 
     def describe(self, row: dict[str, float]) -> str:
         plural = "" if self.generation == 1 else "s"
-        done = f"{self.generation} generation{plural}  " if self.way()[2] != "generations" else ""
+        done = f"{self.generation} generation{plural}  " if self.progress()[2] != "generations" else ""
         return (
             f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
             f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"

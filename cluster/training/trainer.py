@@ -172,7 +172,7 @@ class Learning(ABC):
         """What summary.json has only for this learner."""
 
     @abstractmethod
-    def way(self) -> tuple[float, float, str]:
+    def progress(self) -> tuple[float, float, str]:
         """How far the run is, how far it goes at most (0: unknown), and in what unit."""
 
     @abstractmethod

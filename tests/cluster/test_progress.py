@@ -18,9 +18,9 @@ WORDS = "240 generations  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"
 WIDTHS = [60, 80, 120]
 
 
-def learning(way=(12.3, 30.0, "M car-steps")):
+def learning(done=(12.3, 30.0, "M car-steps")):
     found: Any = SimpleNamespace(verb="evolving", describe=lambda row: WORDS, done=lambda: False)
-    found.way = lambda: way
+    found.progress = lambda: done
     found.settings = SimpleNamespace(policy="mlp:4", scenario="curved", seed=0, car_steps=30_000_000)
     return found
 
@@ -48,20 +48,20 @@ def after(monkeypatch, seconds):
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize(
-    ("way", "counter"),
+    ("done", "counter"),
     [((12.3, 30.0, "M car-steps"), "12.3/30 M car-steps"), ((240, 1200, "generations"), "240/1200 generations")],
 )
-def test_counter_success_and_eta_are_always_there(way, counter, width, monkeypatch):
-    learner = learning(way)
+def test_counter_success_and_eta_are_always_there(done, counter, width, monkeypatch):
+    learner = learning(done)
     shown, _ = begun(learner, width)
     assert drawn(shown, width).startswith(f"{counter}  success 0%  ETA -:--  ")
     shown.row(1, ROW)
-    learner.way = lambda: (way[0] * 1.5, *way[1:])
+    learner.progress = lambda: (done[0] * 1.5, *done[1:])
     after(monkeypatch, 3700.0)
     shown.row(2, {**ROW, "car_steps": 12_300_000.0 * 1.5})
     shown.members("validate", 3, 128)
     line = drawn(shown, width)
-    assert line.startswith(f"{progress.way(learner)}  success 37%  ETA 1:")
+    assert line.startswith(f"{progress.progress_of(learner)}  success 37%  ETA 1:")
     assert " at most  " in line
     assert ("validate   3/128  240 generations" in line) == (width >= 120)
 
@@ -89,7 +89,7 @@ def test_a_comparison_shows_the_same(width):
     shown = compare.Progress(console, ComparisonFolder(Path("runs/c"), plan), 3, 3)
     shown.begin(first)
     learner = learning((12, 10**15, "generations"))
-    shown.note(f"{progress.way(learner, bound=False)}  success 37%", learner.describe(ROW))
+    shown.note(f"{progress.progress_of(learner, bound=False)}  success 37%", learner.describe(ROW))
     line = drawn(shown, width)
     assert line.startswith("run 0/3  ETA 3:0")
     assert "  12 generations  success 37%  " in line
