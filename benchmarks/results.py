@@ -5,7 +5,7 @@ Each row is a command, run as a user would run it and timed from start to exit, 
 change of gridsim, evolution or cluster. So an interrupted measurement goes on where it was. --write puts the tables of
 which all rows are there into docs/results.md, with the commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, other, dqn, speed, comparison; all by default, in an hour and a half on two cores.
+Tables: seeds, roads, other, speed, comparison; all by default, in an hour on two cores.
 """
 
 from __future__ import annotations
@@ -39,9 +39,8 @@ COMMANDS = {
         "gridsim-evolve --recombination two",
         "gridsim-evolve --scenario curved --observation grid",
     ],
-    "dqn": [f"gridsim-dqn --seed {seed}" for seed in range(3)],
     "speed": ["benchmarks/throughput.py --json", "benchmarks/scaling.py --json"],
-    "comparison": ["gridsim-compare --learners evolution dqn --seeds 5"],
+    "comparison": ["gridsim-compare --learners evolution dqn --seeds 3"],
 }
 HEAD = (
     "| command | car-steps, million | to its end, s | success, % | collisions, % | speed, m/s |\n"

@@ -53,10 +53,10 @@ def test_script_runs(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.e2e
 def test_results_are_measured_once_and_printed_as_a_table(tmp_path: Path) -> None:
-    command = [sys.executable, str(FOLDER / "results.py"), "dqn", "--quick", "--output", str(tmp_path)]
+    command = [sys.executable, str(FOLDER / "results.py"), "seeds", "--quick", "--output", str(tmp_path)]
     first = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert first.returncode == 0, first.stderr
-    assert "| `gridsim-dqn --seed 0 --car-steps 1000` | 0.1 | " in first.stdout
+    assert "| `gridsim-evolve --seed 0 --car-steps 1000` | 0.0 | " in first.stdout
     runs = sorted(tmp_path.glob("*/summary.json"))
     again = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert (again.stdout, sorted(tmp_path.glob("*/summary.json"))) == (first.stdout, runs)
