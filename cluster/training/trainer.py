@@ -50,13 +50,14 @@ State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
 
 class Maps:
-    """Builds maps, each once, and ahead of their use in a thread; keeps the latest."""
+    """Builds maps, each once, and ahead of their use in threads; keeps the latest."""
 
     def __init__(self, scenario: str, config: SimConfig):
         self._scenario, self._config = scenario, config
         self._built: dict[int, Future[Map]] = {}
         self._lock = threading.Lock()
-        self._soon, self._later = (ThreadPoolExecutor(1, thread_name_prefix=f"maps-{k}") for k in range(2))
+        # Two threads for later ones: where the workers wait for validation's maps, both cores build them.
+        self._soon, self._later = (ThreadPoolExecutor(n, thread_name_prefix=f"maps-{n}") for n in (1, 2))
 
     def ahead(self, seeds: Sequence[int], later: bool = False) -> None:
         """Begin to build maps that will be needed, in this order; `later` ones do not keep others waiting."""
