@@ -170,7 +170,7 @@ def commit() -> str:
 
 def quick() -> dict[str, list[str]]:
     """The first command of each table, on a small scale."""
-    small = {"gridsim-evolve": "--car-steps 1000", "gridsim-dqn": "--car-steps 1000", "gridsim-compare": "--quick"}
+    small = {"gridsim-evolve": "--car-steps 1000", "gridsim-compare": "--quick"}
     firsts = {table: commands[0] for table, commands in COMMANDS.items()}
     return {table: [f"{first} {small.get(first.split()[0], '--runs 1')}"] for table, first in firsts.items()}
 

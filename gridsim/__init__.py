@@ -3,7 +3,7 @@
 Importing it registers the Gymnasium environments. That takes milliseconds, because Numba and the maps are loaded only
 when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
 
-`gridsim.evolve` and the others of `cluster.api` are looked up there when they are first used: everybody looks for them
+`gridsim.evolve` and the others of `cluster.api` are looked up there when they are first used: users look for them
 here, and the simulator does not import what trains in it.
 """
 

@@ -68,7 +68,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
         raise CheckpointError(f"{path}: truncated, or not written by GridSim")
     if content[-_DIGEST:] != hashlib.sha256(memoryview(content)[:-_DIGEST]).hexdigest().encode():
         raise CheckpointError(f"{path}: damaged or edited: its content does not match its checksum")
-    # A checksum is no signature: somebody else may have written these bytes. zipfile, numpy and json raise a dozen
+    # A checksum is no signature: another program may have written these bytes. zipfile, numpy and json raise a dozen
     # kinds of errors for such content, and all mean the same.
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:

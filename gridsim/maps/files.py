@@ -104,8 +104,8 @@ def problems_of(name: str, config: SimConfig) -> list[str]:
     if border >= MOST_BORDER and not file.torus:
         problems.append(
             f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
-            f"set negate: {int(not file.negate)} in its YAML; if cars shall stay within a track, make what is around "
-            "it wall"
+            f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
+            "surroundings as wall"
         )
     return problems
 

@@ -397,7 +397,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         car[LANE] = _F(best)
         car[NEXT] = _F(choose_lane(network, best, car))
         car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
-        # On its way over it must not touch whoever is ahead in its own lane.
+        # While it moves over, it must not touch the car ahead in its old lane.
         car[GAP], car[LEAD_SPEED] = _F(1e9), _ZERO
         for j in range(world.shape[0]):
             if j != i and world[j, LANE] >= _ZERO:

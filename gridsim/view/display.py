@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
-# What SDL goes by on Linux: a driver that is asked for by name, Wayland or X11.
+# What SDL looks at on Linux: a driver given by name, Wayland or X11.
 _VARIABLES = ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY", "DISPLAY")
 
 

@@ -42,7 +42,7 @@ def _positions(rng: np.random.Generator, count: int, least: float) -> np.ndarray
 def street_graph(rng: np.random.Generator, columns: int, rows: int) -> np.ndarray:
     """Open edges bool [rows, columns, 4] (east, north, west, south): connected, and two or more at each node.
 
-    Each street lacks one piece: whoever does not steer meets a wall.
+    Each street lacks one piece: a car that does not steer meets a wall.
     """
     while True:
         edges = np.ones((rows, columns, 4), dtype=bool)

@@ -59,7 +59,7 @@ def _neighbour(tile: int, direction: int) -> int:
 def tile_graph(rng: np.random.Generator) -> np.ndarray:
     """Open edges bool [tiles, 4] (east, north, west, south) of a connected network without dead ends.
 
-    No straight road closes round the torus: whoever does not steer leaves it.
+    No straight road closes round the torus: a car that does not steer leaves it.
     """
     while True:
         edges = np.zeros((TILES * TILES, 4), dtype=bool)
