@@ -28,7 +28,7 @@ LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default.
-CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 90_000_000
+CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -57,7 +57,7 @@ class RunSettings:
     policy: str = ""
     """Network; by default one that suits the observation."""
     car_steps: int = 0
-    """Car-steps at most, checked after each generation; 0: 30 million, in traffic 90, and any number if generations are
+    """Car-steps at most, checked after each generation; 0: 30 million, in traffic 60, and any number if generations are
     given."""
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
@@ -152,15 +152,15 @@ class EvolveSettings(RunSettings):
     closer, +steering if it sees how its own wheels stand; by default mlp:64+steering, in traffic
     mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
     of a dense layer and the number of frames, by default cnn:8,16,32@1."""
-    population: int = 256
-    """Members of a generation."""
+    population: int = 0
+    """Members of a generation; 0: 256, in traffic 128, where each drives more episodes."""
     generations: int = 0
     """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
-    otherwise no more than 30 million car-steps, in traffic 90."""
+    otherwise no more than 30 million car-steps, in traffic 60."""
     recombination: Literal["all", "two"] = "all"
     """Whose genes a child has: all winners of the tournaments, averaged into one centre (an evolution strategy), or
     two parents' (the classic genetic algorithm)."""
-    tournament: int = 8
+    tournament: int = 4
     """Members of a tournament."""
     sigma: float = 0.5
     """Standard deviation of mutation; that of all winners' centre adapts from there."""
@@ -173,6 +173,8 @@ class EvolveSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.population:
+            object.__setattr__(self, "population", 128 if self.traffic else SearchConfig.population)
         if not self.generations and not self.car_steps:
             object.__setattr__(self, "car_steps", self.default_car_steps())
 

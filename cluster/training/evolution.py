@@ -30,6 +30,7 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of history.csv after `generation`; the names that MLflow has them under. `best` is of the leader."""
 
+CRASHES = ("crashes", "crash_worlds", "failures")  # the curriculum's arrays in a checkpoint
 AHEAD = 8  # generations for which training maps are built
 
 
@@ -91,6 +92,7 @@ class Evolution(Learning):
         check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
+        curriculum.learn_from_members(self.generation, [driven.results[part] for part in groups])
 
         if leader is None:  # of the first generation it is the best member
             best = int(score.argmax())
@@ -167,7 +169,7 @@ class Evolution(Learning):
         curriculum = self.curriculum
         searched, numbers = self.search.state()
         arrays |= {f"search_{name}": array for name, array in searched.items()}
-        arrays |= {"crashes": curriculum.crashes, "crash_worlds": curriculum.crash_worlds}
+        arrays |= {name: getattr(curriculum, name) for name in CRASHES}
         meta |= {"search": numbers, "target": curriculum.target}
         return arrays, meta
 
@@ -179,7 +181,8 @@ class Evolution(Learning):
         if self.champion is not None:
             self.search.keep_champion(self.champion.genome)
         curriculum = self.curriculum
-        curriculum.crashes, curriculum.crash_worlds = arrays["crashes"], arrays["crash_worlds"]
+        for name in CRASHES:
+            setattr(curriculum, name, arrays[name])
         curriculum.target = meta["target"]
 
 

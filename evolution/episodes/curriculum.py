@@ -2,9 +2,9 @@
 
 Distance and speed alone are deceptive under limited grip: at first, the best members drive into the first bend at full
 speed. So episodes begin short, and their length doubles when the leader (the best genome known before a generation)
-succeeds. Half of them start shortly before a crash of a recent leader, where there is most to learn. The groups of a
-generation have different episodes, so that selection uses many although each member drives few. The champion is chosen
-on validation maps, which are not used in training.
+succeeds. Half of them start shortly before a crash of a recent leader, most often where half of the members crash again,
+so that there is most to learn. The groups of a generation have different episodes, so that selection uses many although
+each member drives few. The champion is chosen on validation maps, which are not used in training.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
@@ -12,7 +12,7 @@ The state is arrays and numbers; random numbers depend only on (seed, generation
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +28,14 @@ from gridsim.traffic.world import FIELDS, LANE
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
+LEAST_CRASH_WEIGHT = 0.05  # of a crash that all members avoid or none does, where one that half of them avoid has 1
 
 
 @dataclass(frozen=True)
 class CurriculumConfig:
     """The curriculum's parameters."""
 
-    maps: int = 16  # training maps
+    maps: int = 32  # training maps
     first_maps: int = 4  # of these, how many the first generation uses ...
     map_generations: int = 4  # ... and generations after which one more is used, so that maps are built in time
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
@@ -84,6 +85,7 @@ class Curriculum:
         self.goal_steps = round(time_s / period_s)
         self.target = min(config.first_target, target_m)
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
+        self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
         self._validation: Episodes | None = None
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
         self.map_seeds = [
@@ -135,7 +137,7 @@ class Curriculum:
         fresh = self._new_starts(np.concatenate(maps), rng)
         if not len(self.crashes) or not config.crash_starts:
             return fresh
-        chosen = self._rng(generation, 1).integers(len(self.crashes), size=config.groups * config.crash_starts)
+        chosen = self._choose_crashes(generation)
         crashes, worlds = self.crashes[chosen].copy(), self.crash_worlds[chosen]
         target = min(config.crash_target, self.target)
         crashes["target"], crashes["steps"] = target, self._steps(target)
@@ -144,6 +146,25 @@ class Curriculum:
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
         crashes["map"] = np.searchsorted(used, seeds)
         return Episodes(used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, worlds))
+
+    def _choose_crashes(self, generation: int) -> np.ndarray:
+        """Indices of a generation's crash starts, group by group: likeliest where half of the members failed."""
+        count = self.config.groups * self.config.crash_starts
+        weights = np.maximum(4.0 * self.failures * (1.0 - self.failures), LEAST_CRASH_WEIGHT)
+        chosen = self._rng(generation, 1).choice(
+            len(weights), count, replace=count > len(weights), p=weights / weights.sum()
+        )
+        return chosen.astype(np.intp)
+
+    def learn_from_members(self, generation: int, results: Sequence[np.ndarray]) -> None:
+        """Learn how hard the crash starts of a generation's `episodes` are, from each group's RESULT [members, e]."""
+        if not len(self.crashes) or not self.config.crash_starts:
+            return
+        chosen = self._choose_crashes(generation).reshape(len(results), -1)
+        self.failures = self.failures.copy()  # the one before may be on its way into a checkpoint
+        for crashes, result in zip(chosen, results, strict=True):
+            failed = (result["end"][:, -len(crashes) :] != End.SUCCESS).mean(axis=0)
+            self.failures[crashes] = (self.failures[crashes] + failed) / 2.0
 
     def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
         """Distribute each kind [e, ...] over the groups, and concatenate group by group."""
@@ -182,6 +203,7 @@ class Curriculum:
             kept = self.config.crash_memory
             self.crashes = np.concatenate([self.crashes, new])[-kept:]
             self.crash_worlds = np.concatenate([self.crash_worlds, worlds[crashed]])[-kept:]
+            self.failures = np.concatenate([self.failures, np.full(len(new), 0.5)])[-kept:]
         if (results["distance"] >= self.target).mean() >= self.config.growth:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 

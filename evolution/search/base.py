@@ -23,7 +23,7 @@ class SearchConfig:
 
     population: int = 256  # members of a generation
     groups: int = 8  # of members; each group has its own episodes
-    tournament: int = 8  # members of a tournament
+    tournament: int = 4  # members of a tournament
     sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
     elites: int = 8  # best members, kept unmodified
     mutation_rate: float = Mutation.rate  # share of genes that mutate

@@ -29,6 +29,8 @@ from evolution.search.breeding import Kind, Mutation, moments
 
 _CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the broadcast parents
 _ELITES = 2  # the centre, and the champion or, before the first one, the average
+# Learning rate of the mean (c_m of Hansen 2016, "The CMA Evolution Strategy: A Tutorial"), by measurement.
+_LEARNING_RATE = 2.0
 _KEPT = 0.9  # decay of the average of centres in each generation
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
@@ -102,7 +104,8 @@ class Recombination(Search):
         plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
         genes, shift = len(self._free), plus - minus
         first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, self.spec)
-        self.centre = self.centre + self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
+        towards = self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
+        self.centre = self.centre + _LEARNING_RATE * towards
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
         # Under random selection, first / norm is N(0, 1) in each gene for any weights of the pairs.
         norm = math.sqrt(float((shift**2).sum()))

@@ -56,7 +56,8 @@ def test_what_is_not_given_suits_the_observation():
 def test_evolution_s_default_budget_is_of_car_steps():
     usual, short = EvolveSettings(), EvolveSettings(generations=4)
     assert (usual.generations, usual.car_steps) == (0, 30_000_000)
-    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 90_000_000
+    assert EvolveSettings(traffic=1).car_steps == EvolveSettings("highway").car_steps == 60_000_000
+    assert (EvolveSettings().population, EvolveSettings("highway").population) == (256, 128)
     assert (short.generations, short.car_steps) == (4, 0)  # whoever says how long means it
     assert (EvolveSettings(car_steps=7).generations, EvolveSettings(car_steps=7).car_steps) == (0, 7)
     assert usual.ended({"solved": False, "generation": 1, "car_steps": 30_000_000})

@@ -95,6 +95,31 @@ def test_each_group_has_as_many_new_starts_and_crashes():
     assert curriculum.episodes(2).rows.tobytes() != episodes.rows.tobytes()
 
 
+def test_crashes_that_all_members_avoid_are_seldom_driven_again():
+    curriculum = new()
+    led(curriculum, 0, np.full(8, End.COLLISION))
+    easy = curriculum.crashes["start"][4:, 0]
+    for generation in range(1, 40):
+        starts = (
+            curriculum.episodes(generation).rows["start"].reshape(3, 4, 5)[:, 2:, 0]
+        )  # of each group's crash starts
+        results = np.zeros((3, 6, 4), dtype=RESULT)  # of groups, members, episodes
+        results["end"] = End.COLLISION
+        results["end"][:, ::2, 2:] = End.SUCCESS  # half of the members avoid the hard ones
+        results["end"][:, :, 2:][np.broadcast_to(np.isin(starts, easy)[:, None], (3, 6, 2))] = End.SUCCESS
+        curriculum.learn_from_members(generation, list(results))
+    assert curriculum.failures[:4] == pytest.approx(0.5)
+    assert (curriculum.failures[4:] < 0.05).all()
+    drawn = np.concatenate(
+        [curriculum.episodes(k).rows["start"].reshape(3, 4, 5)[:, 2:, 0].ravel() for k in range(40, 90)]
+    )
+    # Of 6 starts without repetition, 4 are hard ones nearly always.
+    assert 0.58 < 1.0 - np.isin(drawn, easy).mean() < 0.67
+    led(curriculum, 1, np.full(8, End.COLLISION))
+    assert len(curriculum.failures) == len(curriculum.crashes) == CONFIG.crash_memory
+    assert curriculum.failures[-8:] == pytest.approx(0.5)
+
+
 def test_maps_come_in_one_by_one(curriculum):
     assert [curriculum.maps_in_use(generation) for generation in (0, 3, 4, 8)] == [2, 2, 3, 3]
     assert set(curriculum.episodes(0).maps) <= set(curriculum.map_seeds[:2])
