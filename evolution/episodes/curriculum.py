@@ -2,8 +2,8 @@
 
 Distance and speed alone are deceptive under limited grip: at first, the best members drive into the first bend at full
 speed. So episodes begin short, and their length doubles when the leader (the best genome known before a generation)
-succeeds. Half of them start shortly before a crash of a recent leader, most often where half of the members crash again,
-so that there is most to learn. The groups of a generation have different episodes, so that selection uses many although
+succeeds. Half of them start shortly before a crash of a recent leader, mostly where half of the members crash again:
+there is most to learn. The groups of a generation have different episodes, so that selection uses many although
 each member drives few. The champion is chosen on validation maps, which are not used in training.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
