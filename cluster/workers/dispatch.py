@@ -4,12 +4,10 @@
 * A chunk that killed twice is split into its members (of a batch of experience: its episodes). A member that kills
   three workers by itself is lost, with everything that it was asked for. So the same members are lost however many
   workers there are and however the work was cut.
-* A worker with nothing left to do gets a second copy of a chunk that is late. The first answer counts.
 """
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 
@@ -17,12 +15,10 @@ from cluster.workers.pool import Chunk
 
 QUEUE = 2  # chunks that a worker holds: the one that it works on, and one so that it does not wait for the coordinator
 MAX_KILLS = 3  # workers that one member may cost
-LATE_S = 2.0  # a chunk is late when it takes longer than this ...
-LATE = 5.0  # ... and so many times as long as the slowest one that was answered
 
 
 class Dispatch:
-    """The chunks of one call, on their way to workers and back. Workers are numbers, times are seconds of any clock.
+    """The chunks of one call, on their way to workers and back. Workers are numbers.
 
     Args:
         parts: the chunks; where one is split, its pieces are added at the end.
@@ -40,11 +36,8 @@ class Dispatch:
         self._open = set(range(len(self.parts)))  # neither answered nor lost
         self._todo = deque(range(len(self.parts)))  # of these, the ones that no worker holds
         self._held: dict[int, deque[int]] = {}  # by worker, the one that it works on first
-        self._since: dict[int, float] = {}  # when it was sent that one, or answered the one before
-        self._slowest_s = math.inf  # of the chunks that were answered
         self._kills: Counter[int] = Counter()
         self._suspects: set[int] = set()  # held by a worker that died
-        self._copied: set[int] = set()  # late, and sent to a second worker
 
     def finished(self) -> bool:
         """Whether every chunk is answered, or lost."""
@@ -54,7 +47,7 @@ class Dispatch:
         """The chunk that a worker works on."""
         return self._held[worker][0]
 
-    def give(self, idle: Sequence[int], now: float) -> Iterator[tuple[int, int]]:
+    def give(self, idle: Sequence[int]) -> Iterator[tuple[int, int]]:
         """Yield (worker, chunk) of all that is to be sent now.
 
         The last chunks only go to idle workers. So do suspects, and nothing is queued behind them.
@@ -62,29 +55,23 @@ class Dispatch:
         Args:
             idle: workers that hold nothing, of no earlier call either.
         """
-        left = deque(idle)
-        while left and self._todo:
-            yield self._send(left.popleft(), self._todo.popleft(), now)
+        for worker in idle[: len(self._todo)]:
+            yield self._send(worker)
         busy = sum(1 for held in self._held.values() if held)
         for worker, held in self._held.items():
             if len(self._todo) > busy and 0 < len(held) < QUEUE and self._suspects.isdisjoint((held[0], self._todo[0])):
-                yield self._send(worker, self._todo.popleft(), now)
-        for worker, chunk in zip(left, self._late(now), strict=False):
-            self._copied.add(chunk)
-            yield self._send(worker, chunk, now)
+                yield self._send(worker)
 
-    def answered(self, worker: int, now: float) -> int | None:
-        """A worker has answered: the chunk, or None if its results are there already or it is lost."""
+    def answered(self, worker: int) -> int | None:
+        """A worker has answered: the chunk, or None if that is lost."""
         chunk = self._held[worker].popleft()
-        seconds, self._since[worker] = now - self._since[worker], now
         self.deaths = 0
         if chunk not in self._open:
             return None
         self._open.remove(chunk)
-        self._slowest_s = seconds if math.isinf(self._slowest_s) else max(self._slowest_s, seconds)
         return chunk
 
-    def died(self, worker: int, now: float, blamed: bool = True) -> list[int]:
+    def died(self, worker: int, blamed: bool = True) -> list[int]:
         """A worker is gone, and what it held is sent again. Returns the chunks that are lost, the killer first.
 
         Args:
@@ -99,9 +86,6 @@ class Dispatch:
             if chunk not in self._open:
                 continue
             self._suspects.add(chunk)
-            if chunk in self._copied:
-                self._copied.remove(chunk)  # the other copy goes on
-                continue
             alone = len(self._units(chunk)) == 1
             if alone and self._kills[chunk] >= MAX_KILLS:
                 lost = self._lose(chunk)
@@ -113,11 +97,9 @@ class Dispatch:
                 self._todo.appendleft(chunk)
         return lost
 
-    def _send(self, worker: int, chunk: int, now: float) -> tuple[int, int]:
-        held = self._held.setdefault(worker, deque())
-        if not held:
-            self._since[worker] = now
-        held.append(chunk)
+    def _send(self, worker: int) -> tuple[int, int]:
+        chunk = self._todo.popleft()
+        self._held.setdefault(worker, deque()).append(chunk)
         return worker, chunk
 
     def _units(self, chunk: int) -> range:
@@ -146,11 +128,3 @@ class Dispatch:
         self._open.difference_update(lost)
         self._todo = deque(k for k in self._todo if k in self._open)
         return lost
-
-    def _late(self, now: float) -> Iterator[int]:
-        """Chunks that only one worker holds, for too long or queued behind one held for too long."""
-        limit_s = max(LATE_S, LATE * self._slowest_s)
-        for worker in sorted(self._held, key=self._since.__getitem__):
-            held = self._held[worker]
-            if held and now - self._since[worker] > limit_s:
-                yield from [chunk for chunk in held if chunk in self._open and chunk not in self._copied]

@@ -8,8 +8,8 @@ What differs from Ray's own habits, and why:
   kills Ray's processes when their parent *thread* dies, and so they die with us whatever kills us.
 * Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
   `dispatch` has to know which chunk killed which worker.
-* Ray says nothing of a worker that is stopped, or whose host is cut off, for half a minute or for ever. Idle workers
-  take copies of what it holds; it gets nothing new before it has answered, and after `patience_s` it is replaced.
+* Ray says nothing of a worker that is stopped, or whose host is cut off, for half a minute or for ever. A worker that
+  has not answered for `patience_s` is replaced, and what it held is sent to another one.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ class RayPool(WorkerPool):
                 elif slot.sent and now - slot.heard > self._patience_s and not self._ready([slot.sent[0][1]], 0.0):
                     self._bury(slot, job, f"it did not answer for {now - slot.heard:.0f} s")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.hello and not slot.sent]
-            for number, chunk in dispatch.give(idle, now):
+            for number, chunk in dispatch.give(idle):
                 self._send(self._slots[number], chunk, job)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
@@ -245,8 +245,7 @@ class RayPool(WorkerPool):
             return self._bury(slot, job, reason(error), is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
-        # An earlier call may have left a second copy of a chunk, or have been interrupted.
-        chunk = job.dispatch.answered(slot.number, slot.heard) if serial == self._serial else None
+        chunk = job.dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
         if chunk is not None:
             job.call.add(slot.number, job.dispatch.parts[chunk], *pickle.loads(answer))
             job.call.bytes_up += len(answer)
@@ -255,7 +254,7 @@ class RayPool(WorkerPool):
     def _bury(self, slot: _Slot, job: _Job, reason: str, blamed: bool = True) -> bool:
         """Replace a worker, and see to it that what it held is done. Returns whether anything is lost."""
         dispatch, call = job.dispatch, job.call
-        lost = [dispatch.parts[chunk] for chunk in dispatch.died(slot.number, time.monotonic(), blamed)]
+        lost = [dispatch.parts[chunk] for chunk in dispatch.died(slot.number, blamed)]
         call.retries = dispatch.retries
         for part in lost:
             call.lose(part)

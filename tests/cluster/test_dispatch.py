@@ -1,4 +1,4 @@
-"""Which chunk goes where when workers die, stall and come back: simulated, by random events, without Ray or a clock."""
+"""Which chunk goes where when workers die: simulated, by random events, without Ray or a clock."""
 
 import random
 from collections import Counter, deque
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.workers.dispatch import LATE, LATE_S, MAX_KILLS, QUEUE, Dispatch
+from cluster.workers.dispatch import MAX_KILLS, QUEUE, Dispatch
 from cluster.workers.pool import Chunk
 
 
@@ -27,7 +27,6 @@ class World:
     def __init__(self, dispatch: Dispatch, workers: int, killers: set[int], by_episode: bool):
         self.dispatch, self.killers, self.by_episode = dispatch, killers, by_episode
         self.queues: dict[int, deque[int]] = {worker: deque() for worker in range(workers)}
-        self.now = 0.0
         self.answered: Counter[int] = Counter()  # members, or episodes
         self.lost: set[int] = set()
         self.deaths = 0
@@ -39,14 +38,14 @@ class World:
 
     def give(self) -> None:
         idle = [worker for worker, queue in self.queues.items() if not queue]
-        for worker, chunk in self.dispatch.give(idle, self.now):
+        for worker, chunk in self.dispatch.give(idle):
             self.queues[worker].append(chunk)
             assert len(self.queues[worker]) <= QUEUE
 
     def bury(self, worker: int, blamed: bool = True) -> None:
         self.deaths += 1
         self.queues[worker].clear()
-        for chunk in self.dispatch.died(worker, self.now, blamed):
+        for chunk in self.dispatch.died(worker, blamed):
             self.lost.update(self.units(chunk))
 
     def work(self, worker: int) -> None:
@@ -54,7 +53,7 @@ class World:
         chunk = self.queues[worker].popleft()
         if self.killers & set(self.units(chunk)):
             self.bury(worker)
-        elif (settled := self.dispatch.answered(worker, self.now)) is not None:
+        elif (settled := self.dispatch.answered(worker)) is not None:
             assert settled == chunk
             self.answered.update(self.units(chunk))
 
@@ -70,7 +69,7 @@ class World:
 def test_everything_is_answered_once_but_those_that_kill(
     by_episode: bool, sizes: list[int], workers: int, killers: set[int], chance: float, seed: int
 ) -> None:
-    """Whatever dies by chance, stalls or answers twice: each of those that kill is lost, alone, and nobody else."""
+    """Whatever dies by chance: each of those that kill is lost, alone, and nobody else."""
     parts = rows(*sizes)
     if by_episode:
         parts = [Chunk(part.columns, part.rows) for part in parts]
@@ -82,7 +81,6 @@ def test_everything_is_answered_once_but_those_that_kill(
         if world.dispatch.finished():
             break
         world.give()
-        world.now += rng.choice([0.01, 0.5, 3.0])
         worker = rng.choice([worker for worker, queue in world.queues.items() if queue])  # nothing is forgotten
         if chances and rng.random() < chance:
             chances -= 1
@@ -110,81 +108,38 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     """Validation gives one member's episodes to many workers: they are lost together."""
     parts = [Chunk(slice(0, 1), slice(k, k + 1)) for k in range(4)] + [Chunk(slice(1, 2), slice(0, 4))]
     dispatch = Dispatch(parts, by_episode=False)
-    assert [chunk for _, chunk in dispatch.give([0, 1, 2], 0.0)] == [0, 1, 2]
-    assert dispatch.answered(2, 0.1) == 2
+    assert [chunk for _, chunk in dispatch.give([0, 1, 2])] == [0, 1, 2]
+    assert dispatch.answered(2) == 2
     for _ in range(MAX_KILLS - 1):
-        assert dispatch.died(0, 0.2) == []
-        assert [chunk for _, chunk in dispatch.give([0], 5.0)] == [0]
-    assert dispatch.died(0, 5.1) == [0, 1, 3]
-    assert dispatch.answered(1, 5.2) is None, "it is not asked for any more"
-    assert list(dispatch.give([0, 1], 5.3)) == [(0, 4)]
-    assert dispatch.answered(0, 5.4) == 4
+        assert dispatch.died(0) == []
+        assert [chunk for _, chunk in dispatch.give([0])] == [0]
+    assert dispatch.died(0) == [0, 1, 3]
+    assert dispatch.answered(1) is None, "it is not asked for any more"
+    assert list(dispatch.give([0, 1])) == [(0, 4)]
+    assert dispatch.answered(0) == 4
     assert dispatch.finished()
 
 
 def test_nothing_is_queued_with_a_suspect() -> None:
     """So that the next time it is clear which killed. What waited behind a dead worker's chunk is a suspect too."""
     dispatch = new(*[5] * 9)
-    assert [chunk for _, chunk in dispatch.give([0, 1], 0.0)] == [0, 1, 2, 3]
-    dispatch.died(0, 0.1)
-    assert list(dispatch.give([0], 0.1)) == [(0, 0)]
-    assert list(dispatch.give([], 0.2)) == []
-    assert dispatch.answered(1, 0.2) == 1
-    assert dispatch.answered(1, 0.3) == 3
-    assert list(dispatch.give([1], 0.3)) == [(1, 2)]
-    assert dispatch.answered(0, 0.4) == 0
-    assert list(dispatch.give([0], 0.4)) == [(0, 4), (0, 5)]
-
-
-def stalled() -> Dispatch:
-    """Worker 0 has not answered, and holds chunks 0 and 2. Worker 1 has answered the others, in 0.1 s each."""
-    dispatch = new(5, 5, 5, 5, 5)
-    assert list(dispatch.give([0, 1], 0.0)) == [(0, 0), (1, 1), (0, 2)], "the last ones go to idle workers alone"
-    for chunk, now in ((1, 0.1), (3, 0.2), (4, 0.3)):
-        assert dispatch.answered(1, now) == chunk
-        if chunk < 4:
-            assert list(dispatch.give([1], now)) == [(1, chunk + (2 if chunk == 1 else 1))]
-    return dispatch
-
-
-def test_idle_workers_take_copies_of_late_chunks_and_the_first_answer_counts() -> None:
-    dispatch, late = stalled(), LATE_S + 0.1
-    assert list(dispatch.give([1], LATE_S)) == []
-    assert list(dispatch.give([1, 2, 3], late)) == [(1, 0), (2, 2)]
-    assert list(dispatch.give([3], late + 9.0)) == [], "one extra copy each"
-    assert dispatch.answered(1, late + 0.1) == 0
-    assert dispatch.answered(0, late + 0.2) is None
-    assert dispatch.answered(0, late + 0.3) == 2, "the slow one may still be first"
-    assert dispatch.finished(), "the other copy is not waited for"
-    assert dispatch.died(2, late + 9.1) == []
-    assert dispatch.retries == 0
-
-
-def test_a_chunk_is_not_late_before_the_slowest_took_a_fraction_of_its_time() -> None:
-    dispatch = new(5, 5, 5)
-    assert list(dispatch.give([0, 1], 0.0)) == [(0, 0), (1, 1)]
-    assert list(dispatch.give([2], 1.0)) == [(2, 2)]
-    assert list(dispatch.give([3], 99.0)) == [], "nothing is answered yet: nobody knows how long it takes"
-    assert dispatch.answered(1, 99.0) == 1
-    assert list(dispatch.give([1], LATE * 99.0)) == []
-    assert list(dispatch.give([1], LATE * 99.0 + 0.1)) == [(1, 0)]
-
-
-def test_a_chunk_whose_copy_goes_on_is_not_sent_again() -> None:
-    dispatch = stalled()
-    assert list(dispatch.give([1], 3.0)) == [(1, 0)]
-    assert dispatch.died(0, 3.1) == []
-    assert list(dispatch.give([0], 3.1)) == [(0, 2)], "what waited behind it is"
-    assert dispatch.died(1, 3.2) == []
-    assert len(list(dispatch.give(range(2, 9), 3.2))) == 5, "both copies killed: now it is, member by member"
+    assert [chunk for _, chunk in dispatch.give([0, 1])] == [0, 1, 2, 3]
+    dispatch.died(0)
+    assert list(dispatch.give([0])) == [(0, 0)]
+    assert list(dispatch.give([])) == []
+    assert dispatch.answered(1) == 1
+    assert dispatch.answered(1) == 3
+    assert list(dispatch.give([1])) == [(1, 2)]
+    assert dispatch.answered(0) == 0
+    assert list(dispatch.give([0])) == [(0, 4), (0, 5)]
 
 
 def test_deaths_in_a_row_are_counted_until_a_worker_answers() -> None:
     dispatch = new(9, 9, 9)
     for k in range(4):
-        list(dispatch.give([0], 0.0))
-        dispatch.died(0, 0.0)
+        list(dispatch.give([0]))
+        dispatch.died(0)
         assert dispatch.deaths == k + 1
-    list(dispatch.give([0], 0.0))
-    dispatch.answered(0, 0.1)
+    list(dispatch.give([0]))
+    dispatch.answered(0)
     assert dispatch.deaths == 0

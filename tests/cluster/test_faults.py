@@ -139,34 +139,18 @@ class Stopping(Answering):
 
 
 def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> None:
-    """As a host that is cut off: Ray says nothing. Later calls go on without it; it may come back, or be replaced."""
+    """As a host that is cut off: Ray says nothing. When patience is at its end the worker is replaced."""
     wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(512)).results.tobytes()
-    pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path), patience_s=15.0)
-
-    def evaluate() -> float:
-        begun = time.monotonic()
+    pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path), patience_s=3.0)
+    with contextlib.closing(pool):
+        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2, 60)
+        (tmp_path / "stop").touch()
         outcome = pool.evaluate(make_task(), make_recipes(512))
         assert outcome.results.tobytes() == wanted
-        assert outcome.retries == 0
-        return time.monotonic() - begun
-
-    def stop() -> int:
-        (tmp_path / "stop").touch()
-        evaluate()
-        (stopped,) = tmp_path.glob("stopped-*")
-        stopped.unlink()
-        return int(stopped.name.split("-")[1])
-
-    with contextlib.closing(pool):
-        wait_until(lambda: evaluate() and pool.workers() == 2, 60)
-        pid = stop()
-        assert min(evaluate() for _ in range(20)) < 1.0, "nothing new is sent to it, so that nothing waits for it"
-        os.kill(pid, signal.SIGCONT)
-        time.sleep(0.5)
-        assert min(evaluate() for _ in range(20)) < 1.0
-        assert pid in pool.pids(), "it came back before patience was at its end"
-        pid = stop()
-        wait_until(lambda: evaluate() and pid not in pool.pids() and pool.workers() == 2, 60)
+        assert 1 <= outcome.retries <= 2
+        pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
+        assert pid not in pool.pids()
+        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2, 60)
     wait_until(lambda: not psutil.pid_exists(pid), 30)
 
 
