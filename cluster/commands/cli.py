@@ -19,9 +19,7 @@ from rich.console import Console
 from cluster.commands.common import (
     FAILED,
     INTERRUPTED,
-    TERMINATED,
     RoadFlags,
-    Stopped,
     UsageError,
     WorkFlags,
     check_unchanged,
@@ -214,8 +212,6 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
         session = train(run, workers, uri, flags.experiment, progress, STARTED, initial=initial)
     except KeyboardInterrupt:
         code = INTERRUPTED
-    except Stopped:
-        code = TERMINATED
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         code, message = FAILED, str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # continued, it would fail in the same way

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
-import gc
 import inspect
 import io
 import math
@@ -27,7 +26,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED
 
 T = TypeVar("T")
-FAILED, WRONG_USE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 MANY_WORKERS = 4  # a core; more give a warning
 
 # tyro wraps a field's docstring as a whole only where its lines are not indented.
@@ -191,46 +190,18 @@ def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
         )
 
 
-class Stopped(BaseException):
-    """SIGTERM."""
-
-
-@contextlib.contextmanager
-def stoppable() -> Iterator[None]:
-    """SIGTERM raises Stopped in the main thread, as Ctrl-C raises KeyboardInterrupt."""
-
-    def stop(*_: object) -> None:
-        raise Stopped
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    except SystemError as error:  # what Ray makes of it where it waits
-        raise error.__cause__ or error from None
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
-    """Run a command, which Ctrl-C and SIGTERM stop, and end this process with the code that `body` returns.
+    """Run a command, which Ctrl-C and SIGTERM stop, and exit with the code that `body` returns.
 
     Errors for the user are shown in one line, and a second one if there is a hint for their kind.
     """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with stoppable():
-            code = body()
+        sys.exit(body())
     except KeyboardInterrupt:  # before there was anything to save, or for the second time
         print(f"{prog}: stopped", file=sys.stderr)
-        code = INTERRUPTED
-    except Stopped:
-        code = TERMINATED
+        sys.exit(INTERRUPTED)
     except Failed as error:
         fail(prog, str(error), error.hint, FAILED)
     except GridSimError as error:
         fail(prog, str(error), (hints or {}).get(type(error), ""))
-    if code in (INTERRUPTED, TERMINATED):  # without waiting for threads that are still compiling, or starting Ray
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    gc.freeze()  # otherwise the final garbage collection traverses all PyTorch objects, which takes two seconds
-    sys.exit(code)

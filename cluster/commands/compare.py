@@ -20,9 +20,7 @@ from rich.table import Table
 
 from cluster.commands.common import (
     INTERRUPTED,
-    TERMINATED,
     Failed,
-    Stopped,
     UsageError,
     WorkFlags,
     as_flag,
@@ -146,8 +144,6 @@ def _train_and_compare(
             failed = _train(left, flags, uri, results, tracker, shown)
     except KeyboardInterrupt:
         code, status = INTERRUPTED, "KILLED"
-    except Stopped:
-        code, status = TERMINATED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
         problem, status = str(error) or type(error).__name__, "FAILED"
     if results.runs and not problem:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
 import time
 from functools import partial
@@ -16,10 +18,16 @@ def _enter(module: str, name: str) -> None:
         print(f"gridsim {version('gridsim')}")
         return
     try:
-        commands = import_module(f"cluster.commands.{module}")
+        getattr(import_module(f"cluster.commands.{module}"), name)()
     except KeyboardInterrupt:
         sys.exit(130)
-    getattr(commands, name)()
+    except SystemExit as ended:
+        # At once: the last garbage collection takes seconds with PyTorch, threads may still be compiling, and while
+        # C++ destructors run, threads that Ray leaves behind abort the process once in some thousands of times.
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(int(ended.code or 0))
 
 
 evolve_main = partial(_enter, "cli", "evolve_main")

@@ -49,7 +49,6 @@ from cluster.workers.ray_session import (
     ENVIRONMENT,
     capacity,
     check_address,
-    end_at_once,
     failed_as_it_began,
     is_to_blame,
     join,
@@ -300,7 +299,6 @@ class RayPool(WorkerPool):
             else:
                 join(self.address)
             self._connected = True
-            end_at_once()
             self._shared = Shared(ray.put, self._build_map, MAP_BYTES)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [_Slot(number) for number in range(self._asked)]

@@ -6,7 +6,6 @@ With `ray_pool` all that imports Ray.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib
 import json
 import logging
@@ -121,17 +120,6 @@ def leave() -> None:
             raylet = importlib.import_module("ray._raylet")
             raylet.Config.initialize("")
             raylet.AuthenticationTokenLoader.instance().reset_cache()
-
-
-def end_at_once() -> None:
-    """End this process where Python is done with it, with its own exit status, before any C++ destructors run.
-
-    Ray leaves a dozen native threads behind at `shutdown`. They go on while destructors delete what they use, and once
-    in some thousands of times abort a process that has done all of its work.
-    """
-    libc = ctypes.CDLL(None)
-    if hasattr(libc, "on_exit"):  # glibc's; the last to be registered comes first
-        libc.on_exit(ctypes.cast(libc._exit, ctypes.c_void_p), None)
 
 
 def capacity() -> str:
