@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, read_run
 from cluster.runs import checkpoint
 from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, new_run, open_run, read_config
-from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings, to_dict
+from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
@@ -57,7 +57,7 @@ class Cell(NamedTuple):
                 raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
             return
         found, _ = read_config(self.folder / CONFIG)
-        for name in ("learner", *to_dict(self.settings)):
+        for name in ("learner", *dataclasses.asdict(self.settings)):
             actual, asked = getattr(found, name, None), getattr(self.settings, name)
             if actual != asked:
                 raise ExperimentError(

@@ -10,8 +10,6 @@ import hashlib
 import io
 import json
 import os
-import stat
-import time
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -24,12 +22,9 @@ CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
 """Files of a run's folder."""
 
 VERSION = 1
-MAX_BYTES = 1 << 32
-"""The largest file, in bytes, that is written or read."""
 
 _MARK = b"sha256:"
 _DIGEST = 64  # hex digits of a sha256
-_STALE_S = 60.0
 
 
 class CheckpointError(GridSimError):
@@ -50,8 +45,6 @@ def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict
     with zipfile.ZipFile(buffer, "a") as archive:
         archive.comment = _MARK + b"0" * _DIGEST
     content = buffer.getbuffer()
-    if len(content) > MAX_BYTES:
-        raise CheckpointError(f"{path}: too large to be saved ({len(content):,} bytes)")
     content[-_DIGEST:] = hashlib.sha256(content[:-_DIGEST]).hexdigest().encode()
     write_atomic(path, content)
 
@@ -61,7 +54,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 
     Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited, hostile or another's.
     """
-    content = _read(path)
+    content = _read(Path(path))
     if not content.startswith(b"PK\x03\x04"):
         raise CheckpointError(f"{path}: {'not a GridSim file' if content else 'the file is empty'}")
     if content[-_DIGEST - len(_MARK) : -_DIGEST] != _MARK:
@@ -96,57 +89,32 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
     what can be made again.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.tmp")  # of a writer that is killed it is left, until the next one
     try:
-        try:
-            with open(temporary, "wb") as file:
-                file.write(content)
+        with open(temporary, "wb") as file:
+            file.write(content)
+            if durable:
                 file.flush()
-                if durable:
-                    os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+                os.fsync(file.fileno())
+        os.replace(temporary, path)
     except OSError as error:
         kept = "; the one before it is kept" if path.exists() else ""
         raise CheckpointError(f"{path}: cannot be written: {_one_line(error)}{kept}") from error
-    with contextlib.suppress(OSError):  # the file itself is safe: what fails from here on is no reason to stop a run
-        if durable:
-            _sync_folder(path.parent)
-        _remove_stale(path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
-def _read(path: str | os.PathLike[str]) -> bytes:
-    """The whole file, if it is one and not larger than MAX_BYTES."""
+def _read(path: Path) -> bytes:
+    """The whole file, if it is one."""
     try:
-        status = os.stat(path)
-        if not stat.S_ISREG(status.st_mode):
+        if path.exists() and not path.is_file():
             raise CheckpointError(f"{path}: not a file")
-        if status.st_size > MAX_BYTES:
-            raise CheckpointError(f"{path}: too large for a GridSim file ({status.st_size:,} bytes)")
-        return Path(path).read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {_one_line(error)}") from error
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename in `folder` durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _remove_stale(path: Path) -> None:
-    """Remove what a writer of `path` that was killed left behind; a living one needs milliseconds."""
-    for left in path.parent.glob(f".{path.name}.*.tmp"):
-        with contextlib.suppress(FileNotFoundError):
-            if time.time() - left.stat().st_mtime > _STALE_S:
-                left.unlink()
 
 
 def _one_line(error: BaseException) -> str:

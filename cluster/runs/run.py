@@ -21,7 +21,7 @@ import numpy as np
 
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHECKPOINT, CONFIG
-from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict, to_dict
+from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict
 from cluster.tracking import description
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
@@ -69,7 +69,7 @@ class RunFolder:
             "format": CONFIG_FORMAT,
             "command": self.settings.command,
             "gridsim": version("gridsim"),
-            "settings": to_dict(self.settings),
+            "settings": dataclasses.asdict(self.settings),
             "curriculum": dataclasses.asdict(self.settings.curriculum()),
             "simulator": dataclasses.asdict(SimConfig()),
             "init": self.init,

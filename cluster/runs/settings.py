@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
 
-from cluster.runs.checkpoint import MAX_BYTES
-from evolution.dqn.experience import observation_dtype_and_width
 from evolution.episodes.curriculum import CurriculumConfig
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import SearchConfig
@@ -19,11 +17,10 @@ from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_fi
 
 MAX_WORKERS = 10_000
 MAX_POPULATION = 1_000_000
+MAX_SEED = (1 << 63) - 1
 MAX_TRAFFIC = 100
 MAX_ELITES = 10_000
 MAX_REPLAY = 10_000_000
-REPLAY_BYTES = 16  # of a row, beside the observation, at most
-REPLAY_SHARE = 0.75  # of the largest checkpoint
 LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
@@ -114,16 +111,12 @@ class RunSettings:
                 build(self.scenario, 0)  # kept, so that it is read once
         except ValueError as error:
             raise SettingsError(str(error)) from error
-        if not 0 <= self.traffic <= MAX_TRAFFIC:
-            raise SettingsError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {self.traffic}")
+        self._check_range(0, MAX_TRAFFIC, "traffic")
         if self.traffic and is_map_file(self.scenario):
             raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
-        if not 0 <= self.seed < 1 << 63:
-            raise SettingsError(f"--seed must be 0 or more, not {self.seed}")
-        if not 0 <= self.car_steps <= MAX_STEPS:
-            raise SettingsError(f"--car-steps must be 0 to {MAX_STEPS:,}, not {self.car_steps:,}")
-        if not self.until > 0.0:
-            raise SettingsError(f"--until must be above 0, not {self.until}")
+        self._check_range(0, MAX_SEED, "seed")
+        self._check_range(0, MAX_STEPS, "car_steps")
+        self._check_positive("until")
         low, high = speed_interval(self.scenario)
         if self.pace and not low <= self.pace <= high:
             raise SettingsError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
@@ -136,6 +129,18 @@ class RunSettings:
                 f"policy {self.policy} sees the {spec.observation}; "
                 f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
             )
+
+    def _check_range(self, least: float, most: float, *names: str) -> None:
+        """Raises SettingsError for a field that is out of its range."""
+        for name in names:
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise SettingsError(f"--{name.replace('_', '-')} must be {least:,} to {most:,}, not {value:,}")
+
+    def _check_positive(self, *names: str) -> None:
+        for name in names:
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise SettingsError(f"--{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -215,11 +220,9 @@ class EvolveSettings(RunSettings):
 
     def check(self) -> None:
         super().check()
-        if self.generations < 0:
-            raise SettingsError(f"--generations must be 1 or more, not {self.generations}")
-        if self.population > MAX_POPULATION:
-            raise SettingsError(f"--population must be {MAX_POPULATION:,} or less, not {self.population:,}")
-        _check_share(self, "mutation_rate")
+        self._check_range(0, MAX_STEPS, "generations")
+        self._check_range(4, MAX_POPULATION, "population")
+        self._check_range(0, 1, "mutation_rate")
         for name in ("elites", "mutation_rate"):
             if (
                 self.recombination == "all"
@@ -306,42 +309,18 @@ class DqnSettings(RunSettings):
 
     def check(self) -> None:
         super().check()
-        for name in ("evaluate_every", "batch", "replay", "anneal", "target_period"):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"--{name.replace('_', '-')} must be 1 or more, not {getattr(self, name)}")
-        for name, most in (("anneal", MAX_STEPS), ("episodes", MAX_STEPS), ("updates", MAX_UPDATES)):
-            if getattr(self, name) > most:
-                raise SettingsError(f"--{name.replace('_', '-')} must be {most:,} or less, not {getattr(self, name):,}")
-        for name in ("discount", "epsilon", "converged"):
-            _check_share(self, name)
-        for name in ("updates", "learning_rate"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"--{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
-        if self.episodes < 0:
-            raise SettingsError(f"--episodes must be 0 or more, not {self.episodes}")
+        self._check_range(1, MAX_STEPS, "evaluate_every", "batch", "anneal", "target_period")
+        self._check_range(0, MAX_STEPS, "episodes")
+        self._check_range(0, 1, "discount", "epsilon", "converged")
+        self._check_positive("updates", "learning_rate")
+        self._check_range(0, MAX_UPDATES, "updates")
         if not self.batch <= self.replay <= MAX_REPLAY:
             raise SettingsError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
-        self._check_replay_fits()
         if self.device not in ("auto", "cpu", "cuda"):
             raise SettingsError(f"--device must be auto, cpu or cuda, not {self.device}")
 
-    def _check_replay_fits(self) -> None:
-        """Raises SettingsError where a checkpoint could not hold the replay beside what else there is."""
-        dtype, width = observation_dtype_and_width(PolicySpec.parse(self.policy))
-        most = int(REPLAY_SHARE * MAX_BYTES) // (dtype.itemsize * width + REPLAY_BYTES)
-        if self.replay > most:
-            raise SettingsError(
-                f"--replay must be {most:,} or less for {self.policy}, not {self.replay:,}: a checkpoint holds no more"
-            )
-
 
 SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}
-
-
-def _check_share(settings: RunSettings, name: str) -> None:
-    value = getattr(settings, name)
-    if not 0.0 <= value <= 1.0:
-        raise SettingsError(f"--{name.replace('_', '-')} must be 0 to 1, not {value}")
 
 
 def check_workers(workers: int, address: str, patience_s: float) -> None:
@@ -354,13 +333,8 @@ def check_workers(workers: int, address: str, patience_s: float) -> None:
         raise SettingsError(f"--patience must be 0 or more, not {patience_s:g}")
 
 
-def to_dict(settings: RunSettings) -> dict[str, Any]:
-    """Plain numbers and strings."""
-    return dataclasses.asdict(settings)
-
-
 def from_dict(kind: type[S], values: dict[str, Any]) -> S:
-    """The inverse of `to_dict`. Raises SettingsError for names or types that do not fit."""
+    """Settings from what `dataclasses.asdict` made of them. Raises SettingsError for names or types that do not fit."""
     fields = {f.name: f for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(fields))
     if unknown:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from cluster.runs.settings import RunSettings, to_dict
+from cluster.runs.settings import RunSettings
 from cluster.tracking.commit import git_commit
 from cluster.tracking.mlflow_run import MODEL, RUN_ID, Model
 from evolution.networks.policy import PolicySpec
@@ -32,9 +33,9 @@ def default_name(settings: RunSettings) -> str:
 
 def non_defaults(settings: RunSettings, *without: str) -> dict[str, Any]:
     """Settings that differ from the defaults of their road, except for those that decide when a run ends."""
-    kind, given = type(settings), to_dict(settings)
+    kind, given = type(settings), asdict(settings)
     shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
-    defaults = to_dict(kind(**shared)) | {"traffic": kind(scenario=settings.scenario).traffic, "recombination": "all"}
+    defaults = asdict(kind(**shared)) | {"traffic": kind(scenario=settings.scenario).traffic, "recombination": "all"}
     left_out = {"seed", *settings.unbound, *without}
     return {name: value for name, value in given.items() if name not in left_out and value != defaults[name]}
 
@@ -58,7 +59,7 @@ def group(settings: RunSettings) -> str:
 
 def params(settings: RunSettings) -> dict[str, str]:
     """All that decides the champion; what follows from it, and the simulator's constants, are in config.json."""
-    return {name: str(value) for name, value in to_dict(settings).items()}
+    return {name: str(value) for name, value in asdict(settings).items()}
 
 
 def tags(settings: RunSettings) -> dict[str, str]:

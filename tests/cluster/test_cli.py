@@ -218,7 +218,7 @@ def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(
             assert line == f"{prog}: error: {flag} was removed: {instead}"
     # As a value it is one.
     lines = said_by(monkeypatch, capsys, "--name", "parents", "--population", "3", "--workers", "0")
-    assert "population must be 4 or more" in lines[0]
+    assert "--population must be 4 to 1,000,000" in lines[0]
 
 
 def old_run(folder):

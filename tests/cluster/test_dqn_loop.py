@@ -115,25 +115,19 @@ def test_no_batch_is_begun_beyond_a_bound(loop, bound):
     ("changes", "words"),
     [
         ({"discount": 1.5}, "--discount must be 0 to 1, not 1.5"),
-        ({"batch": -1}, "--batch must be 1 or more, not -1"),
+        ({"batch": -1}, "--batch must be 1 to"),
         ({"replay": 10}, r"--replay must be 256 \(the batch\) to 10,000,000, not 10"),
         ({"learning_rate": float("nan")}, "--learning-rate must be above 0, not nan"),
         ({"policy": "cnn"}, "policy cnn sees the grid"),
         ({"device": "abacus"}, "--device must be auto, cpu or cuda, not abacus"),
-        ({"updates": 1e308}, "--updates must be 1,000,000 or less"),
-        ({"anneal": 10**400}, "--anneal must be 1,000,000,000,000,000 or less"),
+        ({"updates": 1e308}, "--updates must be 0 to 1,000,000"),
+        ({"anneal": 10**400}, "--anneal must be 1 to 1,000,000,000,000,000"),
         ({"car_steps": 10**400}, "--car-steps must be 0 to 1,000,000,000,000,000"),
-        ({"observation": "grid", "replay": 3_000_000}, r"--replay must be 1,9\d\d,\d\d\d or less for cnn:16,32,256@4"),
     ],
 )
 def test_settings_that_no_run_can_have(changes, words):
     with pytest.raises(SettingsError, match=f"^{words}"):
         DqnSettings(**changes).check()
-
-
-@pytest.mark.parametrize("observation", ["rays", "grid"])
-def test_the_default_replay_fits_a_checkpoint(observation):
-    DqnSettings(observation=observation).check()
 
 
 class Losing(SerialPool):
