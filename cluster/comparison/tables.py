@@ -1,4 +1,4 @@
-"""A comparison's tables: medians over seeds, with quartiles and a bootstrap interval."""
+"""A comparison's tables: medians over seeds, with quartiles."""
 
 from __future__ import annotations
 
@@ -26,8 +26,6 @@ NOTHING = "–"
 NOTES = """\
 - Medians over seeds, quartiles in brackets. Fewer than 3 seeds are too few for a verdict.
 - Errors are means over the metres that were driven: small ones of drivers that crash soon say nothing."""
-RESAMPLES, CONFIDENCE = 9_999, 0.95
-_SEED = 20_190_111  # of the resamples: the same numbers always give the same interval
 
 
 class Spread(NamedTuple):
@@ -43,17 +41,6 @@ def spread(values: Iterable[float]) -> Spread:
     """Median and quartiles (linear interpolation) of the finite values: others were not measured."""
     found = [value for value in values if math.isfinite(value)]
     return Spread(len(found), *np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist())
-
-
-def interval(values: Iterable[float]) -> tuple[float, float]:
-    """The percentile bootstrap's interval of the median (Efron and Tibshirani 1993, chapter 13) of several values."""
-    from scipy.stats import bootstrap
-
-    found = [np.sort([value for value in values if math.isfinite(value)])]
-    low, high = bootstrap(
-        found, np.median, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="percentile", rng=_SEED
-    ).confidence_interval
-    return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -165,11 +152,6 @@ def _median(figure: str, scale: float, digits: int) -> Callable[[Group], str]:
     return cell
 
 
-def _percent_interval(group: Group) -> str:
-    values = group.values("velocity_error_percent")
-    return "{:.1f} to {:.1f}".format(*interval(values)) if spread(values).n > 1 else NOTHING
-
-
 Columns = Mapping[str, Callable[[Group], str]]
 DRIVING: Columns = {
     "seeds": _seeds,
@@ -184,7 +166,6 @@ DRIVING: Columns = {
 ERRORS: Columns = {
     "velocity error, m/s": _median("velocity_error_mps", 1.0, 2),
     "% of the reference": _median("velocity_error_percent", 1.0, 1),
-    "its bootstrap interval": _percent_interval,
     "largest, m/s": _median("velocity_error_max_mps", 1.0, 1),
     "steering error, degrees": _median("steering_error_deg", 1.0, 2),
     "largest, degrees": _median("steering_error_max_deg", 1.0, 1),

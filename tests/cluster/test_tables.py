@@ -1,4 +1,4 @@
-"""Tables of a comparison: medians, bootstrap intervals, what is missing; its pictures."""
+"""Tables of a comparison: medians, what is missing; its pictures."""
 
 import csv
 import io
@@ -16,33 +16,18 @@ from rich.console import Console
 from cluster.commands.compare import Results
 from cluster.comparison import tables
 from cluster.comparison.plan import Plan
-from cluster.comparison.tables import interval, spread
+from cluster.comparison.tables import spread
 from cluster.report import pictures
 from cluster.training.evolution import COLUMNS
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
 
-@pytest.mark.parametrize("n", [2, 3, 7, 9, 11])
-def test_bootstrap_against_the_exact_distribution_of_a_resamples_median(n):
-    """The median of a resample is at most the k-th value if more than half of n draws are among the first k."""
-
-    def at_most(k):
-        return sum(math.comb(n, j) * (k / n) ** j * (1 - k / n) ** (n - j) for j in range(n // 2 + 1, n + 1))
-
-    values = np.arange(1.0, n + 1)
-    low, high = interval(np.random.default_rng(0).permutation(values))
-    assert low == (next(k for k in values if at_most(k) > 0.025) if n > 5 else values[0])
-    assert high == (next(k for k in values if at_most(k) >= 0.975) if n > 5 else values[-1])
-
-
 @given(st.lists(st.integers(-100, 100), min_size=2, max_size=6))
-def test_medians_lie_between_quartiles_and_within_the_interval(values):
+def test_medians_lie_between_quartiles(values):
     n, lower, median, upper = spread([*values, math.nan, math.inf])
-    low, high = interval([*values, math.nan])
     assert (n, median) == (len(values), np.median(values))
     assert min(values) <= lower <= median <= upper <= max(values)
-    assert min(values) <= low <= median <= high <= max(values)
 
 
 def rows_of(text):
@@ -63,9 +48,9 @@ def test_tables_show_what_is_missing():
         ["seamless", "evolution", "missing"],
         ["seamless", "random search", "1 of 2"],
     ]
-    assert errors[0][3:5] == ["15.0 (12.5 to 17.5)", "10.0 to 20.0"]
+    assert errors[0][3] == "15.0 (12.5 to 17.5)"
     assert set(errors[1][2:]) == {"–"}
-    assert errors[3][3:5] == ["5.0", "–"]
+    assert errors[3][3] == "5.0"
     rows = list(csv.DictReader(io.StringIO(tables.table_csv(groups, Path()).decode())))
     assert [row["velocity_error_percent"] for row in rows] == ["10.0", "20.0", "", "", "", "", "5.0", ""]
     assert [(row["learner"], row["seed"]) for row in rows[2:4]] == [("random", "0"), ("random", "1")]
