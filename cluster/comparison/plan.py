@@ -50,19 +50,13 @@ class Cell(NamedTuple):
         return (self.folder / SUMMARY).is_file()
 
     def check(self) -> None:
-        """Compare what is in the folder with what was asked. Raises ExperimentError, RunError."""
-        if not (self.folder / CONFIG).is_file():
-            # Killed while it wrote its first file, a run leaves a hidden one.
-            if self.folder.is_file() or any(self.folder.glob("[!.]*")):
-                raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
-            return
-        found, _ = read_config(self.folder / CONFIG)
-        for name in ("learner", *dataclasses.asdict(self.settings)):
-            actual, asked = getattr(found, name, None), getattr(self.settings, name)
-            if actual != asked:
-                raise ExperimentError(
-                    f"{self.folder}: its {name} is {actual}, and {COMPARISON} asks for {asked}; one of them was edited"
-                )
+        """Raises ExperimentError or RunError where the folder holds something else."""
+        if (self.folder / CONFIG).is_file():
+            if read_config(self.folder / CONFIG)[0] != self.settings:
+                raise ExperimentError(f"{self.folder} is not the run that {COMPARISON} asks for; one of them was edited")
+        # Killed while it wrote its first file, a run leaves a hidden one.
+        elif self.folder.is_file() or any(self.folder.glob("[!.]*")):
+            raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
 
     def open(self) -> RunFolder:
         """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""

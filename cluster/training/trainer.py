@@ -42,7 +42,6 @@ from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build, seed_of_map
 
-MAPS_KEPT = 96  # training's, validation's and the held-out ones, and some
 MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
 
 
@@ -50,7 +49,7 @@ State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
 
 class Maps:
-    """Builds maps, each once, and ahead of their use in threads; keeps the latest."""
+    """A run's maps: builds each once, and ahead of its use in threads."""
 
     def __init__(self, scenario: str, config: SimConfig):
         self._scenario, self._config = scenario, config
@@ -70,12 +69,7 @@ class Maps:
     def get(self, seed: int) -> Map:
         """The map of a seed."""
         self.ahead([seed])
-        with self._lock:
-            future = self._built.pop(seed)
-            self._built[seed] = future  # the latest used is last
-            while len(self._built) > MAPS_KEPT:
-                del self._built[next(iter(self._built))]
-        return future.result()
+        return self._built[seed].result()
 
     def build(self, scenario: str, seed: int) -> Map:
         """As pools ask for it."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import pickle
 import signal
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -67,31 +66,27 @@ class Actor:
 
 
 class Shared:
-    """The coordinator's end: the maps in the object store, without those that were least recently used.
+    """The coordinator's end: the maps in the object store, those of the latest task's scenario.
 
     Args:
         put: puts something into the store; returns its reference.
         build_map: builds a map.
-        most_bytes: of maps that are kept.
     """
 
-    def __init__(self, put: Callable[[Any], Any], build_map: BuildMap, most_bytes: int):
-        self._put, self._build_map, self._most_bytes = put, build_map, most_bytes
-        self._maps: OrderedDict[Name, tuple[Any, int]] = OrderedDict()  # references and bytes
+    def __init__(self, put: Callable[[Any], Any], build_map: BuildMap):
+        self._put, self._build_map = put, build_map
+        self._maps: dict[Name, Any] = {}  # references
 
     def put(self, task: Task | CollectTask) -> tuple[Any, int]:
         """Put a task, and those of its maps that are not there yet. Returns its reference, and the bytes of arrays."""
         sent = sum(value.nbytes for value in vars(task).values() if isinstance(value, np.ndarray))
+        scenarios = {scenario for scenario, _ in task.maps}
+        self._maps = {name: ref for name, ref in self._maps.items() if name[0] in scenarios}
         for name in task.maps:
             if name not in self._maps:
                 arrays = self._build_map(*name).arrays()
-                size = sum(array.nbytes for array in arrays.values())
-                self._maps[name] = self._put(arrays), size
-                sent += size
-            self._maps.move_to_end(name)
-        used = sum(size for _, size in self._maps.values())
-        while used > self._most_bytes and len(self._maps) > len(set(task.maps)):
-            used -= self._maps.popitem(last=False)[1][1]
+                self._maps[name] = self._put(arrays)
+                sent += sum(array.nbytes for array in arrays.values())
         return self._put(task), sent
 
     def update(self, known: set[Name], task: Task | CollectTask, ref: Any) -> list[Any]:
@@ -103,4 +98,4 @@ class Shared:
         lacking = [name for name in dict.fromkeys(task.maps) if name not in known]
         known.difference_update(gone)
         known.update(lacking)
-        return [lacking, gone, ref, *(self._maps[name][0] for name in lacking)]
+        return [lacking, gone, ref, *(self._maps[name] for name in lacking)]

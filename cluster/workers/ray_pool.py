@@ -64,7 +64,6 @@ PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill cost fewer
 MAX_FAILED_STARTS = 3  # in a row, each by an exception, while no other worker is up
 PAUSE_S = 1.0  # before a worker that did not come up is started again
-MAP_BYTES = 512 << 20  # of maps in the object store: room for those of training and of validation
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
 
@@ -299,7 +298,7 @@ class RayPool(WorkerPool):
             else:
                 join(self.address)
             self._connected = True
-            self._shared = Shared(ray.put, self._build_map, MAP_BYTES)
+            self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [_Slot(number) for number in range(self._asked)]
             for slot in self._slots:
