@@ -99,13 +99,6 @@ def _compare(arguments: Sequence[str]) -> int:
     return _train_and_compare(console, folder, cells, flags, uri)
 
 
-def _new_folder(flags: CompareFlags) -> Path:
-    name = flags.name or f"comparison-{time.strftime('%Y%m%d-%H%M%S')}"
-    if not flags.name and (Path(flags.output) / name).exists():
-        name += f"-{os.getpid()}"
-    return new_folder(Path(flags.output), name)
-
-
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
     """The comparison's folder, checked; nothing is written yet. Raises GridSimError."""
     check_workers(flags.workers, flags.address, flags.patience)
@@ -121,7 +114,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
         return folder, flags
     plan = select(Plan, flags)
     plan.check()
-    return ComparisonFolder(_new_folder(flags), plan), flags
+    return ComparisonFolder(new_folder(Path(flags.output), flags.name, "comparison"), plan), flags
 
 
 def _train_and_compare(
@@ -292,7 +285,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     if flags.reference:
         read_drive(flags.reference)
     runs = read_runs([Path(name) for name in flags.runs])
-    results = Results(_new_folder(flags), reference=flags.reference)
+    results = Results(new_folder(Path(flags.output), flags.name, "comparison"), reference=flags.reference)
     with console.status("measuring errors") as shown:
         for k, run in enumerate(runs):
             shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")

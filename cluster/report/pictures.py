@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gridsim.reference.errors import Series
 
 _BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
-_ROAD, _WALL, _PATH = "#4a4e57", "#e9efe6", "#f5a524"
+_ROAD, _WALL = "#4a4e57", "#e9efe6"
 _LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00", "random": "#868e96"}
 
 

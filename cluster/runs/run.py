@@ -151,26 +151,25 @@ def open_run(folder: Path) -> RunFolder:
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():
         raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
-    try:
-        settings.ended(meta)
-        run.tracking_key = str(meta["tracking"]["key"])
-    except (LookupError, TypeError, ValueError, OverflowError) as error:
-        raise RunError(f"{folder / CHECKPOINT}: its parts are not those of a run") from error
+    run.tracking_key = str(meta["tracking"]["key"])
     return run
 
 
 def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init_sha256: str = "") -> RunFolder:
     """A new run's folder, checked but not yet made. Raises RunError."""
+    path = new_folder(output, name, description.default_name(settings))
+    return RunFolder(path, settings, init, init_sha256, _map_sha256(settings))
+
+
+def new_folder(output: Path, name: str, kind: str) -> Path:
+    """The folder of a new run or comparison, checked but not yet made; without a name its `kind` and the time make one.
+
+    Raises: RunError.
+    """
     if not name:
-        stamp = time.strftime("%Y%m%d-%H%M%S")
-        name = f"{description.default_name(settings)}-{stamp}"
+        name = f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}"
         if (output / name).exists():
             name += f"-{os.getpid()}"
-    return RunFolder(new_folder(output, name), settings, init, init_sha256, _map_sha256(settings))
-
-
-def new_folder(output: Path, name: str) -> Path:
-    """The folder of a new run or comparison, checked but not yet made. Raises RunError."""
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name

@@ -355,7 +355,7 @@ def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "",
     """The run's tracker; `parent_id` is MLflow's run that it belongs to. `more` is its `Identity`'s."""
     tags = description.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(Identity(
-        uri, experiment, description.title(run.name, run.settings), description.params(run.settings), tags,
+        uri, experiment, run.name, description.params(run.settings), tags,
         note=description.describe(run), key=run.tracking_key, **more,
     ))  # fmt: skip
 

@@ -31,30 +31,16 @@ def default_name(settings: RunSettings) -> str:
     return f"{file_name(settings.scenario)}-{settings.algorithm}-s{settings.seed}"
 
 
-def non_defaults(settings: RunSettings, *without: str) -> dict[str, Any]:
-    """Settings that differ from the defaults of their road, except for those that decide when a run ends."""
-    kind, given = type(settings), asdict(settings)
-    shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
-    defaults = asdict(kind(**shared)) | {"traffic": kind(scenario=settings.scenario).traffic, "recombination": "all"}
-    left_out = {"seed", *settings.unbound, *without}
-    return {name: value for name, value in given.items() if name not in left_out and value != defaults[name]}
-
-
-def title(name: str, settings: RunSettings) -> str:
-    """MLflow's name of a run: its folder's, and what else distinguishes it."""
-    words = "" if f"{name}-".startswith(f"{default_name(settings)}-") else f": {default_name(settings)}"
-    more = non_defaults(settings)
-    parts = [str(more["policy"])] if "policy" in more else []
-    parts += [f"{settings.traffic} cars"] if "traffic" in more else []
-    return " ".join([name + words, *parts])
-
-
 def group(settings: RunSettings) -> str:
     """What runs have in common that differ in their seeds alone, in words."""
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [f"{settings.traffic} cars"] if settings.traffic else []
-    more = non_defaults(settings, "traffic", "observation", "policy", "search")
-    return ", ".join([" ".join(words), *(f"{name} {value}" for name, value in more.items())])
+    given = asdict(settings)
+    shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
+    usual = asdict(type(settings)(**shared)) | {"recombination": "all"}
+    left_out = {"seed", "policy", "search", *settings.unbound}  # decide when a run ends, or are named before
+    more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
+    return ", ".join([" ".join(words), *more])
 
 
 def params(settings: RunSettings) -> dict[str, str]:

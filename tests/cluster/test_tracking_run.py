@@ -3,38 +3,15 @@
 import re
 from dataclasses import fields
 
-import pytest
-
 from cluster.runs.run import new_run
 from cluster.runs.settings import DqnSettings, EvolveSettings
 from cluster.runs.train import NOT_LOGGED
-from cluster.tracking.description import describe, group, held_out_metrics, model_name, params, tags, title
+from cluster.tracking.description import describe, group, held_out_metrics, model_name, params, tags
 from cluster.training.dqn import COLUMNS as DQN_COLUMNS
 from cluster.training.evolution import COLUMNS
 
 HELD_OUT = {"episodes": 64, "success_rate": 0.984, "distance_m": 2000.2, "speed_mps": 7.61, "collision_rate": 0.016}
 SUMMARY = {"generations": 48, "car_steps": 96_300_000, "wall_s": 57.2, "solved": True, "held_out": HELD_OUT}
-
-
-TITLES = {
-    "curved-evolution-s3-20260101-120000": EvolveSettings("curved", seed=3),
-    "mine: curved-evolution-s3": EvolveSettings("curved", seed=3),
-    "mine: curved-random-s0 2 cars": EvolveSettings("curved", traffic=2, search="random"),
-    "mine: highway-evolution-s0": EvolveSettings("highway", traffic=8),
-    "seamless-dqn-s1-x mlp:64,64": DqnSettings(seed=1, policy="mlp:64,64"),
-    "mine: seamless-dqn-s0": DqnSettings(observation="grid", batch=64),
-}
-
-
-@pytest.mark.parametrize("shown", TITLES)
-def test_a_runs_name_says_what_it_is(shown):
-    assert title(shown.partition(":")[0].partition(" ")[0], TITLES[shown]) == shown
-
-
-def test_the_default_folders_name_is_title_enough(tmp_path):
-    run = new_run(tmp_path, "", EvolveSettings("city", seed=7))
-    assert run.name.startswith("city-evolution-s7-")
-    assert title(run.name, run.settings) == run.name
 
 
 def test_seeds_are_one_group_and_nothing_else_is():
