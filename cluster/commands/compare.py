@@ -44,7 +44,6 @@ from cluster.runs.train import Session, Workers, train
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
-from cluster.workers.pool import PoolError
 from gridsim.errors import GridSimError
 from gridsim.view.drive import read_drive
 
@@ -120,30 +119,49 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 def _train_and_compare(
     console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str
 ) -> int:
-    """Train what is not finished, and write tables and pictures of what is."""
-    finished, left = ([cell for cell in cells if cell.finished() == done] for done in (True, False))
+    """Train what is not finished, one run after the other on one pool of workers; write tables and pictures of all."""
     folder.write()
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
     tags = {"algorithm": "comparison"}
     tracker = Tracker(Identity(uri, flags.experiment, folder.path.name, params, tags, key=folder.tracking_key))
+    wall_s = limits(folder.plan.budget)[1] or math.inf
+    workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
     results = Results(folder.path, folder.plan)
-    code, failed, problem = 0, 0, ""
+    code, failed, problem, parent = 0, 0, "", ""
     status: Status = "FINISHED"
     try:
-        with Progress(console, folder, len(cells), len(left)) as shown:
-            shown.note("reading what is finished" if finished else "starting")
-            for cell in finished:
-                results.add(read_run(cell.folder))
-            failed = _train(left, flags, uri, results, tracker, shown)
+        with Progress(console, folder, cells) as shown:
+            if shown.left:
+                try:
+                    parent = tracker.wait_ready()
+                except TrackingError as error:
+                    print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
+            for cell in cells:
+                shown.begin(cell)
+                if cell.finished():
+                    results.add(read_run(cell.folder))
+                    continue
+                try:
+                    run = cell.open()
+                    train(run, workers, uri, flags.experiment, shown, parent_id=parent, wall_limit_s=wall_s)
+                    shown.note("measuring errors")
+                    shown.done(results.add(read_run(cell.folder)))
+                    results.write_tables()
+                except (GridSimError, FloatingPointError) as error:  # stops no other run
+                    failed += 1
+                    shown.failed(str(error))
+                    workers.close()  # the next run has workers of its own
     except KeyboardInterrupt:
         code, status = INTERRUPTED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
         problem, status = str(error) or type(error).__name__, "FAILED"
-    if results.runs and not problem:
-        with console.status("writing tables and pictures"):
-            results.write()
+    finally:
+        workers.close()
     if results.runs:
-        tracker.log_row(len(results.runs), results.medians())
+        if not problem:
+            with console.status("writing tables and pictures"):
+                results.write()
+        tracker.log_row(len(results.runs), {"runs_done": len(results.runs), **results.medians()})
         tracker.log_files(results.files())
     if unsent := tracker.close(status):
         print(f"{PROG}: warning: {unsent}", file=sys.stderr)
@@ -158,42 +176,6 @@ def _train_and_compare(
     elif failed:
         raise Failed(f"{failed} of {len(cells)} runs failed", again)
     return code
-
-
-def _train(
-    cells: Sequence[Cell], flags: CompareFlags, uri: str, results: Results, tracker: Tracker, shown: Progress
-) -> int:
-    """Train one run after the other, on one pool of workers. Returns how many failed; these stop no others."""
-    parent, failed = "", 0
-    if cells:
-        try:
-            parent = tracker.wait_ready()
-        except TrackingError as error:
-            shown.line(f"{PROG}: warning: its runs are not nested in MLflow: {error}")
-    _, wall_s = limits(flags.budget)
-    workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
-    try:
-        for cell in cells:
-            shown.begin(cell)
-            try:
-                train(
-                    cell.open(), workers, uri, flags.experiment, shown,
-                    parent_id=parent, wall_limit_s=wall_s or math.inf,
-                )  # fmt: skip
-                shown.note("measuring errors")
-                run = results.add(read_run(cell.folder))
-            except (GridSimError, FloatingPointError) as error:
-                failed += 1
-                shown.failed(str(error))
-                if isinstance(error, PoolError):
-                    workers.close()  # the next run has workers of its own
-                continue
-            results.write_tables()
-            tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
-            shown.done(run)
-    finally:
-        workers.close()
-    return failed
 
 
 class Results:
@@ -226,7 +208,7 @@ class Results:
         on_seamless = {group.learner: group for group in groups if group.scenario == "seamless"}
         drives = {}
         for learner in ("evolution", "dqn"):
-            runs = _median_first(on_seamless[learner].runs) if learner in on_seamless else []
+            runs = on_seamless[learner].runs if learner in on_seamless else ()
             found = [series[0] for run in runs if (series := series_of(run, self.reference, 1))]
             if found:
                 drives[learner] = found
@@ -265,17 +247,6 @@ class Results:
         console.print(f"tables and pictures: {short_path(self.path)}/", soft_wrap=True)
 
 
-def _median_first(runs: Sequence[Run]) -> list[Run]:
-    """The run whose velocity error is the median, then the others."""
-
-    def error(run: Run) -> float:
-        value = run.figures["velocity_error_percent"]
-        return value if math.isfinite(value) else math.inf
-
-    ordered, middle = sorted(runs, key=error), (len(runs) - 1) // 2
-    return ordered[middle:] + ordered[:middle]
-
-
 def _compare_finished(console: Console, flags: CompareFlags) -> int:
     """Compare finished runs. Raises GridSimError."""
     default = CompareFlags()
@@ -300,17 +271,17 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
 class Progress(Line):
     """Shows which run is trained, how far it is, and ETA: a line on a terminal, plain lines elsewhere."""
 
-    def __init__(self, console: Console, folder: ComparisonFolder, total: int, left: int):
+    def __init__(self, console: Console, folder: ComparisonFolder, cells: Sequence[Cell]):
         super().__init__(console)
-        self._total, self._left, self._done = total, left, 0
-        self._wall_s = limits(folder.plan.budget)[1]
-        self._begun = self._last = time.perf_counter()  # start of the first run, end of the last one
-        there = f", {total - left} of them finished" if left < total else ""
-        console.print(f"comparing {total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
+        self._total, self.left = len(cells), sum(not cell.finished() for cell in cells)
+        self._run_s = limits(folder.plan.budget)[1] or math.nan  # until a first run is done
+        there = f", {self._total - self.left} of them finished" if self.left < self._total else ""
+        console.print(f"comparing {self._total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
     def begin(self, cell: Cell) -> None:
         self.name, self.resume = cell.name, f"{cell.settings.command} --resume {cell.folder}"
-        self.note("starting")
+        self._begun = time.perf_counter()
+        self.note("reading what is finished" if cell.finished() else "starting")
 
     def note(self, text: str, more: str = "") -> None:
         """How far it is, and more where there is room."""
@@ -330,31 +301,25 @@ class Progress(Line):
 
     def done(self, run: Run) -> None:
         error = run.figures["velocity_error_percent"]
-        self._next()
-        self.line(
+        self.left, self._run_s, self._begun = self.left - 1, time.perf_counter() - self._begun, time.perf_counter()
+        self.console.print(
             f"{self._counter()}  {run.folder.name}: success {run.figures['success_rate']:.0%}, "
             f"{run.figures['distance_m']:,.0f} m, "
             + (f"velocity error {error:.1f} %, " if math.isfinite(error) else "")
             + f"{run.figures['training_s']:.0f} s"
-            + (f"  ETA {self._eta()}" if self._left else "")
+            + (f"  ETA {self._eta()}" if self.left else ""),
+            soft_wrap=True,
+            highlight=False,
         )
 
     def failed(self, reason: str) -> None:
-        self._next()
+        self.left -= 1
         print(f"{PROG}: {self.name} failed: {reason}", file=sys.stderr, flush=True)
 
-    def line(self, text: str) -> None:
-        self.console.print(text, soft_wrap=True, highlight=False)
-
     def _counter(self) -> str:
-        return f"run {self._total - self._left}/{self._total}"
-
-    def _next(self) -> None:
-        self._left, self._done, self._last = self._left - 1, self._done + 1, time.perf_counter()
+        return f"run {self._total - self.left}/{self._total}"
 
     def _eta(self) -> str:
-        """From the runs so far; before there are any, from a budget of wall time."""
-        if not (self._done or self._wall_s):
-            return "-:--"
-        each = (self._last - self._begun) / self._done if self._done else self._wall_s
-        return clock(max(each * self._left - (time.perf_counter() - self._last), 0.0))
+        """As if each run took as long as the latest one, or a budget of wall time."""
+        seconds = self._run_s * self.left - (time.perf_counter() - self._begun)
+        return clock(max(seconds, 0.0)) if math.isfinite(seconds) else "-:--"

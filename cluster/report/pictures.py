@@ -153,13 +153,13 @@ def along_route(
 ) -> None:  # fmt: skip
     """Draw velocity and steering error along the seamless road to a PNG.
 
-    Args: for each learner its seeds' drives from the same start, the one to be drawn as a line first, the others as
-    the band from the smallest to the largest error; what learners are called; how far along the route; the names of
+    Args: for each learner its seeds' drives from the same start, the first one to be drawn as a line, all of them as a
+    band from the smallest to the largest error; what learners are called; how far along the route; the names of
     learners that were compared there and have no drive.
     """
     title = "Errors along the seamless road, from the same start on a held-out map"
     if max(len(found) for found in drives.values()) > 1:
-        title += "\nlines: the seed whose mean error is the median; bands: all seeds; crosses: crashed"
+        title += "\nlines: the first seed; bands: all seeds; crosses: crashed"
     if missing:
         title += f"\nnot drawn: {', '.join(missing)}"
     figure, axes = _figure(12.0, 6.2, rows=2)

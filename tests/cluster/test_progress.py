@@ -84,10 +84,10 @@ def test_there_is_no_eta_before_it_means_something(monkeypatch):
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_comparison_shows_the_same(width):
     plan = Plan(("roundabout",), ("two-parents",), 3, budget="3700s")
-    (first, *_) = plan.cells(Path("runs/c"))
+    cells = plan.cells(Path("runs/c"))
     console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
-    shown = compare.Progress(console, ComparisonFolder(Path("runs/c"), plan), 3, 3)
-    shown.begin(first)
+    shown = compare.Progress(console, ComparisonFolder(Path("runs/c"), plan), cells)
+    shown.begin(cells[0])
     learner = learning((12, 10**15, "generations"))
     shown.note(f"{progress.progress_of(learner, bound=False)}  success 37%", learner.describe(ROW))
     line = drawn(shown, width)
