@@ -62,8 +62,6 @@ from evolution.episodes.rollout import Limits
 CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill cost fewer
-MAX_FAILED_STARTS = 3  # in a row, each by an exception, while no other worker is up
-PAUSE_S = 1.0  # before a worker that did not come up is started again
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
 
@@ -72,14 +70,13 @@ class _Slot:
     """One worker's place; a worker that dies is replaced."""
 
     number: int
-    actor: Any = None
-    hello: Any = None  # the answer that says it is up, then that it is prepared; None after that
+    actor: Any
+    hello: Any  # the answer that says it is up, then that it is prepared; None after that
     pid: int = 0
     serial: int = 0  # of the last task that it was sent
     maps: set[Name] = field(default_factory=set)  # that it was sent
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (serial of the task, answer), oldest first
     heard: float = 0.0  # when it last answered, or was sent something after all was answered
-    start_at: float = 0.0  # where there is no actor
 
 
 @dataclass
@@ -128,7 +125,7 @@ class RayPool(WorkerPool):
         self._patience_s = patience_s or (PATIENCE_S if address is None else CLUSTER_PATIENCE_S)
         self._slots: list[_Slot] = []
         self._serial = 0
-        self._failed_starts, self._last_failure = 0, ""
+        self._last_failure = ""  # of a worker's start
         self._metre_s: dict[_Kind, float] = {}  # what a metre of such a part took the last time
         self._logs = ""  # where they are, in words
         self._session: str | None = None  # folder of our own Ray's logs
@@ -163,9 +160,7 @@ class RayPool(WorkerPool):
         while not dispatch.finished():
             now = time.monotonic()
             for slot in self._slots:
-                if slot.actor is None and slot.start_at <= now:
-                    self._start(slot)
-                elif slot.sent and now - slot.heard > self._patience_s and not self._ready([slot.sent[0][1]], 0.0):
+                if slot.sent and now - slot.heard > self._patience_s and not self._ready([slot.sent[0][1]], 0.0):
                     self._bury(slot, job, f"it did not answer for {now - slot.heard:.0f} s")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.hello and not slot.sent]
             for number, chunk in dispatch.give(idle):
@@ -274,8 +269,10 @@ class RayPool(WorkerPool):
         self._leaving = True
         self._booted.wait(CONNECT_S)  # a start of Ray cannot be stopped
         if self._connected:
+            import ray
+
             for slot in self._slots:
-                self._kill(slot)
+                ray.kill(slot.actor)
             leave()
             if self._session and not self._troubled:
                 shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
@@ -300,9 +297,7 @@ class RayPool(WorkerPool):
             self._connected = True
             self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
-            self._slots = [_Slot(number) for number in range(self._asked)]
-            for slot in self._slots:
-                self._start(slot)
+            self._slots = [self._start(number) for number in range(self._asked)]
         except BaseException as error:
             self._failure = error
         finally:
@@ -320,20 +315,16 @@ class RayPool(WorkerPool):
             where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
             raise PoolError(f"{where}: {reason(self._failure)}") from self._failure
 
-    def _start(self, slot: _Slot) -> None:
-        slot.actor = self._actor_class.remote(self._factory)
-        slot.hello = slot.actor.hello.remote()
+    def _start(self, number: int) -> _Slot:
+        actor = self._actor_class.remote(self._factory)
+        return _Slot(number, actor, actor.hello.remote())
 
-    def _replace(self, slot: _Slot, pause_s: float = 0.0) -> None:
-        self._troubled = True
-        self._kill(slot)  # it may be alive and merely out of reach
-        self._slots[slot.number] = _Slot(slot.number, start_at=time.monotonic() + pause_s)
-
-    def _kill(self, slot: _Slot) -> None:
+    def _replace(self, slot: _Slot) -> None:
         import ray
 
-        if slot.actor is not None:
-            ray.kill(slot.actor)
+        self._troubled = True
+        ray.kill(slot.actor)  # it may be alive and merely out of reach
+        self._slots[slot.number] = self._start(slot.number)
 
     def _greet(self, slot: _Slot, job: _Job) -> None:
         """A worker is up and is to be prepared, or it is prepared, or it could not start."""
@@ -344,12 +335,11 @@ class RayPool(WorkerPool):
         except ray.exceptions.RayError as error:
             if not is_to_blame(error):
                 return self._replace(slot)
-            self._failed_starts += 1
-            self._last_failure = f"; the last one: {reason(error)}{self._logs}"
-            if failed_as_it_began(error) and self._failed_starts >= MAX_FAILED_STARTS and not self.pids():
+            if failed_as_it_began(error) and not self.pids():
                 raise PoolError(f"no worker can be started: {reason(error)}{self._logs}") from error
-            self._replace(slot, PAUSE_S)
+            self._last_failure = f"; the last one: {reason(error)}{self._logs}"
+            self._replace(slot)
         else:
-            self._failed_starts, self._last_failure = 0, ""
+            self._last_failure = ""
             prepared = slot.serial > 0
             slot.hello = None if prepared else slot.actor.prepare.remote(self._serial, *self._update(slot, job))
