@@ -40,14 +40,6 @@ class UsageError(GridSimError):
     """Wrong use; the message is shown in one line."""
 
 
-class Failed(GridSimError):
-    """A failure that is no wrong use, which ends with 1; `hint` is a second line."""
-
-    def __init__(self, message: str, hint: str = ""):
-        super().__init__(message)
-        self.hint = hint
-
-
 def cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -201,7 +193,5 @@ def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], 
     except KeyboardInterrupt:  # before there was anything to save, or for the second time
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
-    except Failed as error:
-        fail(prog, str(error), error.hint, FAILED)
     except GridSimError as error:
         fail(prog, str(error), (hints or {}).get(type(error), ""))

@@ -19,13 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from cluster.commands.common import (
+    FAILED,
     INTERRUPTED,
-    Failed,
     UsageError,
     WorkFlags,
     as_flag,
     check_unchanged,
     command_path,
+    fail,
     main,
     parse,
     select,
@@ -167,14 +168,14 @@ def _train_and_compare(
         print(f"{PROG}: warning: {unsent}", file=sys.stderr)
     again = f"continue with: {command_path(PROG)} --resume {short_path(folder.path)}"
     if problem:
-        raise Failed(problem, again)
+        fail(PROG, problem, again, FAILED)
     if results.runs:
         results.show(console)
     console.print(f"compare: {tracker.where()}", soft_wrap=True)
     if code:
         print(f"{PROG}: stopped; {again}", file=sys.stderr)
     elif failed:
-        raise Failed(f"{failed} of {len(cells)} runs failed", again)
+        fail(PROG, f"{failed} of {len(cells)} runs failed", again, FAILED)
     return code
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from cluster.commands.common import Failed, RoadFlags, UsageError, command_path, main, parse, wrong_use
+from cluster.commands.common import FAILED, RoadFlags, UsageError, command_path, fail, main, parse, wrong_use
 from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs import checkpoint
@@ -285,7 +285,7 @@ def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
         try:
             count = write_video(output, counted(), size, fps)
         except VideoError as error:
-            raise Failed(str(error)) from error
+            fail(WATCH, str(error), code=FAILED)
     end = drives[0][0].end
     how = "" if end == End.RUNNING else f", to its end: {end.name.lower()}"
     size_mb = output.stat().st_size / 1e6

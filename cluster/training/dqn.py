@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import DqnSettings
-from cluster.training.trainer import Learning, check_any_left, mean_speed, unmodified
+from cluster.training.trainer import Learning, check_any_left, mean_speed, named, unmodified
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
 from evolution.dqn.replay import Replay
@@ -209,14 +209,6 @@ class Dqn(Learning):
             "car_steps": self.car_steps,
             "episodes": self.episodes,
             "updates": self.learner.updates,
-            "converged": int(self.converged),
-        }
-
-    def summary(self) -> dict[str, Any]:
-        return {
-            "evaluations": self.steps,
-            "updates": self.learner.updates,
-            "episodes": self.episodes,
             "converged": self.converged,
         }
 
@@ -250,9 +242,9 @@ class Dqn(Learning):
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super().restore(arrays, meta)
-        self.learner.restore(_named(arrays, "learner_"), meta["learner"])
+        self.learner.restore(named(arrays, "learner_"), meta["learner"])
         if "replay" in meta:  # an ended run saves none; if it is extended, it fills a new one before it learns on
-            self.replay.restore(_named(arrays, "replay_"), meta["replay"])
+            self.replay.restore(named(arrays, "replay_"), meta["replay"])
         self.probe, self.probe_q = arrays["probe"], arrays["probe_q"]
         self.batches, self.episodes, self.calm = meta["batches"], meta["episodes"], meta["calm"]
         self._owed, self._mean_steps = meta["owed"], meta["mean_steps"]
@@ -263,8 +255,3 @@ def _finite(numbers: np.ndarray, updates: int) -> np.ndarray:
     if not np.isfinite(numbers).all():
         raise diverged(updates)
     return numbers
-
-
-def _named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names begin with a prefix, without it."""
-    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}

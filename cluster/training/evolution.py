@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import EvolveSettings
-from cluster.training.trainer import Bred, Learning, check_any_left, mean_speed
+from cluster.training.trainer import Bred, Learning, check_any_left, mean_speed, named
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import targets
@@ -147,9 +147,6 @@ class Evolution(Learning):
     def counts(self) -> dict[str, int]:
         return {"generation": self.generation, "car_steps": self.car_steps}
 
-    def summary(self) -> dict[str, Any]:
-        return {"generations": self.generation}
-
     def progress(self) -> tuple[float, float, str]:
         s = self.settings
         if s.car_steps and not s.generations:
@@ -175,8 +172,7 @@ class Evolution(Learning):
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super().restore(arrays, meta)
-        searched = {name.removeprefix("search_"): array for name, array in arrays.items() if name.startswith("search_")}
-        self.search.restore(searched, meta["search"])
+        self.search.restore(named(arrays, "search_"), meta["search"])
         self.search.generation = meta["generation"]
         if self.champion is not None:
             self.search.keep_champion(self.champion.genome)

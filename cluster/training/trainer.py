@@ -163,10 +163,6 @@ class Learning(ABC):
         """How far it has come: the settings' `counts`."""
 
     @abstractmethod
-    def summary(self) -> dict[str, Any]:
-        """What summary.json has only for this learner."""
-
-    @abstractmethod
     def progress(self) -> tuple[float, float, str]:
         """How far the run is, how far it goes at most (0: unknown), and in what unit."""
 
@@ -313,6 +309,11 @@ class Learning(ABC):
         for k, row in enumerate(self.history[:steps]):
             writer.writerow([k, *(repr(row[name]) for name in self.columns)])
         return text.getvalue().encode()
+
+
+def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def genes_of(genome: np.ndarray | None) -> np.ndarray:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 
+from cluster.workers import ray_session
 from cluster.workers.actor import Actor, Name, Shared
 from cluster.workers.dispatch import MAX_KILLS, Dispatch
 from cluster.workers.pool import (
@@ -44,17 +45,6 @@ from cluster.workers.pool import (
     identify,
     last_line,
     metres,
-)
-from cluster.workers.ray_session import (
-    ENVIRONMENT,
-    capacity,
-    check_address,
-    failed_as_it_began,
-    is_to_blame,
-    join,
-    leave,
-    reason,
-    start_own,
 )
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import Limits
@@ -117,8 +107,8 @@ class RayPool(WorkerPool):
     ):  # fmt: skip
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
-        os.environ.update(ENVIRONMENT | os.environ)
-        self.address = None if address is None else check_address(address)
+        os.environ.update(ray_session.ENVIRONMENT | os.environ)
+        self.address = None if address is None else ray_session.check_address(address)
         self._asked = workers
         self._build_map = build_map
         self._factory = worker_factory
@@ -176,7 +166,7 @@ class RayPool(WorkerPool):
             if self.pids():
                 alone_since = time.monotonic()
             elif time.monotonic() - alone_since > self._patience_s:
-                why = capacity() + self._last_failure
+                why = ray_session.capacity() + self._last_failure
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
         self._measure(task, asked, call)
@@ -229,13 +219,13 @@ class RayPool(WorkerPool):
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
             if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
-                return self._bury(slot, job, reason(cause), is_to_blame(cause))
+                return self._bury(slot, job, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = job.dispatch.at(slot.number)
                 what = describe(job.task, at, job.dispatch.parts[at])
                 raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
         except ray.exceptions.RayError as error:
-            return self._bury(slot, job, reason(error), is_to_blame(error))
+            return self._bury(slot, job, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
         chunk = job.dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
@@ -273,7 +263,7 @@ class RayPool(WorkerPool):
 
             for slot in self._slots:
                 ray.kill(slot.actor)
-            leave()
+            ray_session.leave()
             if self._session and not self._troubled:
                 shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
         self._slots = []
@@ -290,10 +280,10 @@ class RayPool(WorkerPool):
             if self._leaving:
                 return
             if self.address is None:
-                self._session = start_own(self._asked)
+                self._session = ray_session.start_own(self._asked)
                 self._logs = f" (logs: {self._session}/logs)"
             else:
-                join(self.address)
+                ray_session.join(self.address)
             self._connected = True
             self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
@@ -313,10 +303,10 @@ class RayPool(WorkerPool):
             raise self._failure
         if self._failure:
             where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
-            raise PoolError(f"{where}: {reason(self._failure)}") from self._failure
+            raise PoolError(f"{where}: {ray_session.reason(self._failure)}") from self._failure
 
     def _start(self, number: int) -> _Slot:
-        actor = self._actor_class.remote(self._factory)
+        actor: Any = self._actor_class.remote(self._factory)
         return _Slot(number, actor, actor.hello.remote())
 
     def _replace(self, slot: _Slot) -> None:
@@ -333,11 +323,11 @@ class RayPool(WorkerPool):
         try:
             slot.pid = ray.get(slot.hello)
         except ray.exceptions.RayError as error:
-            if not is_to_blame(error):
+            if not ray_session.is_to_blame(error):
                 return self._replace(slot)
-            if failed_as_it_began(error) and not self.pids():
-                raise PoolError(f"no worker can be started: {reason(error)}{self._logs}") from error
-            self._last_failure = f"; the last one: {reason(error)}{self._logs}"
+            if ray_session.failed_as_it_began(error) and not self.pids():
+                raise PoolError(f"no worker can be started: {ray_session.reason(error)}{self._logs}") from error
+            self._last_failure = f"; the last one: {ray_session.reason(error)}{self._logs}"
             self._replace(slot)
         else:
             self._last_failure = ""

@@ -9,7 +9,7 @@ import pytest
 from cluster.commands import common as command
 from cluster.commands import entry, watch
 from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
-from cluster.commands.common import Failed, UsageError, command_path, main, parse, warn_of_many_workers
+from cluster.commands.common import UsageError, command_path, main, parse, warn_of_many_workers
 from cluster.commands.compare import CompareFlags
 from cluster.commands.watch import DriveFlags, WatchFlags
 from cluster.workers import ray_pool
@@ -115,7 +115,6 @@ def test_a_command_is_entered_and_ctrl_c_is_quiet_while_its_libraries_load(monke
     [
         (UsageError("no such\nroad"), 2, ["p: error: no such road"]),
         (NoDisplayError("no display"), 2, ["p: error: no display", "film it"]),
-        (Failed("the disk is full", "go on"), 1, ["p: error: the disk is full", "go on"]),
     ],
 )
 def test_an_error_for_the_user_is_one_line_and_perhaps_a_hint(error, code, lines, capsys):
