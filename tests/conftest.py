@@ -64,6 +64,12 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def database(empty_database: Path, tmp_path: Path) -> None:
+    """The database that a run started in `tmp_path` logs to, created already."""
+    shutil.copy(empty_database, tmp_path)
+
+
+@pytest.fixture
 def uri(empty_database: Path, tmp_path: Path) -> str:
     """MLflow's address of a database that holds nothing but the experiment `other`."""
     from cluster.tracking.address import check_uri

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
+import pytest
 
 BIN = Path(sys.executable).parent
 
@@ -37,6 +38,14 @@ def finish(*arguments, cwd, timeout=240, **env):
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def call(main, monkeypatch, capsys, *arguments):
+    """A command's function (`evolve_main`) in this process: (exit code, what it prints, its errors)."""
+    monkeypatch.setattr(sys, "argv", [f"gridsim-{main.__name__.removesuffix('_main')}", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code, *capsys.readouterr()
 
 
 def summary(folder):
