@@ -57,16 +57,6 @@ def test_gymnasiums_checker_passes_without_a_display(
         check_env(env.unwrapped)
 
 
-@pytest.mark.usefixtures("dummy")
-def test_gymnasiums_checker_passes_with_a_display(maps: Maps) -> None:
-    """It makes the environment in both of its render modes."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        env = gymnasium.make("GridSim/City-v0", maps=maps["city"][:1])
-        assert env.unwrapped.metadata["render_modes"] == ["rgb_array", "human"]
-        check_env(env.unwrapped)
-
-
 @pytest.mark.parametrize(("observation", "frames"), SENSING)
 @pytest.mark.parametrize("name", IDS)
 def test_spaces_and_traffic_are_those_of_the_options(name: str, observation: str, frames: int) -> None:
