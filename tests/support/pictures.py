@@ -9,13 +9,12 @@ from PIL import Image
 from gridsim.car.ego import collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
-from gridsim.maps.roads import Strips, clearances, freeze
+from gridsim.maps.roads import clearances, freeze
 
 PPM = 16
 W, H = 100.0, 72.0  # m
 LINES = np.array([[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]])
 ARCS = np.array([[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]])
-STRIPS = Strips.of(LINES, ARCS)
 
 
 def distance(x, y):
