@@ -50,25 +50,6 @@ def read(road, points):
 # --- The oracle itself -----------------------------------------------------------------------------------------------
 
 
-def test_the_oracles_two_halves_agree(exact):
-    """Rays are intersections, clearance is distances: walk along rays in steps of 2 cm and look where they leave."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0.0, 256.0, (2000, 2))
-    points = np.repeat(points[exact.clearance(points) > 0.05][:60], 2, axis=0)
-    angles = rng.uniform(-math.pi, math.pi, len(points))
-    t, grazing = np.arange(0.0, 50.0, 0.02), 0
-    for point, angle, reach in zip(points, angles, exact.cast(points, angles[:, None], 50.0)[:, 0], strict=True):
-        along = point + t[:, None] * [math.cos(angle), math.sin(angle)]
-        inside = exact.clearance(along) >= 0.0
-        left = t[np.argmin(inside)] if not inside.all() else 50.0
-        if abs(left - reach) > 0.02 + 1e-9:
-            # A chord of less than a step off the road may be stepped over; nothing else may differ.
-            assert left > reach
-            assert exact.clearance(along[t <= left]).min() < 0.02
-            grazing += 1
-    assert grazing <= 2
-
-
 def test_the_oracle_knows_a_ring_and_a_strip():
     _, ring = small_road(arcs=[[32, 32, 10, 1.0, 2 * math.pi, 3]])
     points = [[42, 32], [45, 32], [46, 32], [32, 39], [32, 38], [32, 24.5]]
@@ -164,19 +145,6 @@ def test_no_start_range_exceeds_the_true_range(scenario, exact, wide):
     # It is there to save steps: on the road's inner metres it covers most of the way.
     inner = exact.clearance(points) > 1.0
     assert start[inner].sum() > 0.35 * true[inner].sum()
-
-
-def test_the_table_repeats_its_first_bins_behind_the_last(scenario):
-    table = start_table(scenario.road)
-    extra = table.shape[1] - HEADING_BINS
-    assert extra > 0
-    assert (table[:, HEADING_BINS:] == table[:, np.arange(extra) % HEADING_BINS]).all()
-
-
-def test_in_the_open_the_table_reaches_as_far_as_the_field_can_tell():
-    road, _ = small_road(lines=[[0, 0, 64, 0, 40.0], [0, 32, 64, 32, 40.0]])  # road everywhere
-    assert (road.start_row >= 0).all()
-    assert (road.start == 50 * START_UNITS).all()
 
 
 # --- What kernels read -----------------------------------------------------------------------------------------------
