@@ -316,15 +316,6 @@ def test_back_and_forth_earns_the_furthest_point(straight):
     assert r.states[:, DISTANCE] == pytest.approx(furthest, abs=0.02)
 
 
-def test_only_a_bounded_speed_is_paced(straight):
-    r = run(straight, [100, 32, 0, 0, 0], always(Action.ACCELERATE), max_steps=80)  # 0 to 24 m/s
-    v = r.states[:, SPEED].astype(float)
-    within = (v >= INTERVAL[0]) & (v <= INTERVAL[1])
-    gained = np.diff(r.states[:, DISTANCE].astype(float), prepend=0.0)
-    assert 0 < within.sum() < 80
-    assert r.states[-1, PACED] == pytest.approx(gained[within].sum(), abs=1e-3)
-
-
 @pytest.mark.parametrize("wall", [1.0, 2.0])
 @pytest.mark.parametrize("heading", [0.0, 0.02, math.pi])
 def test_nothing_tunnels_through_a_thin_wall(wall, heading):
