@@ -99,15 +99,3 @@ def test_random_search_learns_nothing_but_keeps_its_best():
         assert not {g.tobytes() for g in fresh} & {g.tobytes() for g in before}
         search.tell(first_gene(now))
         before = now
-
-
-def test_a_run_may_begin_with_a_genome():
-    genome = np.random.default_rng(1).normal(size=SPEC.size).astype(F)
-    search = TwoParents(SPEC, CONFIG, seed=12)
-    search.start_from(genome)
-    assert leader(search).tobytes() == genome.tobytes()
-    search.ask()
-    members = search.genomes(EVERYONE)
-    assert members[0].tobytes() == genome.tobytes()
-    assert (members == genome).mean() > 0.9  # the others are its children
-    assert len({m.tobytes() for m in members}) > 10
