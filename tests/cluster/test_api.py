@@ -146,24 +146,13 @@ def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer):
     stack = np.random.default_rng(1).choice([0, 127, 255], (3, 2, 80, 80)).astype(np.uint8)
     actions = seer.act(stack, np.array([0.0, 5.0, 9.0]))
     assert [seer.act(grid, speed) for grid, speed in zip(stack, (0.0, 5.0, 9.0), strict=True)] == list(actions)
+    shares = np.array([[0.0], [5.0], [9.0]]) / seer.sim.vehicle.speed_limit
+    assert list(seer.act({"grid": stack, "speed": shares})) == list(actions)
+    assert list(seer.act({"grid": stack}, np.array([0.0, 5.0, 9.0]))) == list(actions)
     with pytest.raises(ValueError, match="needs the speed"):
         seer.act(stack)
     with pytest.raises(ValueError, match="sees grids"):
         seer.act(np.zeros(32, dtype=np.float32), 5.0)
-
-
-@pytest.mark.parametrize("frames", [1, 2])
-def test_a_champion_of_the_grid_drives_what_its_environment_shows(frames, seer):
-    spec = PolicySpec.parse(f"cnn:8,8,8@{frames}")
-    driver = Champion(np.random.default_rng(2).normal(size=spec.size).astype(np.float32), str(spec), "curved", seer.sim)
-    env = driver.make_env(maps=1)
-    observation, info = env.reset(seed=1)
-    for _ in range(3):
-        grid = observation["grid"] if frames > 1 else observation["grid"][0]
-        assert grid.shape[-2:] == (80, 80)
-        action = driver.act(observation)
-        assert action == driver.act(observation, info["speed_mps"]) == driver.act(grid, info["speed_mps"])
-        observation, *_, info = env.step(action)
 
 
 def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):
