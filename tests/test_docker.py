@@ -1,7 +1,4 @@
-"""The image and the compose file, without Docker: held against the project, and their commands run as they stand there.
-
-The image's own steps are run in fresh roots by test_image.py, where it is asked to: that takes ten minutes.
-"""
+"""The image and the compose file, without Docker: held against the project, and their commands run as they stand."""
 
 import json
 import os
