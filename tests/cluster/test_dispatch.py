@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.workers.dispatch import LATE_S, MAX_KILLS, QUEUE, Dispatch
+from cluster.workers.dispatch import LATE, LATE_S, MAX_KILLS, QUEUE, Dispatch
 from cluster.workers.pool import Chunk
 
 
@@ -158,6 +158,16 @@ def test_idle_workers_take_copies_of_late_chunks_and_the_first_answer_counts() -
     assert dispatch.finished(), "the other copy is not waited for"
     assert dispatch.died(2, late + 9.1) == []
     assert dispatch.retries == 0
+
+
+def test_a_chunk_is_not_late_before_the_slowest_took_a_fraction_of_its_time() -> None:
+    dispatch = new(5, 5, 5)
+    assert list(dispatch.give([0, 1], 0.0)) == [(0, 0), (1, 1)]
+    assert list(dispatch.give([2], 1.0)) == [(2, 2)]
+    assert list(dispatch.give([3], 99.0)) == [], "nothing is answered yet: nobody knows how long it takes"
+    assert dispatch.answered(1, 99.0) == 1
+    assert list(dispatch.give([1], LATE * 99.0)) == []
+    assert list(dispatch.give([1], LATE * 99.0 + 0.1)) == [(1, 0)]
 
 
 def test_a_chunk_whose_copy_goes_on_is_not_sent_again() -> None:
