@@ -139,6 +139,16 @@ def test_mutation_is_gaussian_at_its_rate(rate, sigma):
     assert is_normal(children[changed][:20_000].astype(float) / sigma)
 
 
+def test_mutation_and_inheritance_are_independent(parents):
+    two = np.stack([np.full(SPEC.size, -100.0), np.full(SPEC.size, 100.0)]).astype(F)
+    children = breed(two, many(Kind.CROSS, 0, 1, 2000), 5, SPEC, Mutation(rate=0.5, sigma=1.0)).astype(float)
+    inherited = children > 0
+    noise = children - np.where(inherited, 100.0, -100.0)
+    mutated = np.abs(noise) > 1e-4
+    assert mutated[inherited].mean() == pytest.approx(mutated[~inherited].mean(), abs=0.01)
+    assert noise[inherited & mutated].mean() == pytest.approx(0.0, abs=0.02)
+
+
 @settings(max_examples=30, derandomize=True)
 @given(data=st.data())
 def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data):
