@@ -125,3 +125,19 @@ def test_a_gene_that_is_not_a_number_is_no_action():
         spoilt[gene] = math.nan
         assert decide(spoilt, spec.layers, F(5), room) == -1, gene
     assert decide(genome, spec.layers, F(5), room) >= 0  # and nothing of it stays
+
+
+@pytest.mark.parametrize(
+    ("text", "shape", "kind"),
+    [
+        ("cnn:8,8,8@1", (4, 80, 80, 1), np.uint8),
+        ("cnn:8,8,8@4", (80, 80), np.uint8),
+        ("cnn:8,8,8@4", (3, 80, 80), np.uint8),
+        ("cnn:8,8,8@1", (80, 80), np.float32),
+        ("cnn:8,8,8@1", (32,), np.float32),
+    ],
+)
+def test_other_observations_are_refused(text, shape, kind):
+    spec = cnn(text)
+    with pytest.raises(ValueError, match=r"^cnn:8,8,8@\d sees grids uint8"):
+        convnet.act_on(spec, np.zeros(spec.size, F), np.zeros(shape, kind), 1.0)
