@@ -150,6 +150,16 @@ FUZZ = settings(max_examples=40)
 
 
 @FUZZ
+@given(data=st.binary(max_size=300), suffix=st.sampled_from(["png", "pgm", "jpg", "bmp", "yaml"]))
+def test_any_bytes(small, data, suffix):
+    starts = {"png": b"\x89PNG\r\n\x1a\n", "pgm": b"P5 ", "jpg": b"\xff\xd8\xff", "bmp": b"BM", "yaml": b""}
+    path = small[0] / f"fuzz.{suffix}"
+    for content in (data, starts[suffix] + data):
+        path.write_bytes(content)
+        loads_or_is_refused(path)
+
+
+@FUZZ
 @given(
     edits=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=4),
     cut=st.one_of(st.none(), st.integers(0, 10_000)),
