@@ -18,7 +18,7 @@ from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs import episodes, observing, simulator
-from gridsim.envs.env import RENDER_SIZE, GridSimEnv
+from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
 from gridsim.maps import map
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
@@ -57,6 +57,18 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
     human.step(Action.ACCELERATE)  # drives on, unseen
     human.close()
     human.close()
+
+
+def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
+    env = GridSimVectorEnv(3, scenario="highway", maps=maps["highway"], render_mode="rgb_array", observation="grid")
+    env.reset(seed=0)
+    pictures = env.render()
+    assert pictures is not None
+    assert len(pictures) == 3
+    assert len({p.tobytes() for p in pictures}) == 3
+    again = env.render()
+    assert again is not None
+    np.testing.assert_array_equal(pictures, again)
 
 
 @pytest.mark.parametrize("vector", [False, True])
