@@ -146,8 +146,8 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     """It waits for the first host, takes in the second, goes on without the first, and is resumed without any."""
     address, _ = cluster(0)
     run = tmp_path / "runs/h"
-    arguments = ("--workers", "2", "--address", address, "--patience", str(PATIENCE_S), "--name", "h", *SMALL)
-    process = start("gridsim-evolve", *arguments, cwd=tmp_path)
+    arguments = ("--workers", "2", "--address", "auto", "--patience", str(PATIENCE_S), "--name", "h", *SMALL)
+    process = start("gridsim-evolve", *arguments, cwd=tmp_path, RAY_ADDRESS=address)
     try:
         _, first = cluster(1, address)
         wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
