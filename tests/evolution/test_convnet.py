@@ -5,11 +5,11 @@ import math
 import numba
 import numpy as np
 import pytest
+from searching import new_genomes
 
 from evolution.networks import convnet
 from evolution.networks.dense import plain_tile, vector_tile
 from evolution.networks.policy import CnnSpec, PolicySpec
-from evolution.search.breeding import RECIPE, Kind, Mutation, breed
 from gridsim.config import SimConfig
 from gridsim.sensing.grid import grid_table, grids
 
@@ -36,12 +36,6 @@ def cnn(text):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, CnnSpec)
     return spec
-
-
-def new_genomes(spec, n, seed=1):
-    recipes = np.zeros(n, dtype=RECIPE)
-    recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
-    return breed(np.zeros((0, spec.size), dtype=F), recipes, seed, spec, Mutation())
 
 
 def random_grids(n, rng):
