@@ -7,6 +7,7 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import read, small_road
 
 from gridsim.maps.roads import (
     CELLS_PER_M,
@@ -17,13 +18,10 @@ from gridsim.maps.roads import (
     START_UNITS,
     Strips,
     clearance_nodes,
-    clearances,
     freeze,
-    make_road,
     power_of_two,
 )
 
-F = np.float32
 SIDE = 64.0  # m, of the small maps
 CEILING = FIELD_FLOOR + 255 / FIELD_UNITS  # m, the greatest clearance a field can hold
 
@@ -36,15 +34,6 @@ def scenario(maps):
 @pytest.fixture(scope="module")
 def exact(scenario):
     return oracle.ExactRoad(scenario.strips, float(scenario.road.width), float(scenario.road.height))
-
-
-def small_road(lines=(), arcs=(), side=SIDE):
-    strips = Strips.of(lines, arcs)
-    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 50.0), oracle.ExactRoad(strips, side, side)
-
-
-def read(road, points):
-    return clearances(road, freeze(np.asarray(points, dtype=F)))
 
 
 # --- The oracle itself -----------------------------------------------------------------------------------------------

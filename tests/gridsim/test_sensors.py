@@ -6,6 +6,7 @@ import numba
 import numpy as np
 import oracle
 import pytest
+from pictures import small_road
 
 from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
@@ -98,17 +99,12 @@ def test_rays_are_those_of_the_exact_geometry(views):
 
 
 def test_the_first_ray_is_the_rightmost():
-    road, _ = strip_road([[0, 32, 64, 32, 4.0]])
+    road, _ = small_road([[0, 32, 64, 32, 4.0]])
     ranges = look(road, [(20.0, 34.0)], [0.0])[0]
     # 2 m of road to the left, 6 m to the right.
     assert ranges[30] == pytest.approx(2.0 / math.sin(math.radians(60.0)), abs=0.05)
     assert ranges[0] == pytest.approx(6.0 / math.sin(math.radians(60.0)), abs=0.05)
     assert ranges[15] == REACH
-
-
-def strip_road(lines=(), arcs=(), side=64.0):
-    strips = Strips.of(lines, arcs)
-    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), REACH), oracle.ExactRoad(strips, side, side)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +118,7 @@ def strip_road(lines=(), arcs=(), side=64.0):
 def test_no_ray_passes_a_wall(half, wall, thin):
     """Two roads side by side, a wall between them: rays from one never reach the other, from wherever they start."""
     strips = [[0, 20.2, 64, 20.2, half], [0, 20.2 + 2 * half + wall, 64, 20.2 + 2 * half + wall, half]]
-    road = strip_road(strips)[0]._replace(thin=np.uint32(thin))
+    road = small_road(strips)[0]._replace(thin=np.uint32(thin))
     rng = np.random.default_rng(3)
     points = np.stack([rng.uniform(0, 64, 1000), 20.2 + (half - 0.5) * rng.uniform(-1, 1, 1000)], axis=1).astype(F)
     headings = rng.uniform(0.1, math.pi - 0.1, 1000)
@@ -161,9 +157,9 @@ def test_rays_see_parked_cars():
 
 
 def test_an_empty_world_and_a_full_one():
-    road, _ = strip_road([[0, 0, 64, 0, 40.0], [0, 32, 64, 32, 40.0]])
+    road, _ = small_road([[0, 0, 64, 0, 40.0], [0, 32, 64, 32, 40.0]])
     assert (look(road, [(10.0, 10.0)], [1.0]) == REACH).all()
-    road, _ = strip_road([[10, 10, 11, 10, 2.0]])
+    road, _ = small_road([[10, 10, 11, 10, 2.0]])
     assert look(road, [(40.0, 40.0)], [1.0]).max() == 0.0  # far off the road everything is hidden
 
 

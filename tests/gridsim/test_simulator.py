@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import oracle
 import pytest
-from pictures import crashes
+from pictures import crashes, small_road
 
 from gridsim.car.ego import (
     COS,
@@ -238,15 +238,10 @@ def test_a_batch_is_its_cars(scenarios, episodes):
     assert [End(e).name for e in batch.state.ends] == [r.end for _, r in chosen]
 
 
-def small_road(lines=(), arcs=(), side=128.0):
-    strips = Strips(np.array(lines, dtype=float).reshape(-1, 5), np.array(arcs, dtype=float).reshape(-1, 6))
-    return make_road(clearance_nodes(strips, side, side), INTERVAL, 50.0)
-
-
 @pytest.fixture(scope="module")
 def plain():
     """Road everywhere: a torus of 128 m without an edge."""
-    return small_road([[0, y, 128, y, 40.0] for y in (0, 40, 80)])
+    return small_road([[0, y, 128, y, 40.0] for y in (0, 40, 80)], side=128.0)[0]
 
 
 @pytest.fixture(scope="module")
@@ -320,7 +315,7 @@ def test_back_and_forth_earns_the_furthest_point(straight):
 @pytest.mark.parametrize("heading", [0.0, 0.02, math.pi])
 def test_nothing_tunnels_through_a_thin_wall(wall, heading):
     """30 m/s at a wall across the road, from starts 10 cm apart: 3 m a step, and never beyond it."""
-    road = small_road([[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]])
+    road, _ = small_road([[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]], side=128.0)
     backwards = heading > 1.0
     for k in range(32):
         x = 40 + 0.1 * k if not backwards else 120 - 0.1 * k
