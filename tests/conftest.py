@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from commands import BIN, answers, end, wait_until
+from commands import BIN, answers, end, importable, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -103,6 +103,14 @@ def maps() -> dict[str, list[Map]]:
 def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows that nobody sees."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+@pytest.fixture(scope="module")
+def stand_ins(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Ray's workers, which know nothing of pytest's search path, can import what a test's file defines."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", importable(request.path))
+        yield
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tracked
-from commands import all_in_mlflow, call, descendants, duration_s, finish, rows, start, summary, wait_until
+from commands import all_in_mlflow, call, descendants, duration_s, finish, rows, same_run, start, summary, wait_until
 
 from cluster.commands.cli import DqnFlags, EvolveFlags, dqn_main, evolve_main
 from cluster.commands.compare import compare_main
@@ -52,10 +52,7 @@ def test_champion_is_the_same_for_any_number_of_workers(reference, tmp_path, wor
     done = evolve("--workers", str(workers), "--name", "w", *SMALL, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # no warning of Ray's or MLflow's reaches the user
-    assert summary(tmp_path / "runs/w")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
-    for mine, theirs in zip(rows(tmp_path / "runs/w"), rows(reference / "runs/ref"), strict=True):
-        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
-            assert mine[name] == theirs[name]
+    assert same_run(tmp_path / "runs/w", reference / "runs/ref")
 
 
 @pytest.mark.e2e

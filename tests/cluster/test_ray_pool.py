@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import importable, wait_until
+from commands import wait_until
 from driving import to_bytes
 from test_pool import (
     MAPS,
@@ -35,7 +35,7 @@ from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 
 NOBODY = 1_000_000  # stands for a member where there is none: as workers are prepared
 BANNED = {"torch", "mlflow", "pygame", "matplotlib", "tyro", "rich"}
@@ -88,14 +88,6 @@ class Inspecting(Worker):
 class Unfit(Answering):
     def __init__(self) -> None:
         raise RuntimeError("not in this state")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _stand_ins_can_be_imported() -> Iterator[None]:
-    """By the workers too, which know nothing of pytest's search path."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", importable(__file__))
-        yield
 
 
 @pytest.fixture(scope="module")

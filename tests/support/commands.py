@@ -69,6 +69,18 @@ def all_in_mlflow(run):
     return client.get_run(ended["mlflow_run_id"]).info.status == "FINISHED"
 
 
+def same_run(run, reference):
+    """Whether two runs of evolution came to the same by the same way, and MLflow has all of the first once."""
+    mine, theirs = summary(run), summary(reference)
+    assert mine["champion_sha256"] == theirs["champion_sha256"]
+    assert mine["car_steps"] == theirs["car_steps"]
+    assert mine["lost_chunks"] == 0
+    for row, other in zip(rows(run), rows(reference), strict=True):
+        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
+            assert row[name] == other[name]
+    return all_in_mlflow(run)
+
+
 def duration_s(run):
     """Duration that MLflow, in the database beside the run's folder's folder, has of the only run there."""
     from mlflow.tracking import MlflowClient
