@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from commands import BIN, answers, end, wait_until
+from commands import BIN, answers, end, importable, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -64,6 +64,12 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def database(empty_database: Path, tmp_path: Path) -> None:
+    """The database that a run started in `tmp_path` logs to, created already."""
+    shutil.copy(empty_database, tmp_path)
+
+
+@pytest.fixture
 def uri(empty_database: Path, tmp_path: Path) -> str:
     """MLflow's address of a database that holds nothing but the experiment `other`."""
     from cluster.tracking.address import check_uri
@@ -97,6 +103,14 @@ def maps() -> dict[str, list[Map]]:
 def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows that nobody sees."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+@pytest.fixture(scope="module")
+def stand_ins(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Ray's workers, which know nothing of pytest's search path, can import what a test's file defines."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", importable(request.path))
+        yield
 
 
 @pytest.fixture

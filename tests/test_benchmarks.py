@@ -1,13 +1,10 @@
-"""Every script in benchmarks/ runs, on a small scale, and the simulation behaves as queues do."""
+"""Every script in benchmarks/ runs, on a small scale."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -60,42 +57,3 @@ def test_results_are_measured_once_and_printed_as_a_table(tmp_path: Path) -> Non
     runs = sorted(tmp_path.glob("*/summary.json"))
     again = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert (again.stdout, sorted(tmp_path.glob("*/summary.json"))) == (first.stdout, runs)
-
-
-# ----------------------------------------------------------------------------------------------------- the simulation
-
-
-@pytest.fixture(scope="module")
-def simulation() -> Any:
-    spec = importlib.util.spec_from_file_location("simulation", FOLDER / "simulation.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["simulation"] = module  # its dataclasses look themselves up
-    spec.loader.exec_module(module)
-    return module
-
-
-def load_of(simulation: Any) -> Any:
-    goals, leader = np.array([400.0, 120.0]), np.full(16, 1000.0)
-    return simulation.at(simulation.Load(goals, np.tile(goals, (64, 1)), leader, leader, 311), 1.0, 311, True)
-
-
-def costs_of(simulation: Any, **costs: float) -> Any:
-    each = ("child", "recombine", "chunk", "look", "look_worker", "byte", "gene", "latency")
-    free = dict.fromkeys([f"{name}_s" for name in each], 0.0)
-    return simulation.Costs(**{**free, "bandwidth": 1e30, **costs})
-
-
-def test_one_worker_at_no_cost_never_waits(simulation: Any) -> None:
-    assert simulation.efficiency(costs_of(simulation), load_of(simulation), 1, 50) == pytest.approx(1.0)
-
-
-def test_a_coordinator_that_takes_time_for_each_chunk_bounds_many_workers(simulation: Any) -> None:
-    """Every chunk takes 10 ms of one thread: nothing is faster than all of them one after the other."""
-    load, chunk_s = load_of(simulation), 0.01
-    call = simulation.Call(
-        costs_of(simulation, chunk_s=chunk_s), 500, np.tile(load.drives[:1], (1000, 1)), load.targets
-    )
-    assert call.run() >= len(call.chunks()) * chunk_s * (1 - 1e-9)
-    assert call.run() >= call.drives.sum() / 500

@@ -1,13 +1,9 @@
-"""The image and the compose file, without Docker: held against the project, and their commands run as they stand there.
-
-The image's own steps are run in fresh roots by test_image.py, where it is asked to: that takes ten minutes.
-"""
+"""The image and the compose file, without Docker: held against the project, and their commands run as they stand."""
 
 import json
 import os
 import re
 import shlex
-import socket
 import subprocess
 import tomllib
 from collections.abc import Iterator
@@ -22,6 +18,7 @@ from commands import BIN, finish, wait_until
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
+from tracked import free_port
 
 from cluster.commands import cli, common
 from cluster.runs.settings import DqnSettings, EvolveSettings
@@ -173,12 +170,6 @@ def test_the_guides_commands_are_read_by_the_real_parser() -> None:
         common.parse(cli.EvolveFlags, "gridsim-evolve", shlex.split(line.replace("$WORKERS", "8")))
     for option in re.findall(r"--file (\S+)", text):
         assert (ROOT / option).is_file()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Services:

@@ -13,6 +13,7 @@ from cluster.runs.checkpoint import CheckpointError, save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import DqnSettings, SettingsError
 from evolution.episodes.rollout import Limits, trajectory
+from evolution.networks import convnet
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import STEERING
 from gridsim.maps.scenarios import build
@@ -142,28 +143,20 @@ def test_an_unfinished_run_says_how_to_go_on(settings, tmp_path):
         load_champion(tmp_path)
 
 
-def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer):
+def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer, monkeypatch):
     stack = np.random.default_rng(1).choice([0, 127, 255], (3, 2, 80, 80)).astype(np.uint8)
-    actions = seer.act(stack, np.array([0.0, 5.0, 9.0]))
-    assert [seer.act(grid, speed) for grid, speed in zip(stack, (0.0, 5.0, 9.0), strict=True)] == list(actions)
+    speeds = np.array([0.0, 5.0, 9.0])
+    actions = seer.act(stack, speeds)
+    assert [seer.act(grid, speed) for grid, speed in zip(stack, speeds, strict=True)] == list(actions)
+    assert list(seer.act({"grid": stack}, speeds)) == list(actions)
+    with monkeypatch.context() as patch:
+        patch.setattr(convnet, "act_on", lambda spec, genome, grids, speed: speed)
+        shares = speeds[:, None] / seer.sim.vehicle.speed_limit  # as an environment shows them
+        np.testing.assert_allclose(seer.act({"grid": stack, "speed": shares}), speeds, rtol=1e-6)
     with pytest.raises(ValueError, match="needs the speed"):
         seer.act(stack)
     with pytest.raises(ValueError, match="sees grids"):
         seer.act(np.zeros(32, dtype=np.float32), 5.0)
-
-
-@pytest.mark.parametrize("frames", [1, 2])
-def test_a_champion_of_the_grid_drives_what_its_environment_shows(frames, seer):
-    spec = PolicySpec.parse(f"cnn:8,8,8@{frames}")
-    driver = Champion(np.random.default_rng(2).normal(size=spec.size).astype(np.float32), str(spec), "curved", seer.sim)
-    env = driver.make_env(maps=1)
-    observation, info = env.reset(seed=1)
-    for _ in range(3):
-        grid = observation["grid"] if frames > 1 else observation["grid"][0]
-        assert grid.shape[-2:] == (80, 80)
-        action = driver.act(observation)
-        assert action == driver.act(observation, info["speed_mps"]) == driver.act(grid, info["speed_mps"])
-        observation, *_, info = env.step(action)
 
 
 def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):

@@ -1,6 +1,5 @@
 """Saved whole or not at all; loaded as saved or refused with a CheckpointError."""
 
-import contextlib
 import errno
 import functools
 import io
@@ -29,7 +28,6 @@ from cluster.runs.checkpoint import CheckpointError, load, save, write_atomic
 
 META = {"generation": 7, "history": [{"fitness/best": 0.1 + 0.2, "mean": float("-inf")}], "name": "Straße"}
 RECIPE = np.dtype([("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
-ALIGNED = np.dtype([("end", "u1"), ("distance", "<f8"), ("pose", "<f4", (3,))], align=True)
 DTYPES: st.SearchStrategy[Any] = st.sampled_from([*map(np.dtype, ("<f4", "<f8", "<u2", ">i4", "?", "<U4")), RECIPE])
 ONE_FOLDER = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -104,29 +102,6 @@ def test_numpy_reads_it_too(saved):
     assert saved.with_name("again.npz").read_bytes() == saved.read_bytes()
 
 
-@pytest.mark.parametrize(
-    "array",
-    [
-        np.array(3.5),
-        np.zeros(0, RECIPE),
-        np.array([(1, 2.5, (1, 2, 3))], ALIGNED),
-        np.arange(24.0).reshape(2, 3, 4).T,
-        np.arange(10)[::-2],
-        np.frombuffer(b"\0" * 7 + np.arange(3, dtype="<f8").tobytes(), np.uint8)[7:].view("<f8"),
-    ],
-    ids=lambda array: f"{array.dtype.kind}{array.shape}",
-)
-def test_arrays_come_back_as_numba_wants_them(tmp_path, array):
-    """It would compile a second time for others."""
-    save(tmp_path / "a.npz", {"x": array}, {})
-    loaded = load(tmp_path / "a.npz")[0]["x"]
-    assert (loaded.shape, loaded.dtype) == (array.shape, array.dtype)
-    np.testing.assert_array_equal(loaded, array)
-    assert loaded.flags.c_contiguous
-    assert loaded.flags.aligned
-    assert loaded.flags.writeable
-
-
 @given(
     arrays=st.dictionaries(
         st.from_regex(r"[a-z_]{1,8}", fullmatch=True).filter(lambda name: name != "meta"),
@@ -139,11 +114,17 @@ def test_arrays_come_back_as_numba_wants_them(tmp_path, array):
     ),
 )
 @ONE_FOLDER
-def test_any_content_comes_back_bit_by_bit(tmp_path, arrays, meta):
+def test_any_content_comes_back_bit_by_bit_as_numba_wants_it(tmp_path, arrays, meta):
+    """It would compile a second time for arrays that are not contiguous, aligned and writable."""
     path = tmp_path / "any.npz"
-    save(path, arrays, meta)
+    save(path, {name: array.T for name, array in arrays.items()}, meta)
     loaded, loaded_meta = load(path)
-    assert {name: array.tobytes() for name, array in loaded.items()} == {n: a.tobytes() for n, a in arrays.items()}
+    assert {name: array.tobytes() for name, array in loaded.items()} == {n: a.T.tobytes() for n, a in arrays.items()}
+    for name, array in loaded.items():
+        assert (array.shape, array.dtype) == (arrays[name].T.shape, arrays[name].dtype)
+        assert array.flags.c_contiguous
+        assert array.flags.aligned
+        assert array.flags.writeable
     assert loaded_meta == meta
 
 
@@ -162,18 +143,6 @@ def test_truncated_or_edited_at_any_byte(saved):
         flip = (0x01, 0x80, 0xFF)[place % 3]
         saved.write_bytes(content[:place] + bytes([content[place] ^ flip]) + content[place + 1 :])
         refused(saved)
-
-
-@given(data=st.data())
-@ONE_FOLDER
-def test_an_edit_with_a_matching_checksum_never_raises_anything_else(saved, data):
-    body = bytearray(saved.read_bytes()[:-64])
-    for _ in range(data.draw(st.integers(1, 4))):
-        body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
-    path = saved.with_name("edited.npz")
-    path.write_bytes(body + sha256(body).hexdigest().encode())
-    with contextlib.suppress(CheckpointError):
-        load(path)
 
 
 def test_what_is_no_checkpoint(tmp_path, saved):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tracked
-from commands import all_in_mlflow, descendants, duration_s, finish, rows, start, summary, wait_until
+from commands import all_in_mlflow, call, descendants, duration_s, finish, rows, same_run, start, summary, wait_until
 
 from cluster.commands.cli import DqnFlags, EvolveFlags, dqn_main, evolve_main
 from cluster.commands.compare import compare_main
@@ -36,29 +36,28 @@ def evolve(*arguments, cwd, **env):
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory):
+def reference(tmp_path_factory, empty_database):
     """The undisturbed run, in one process."""
     cwd = tmp_path_factory.mktemp("reference")
+    shutil.copy(empty_database, cwd)
     done = evolve("--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return cwd
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("database")
 @pytest.mark.parametrize("workers", [1, 4])  # with 2 it is interrupted, below
 def test_champion_is_the_same_for_any_number_of_workers(reference, tmp_path, workers):
     done = evolve("--workers", str(workers), "--name", "w", *SMALL, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # no warning of Ray's or MLflow's reaches the user
-    assert summary(tmp_path / "runs/w")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
-    for mine, theirs in zip(rows(tmp_path / "runs/w"), rows(reference / "runs/ref"), strict=True):
-        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
-            assert mine[name] == theirs[name]
+    assert same_run(tmp_path / "runs/w", reference / "runs/ref")
 
 
 @pytest.mark.e2e
-def test_ctrl_c_saves_and_leaves_nothing_behind(reference, empty_database, tmp_path):
-    shutil.copy(empty_database, tmp_path / "mlflow.db")  # a run waits for MLflow no more than 15 s then
+@pytest.mark.usefixtures("database")  # a run waits for MLflow no more than 15 s then
+def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
     process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
     history = tmp_path / "runs/c/history.csv"
     wait_until(lambda: history.exists() and len(rows(tmp_path / "runs/c")) >= 2)
@@ -115,6 +114,7 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("database")
 def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_path):
     """The same run again, a part of it first: flags beside `--config` change it."""
     config, run = str(reference / "runs/ref/config.json"), tmp_path / "runs/s"
@@ -129,11 +129,12 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
     assert len(rows(run)) == 6
     assert duration_s(run) == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "compare: make ui" in done.stdout
-    assert "http://127.0.0.1:5000/#/experiments/1/runs?workflowType=machine_learning&" in done.stdout
+    assert "http://127.0.0.1:5000/#/experiments/2/runs?workflowType=machine_learning&" in done.stdout
     assert summary(run)["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
 
 
 @pytest.mark.e2e
+@pytest.mark.usefixtures("database")
 def test_init_begins_with_a_champion(reference, tmp_path):
     arguments = ["--workers", "0", *ROAD, "--population", "24", "--generations", "1"]
     arguments += ["--recombination", "two", "--mutation-rate", "0"]
@@ -144,15 +145,15 @@ def test_init_begins_with_a_champion(reference, tmp_path):
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("after_s", [0.0, 1.5])
-def test_sigterm_while_ray_starts_ends_soon_and_leaves_nothing(tmp_path, after_s):
+@pytest.mark.parametrize(("sign", "after_s"), [(signal.SIGTERM, 0.0), (signal.SIGTERM, 1.5), (signal.SIGINT, 0.5)])
+def test_stopped_while_ray_starts_it_ends_soon_and_leaves_nothing(tmp_path, sign, after_s):
     with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
         process = start("gridsim-evolve", "--workers", "2", *SMALL, cwd=tmp_path, RAY_TMPDIR=short)
         wait_until(lambda: list(Path(short).glob("ray/session_2*")))
         time.sleep(after_s)
         children = descendants(process.pid)
         began = time.monotonic()
-        process.terminate()
+        process.send_signal(sign)
         _, err = process.communicate(timeout=60)
         assert time.monotonic() - began < 15  # 0.2 s where nothing else is going on
         assert process.returncode == 130, err
@@ -184,12 +185,8 @@ WRONG = [
 
 def said_by(monkeypatch, capsys, *arguments, main=evolve_main, prog="gridsim-evolve"):
     """What a command says on its standard error where it refuses to begin."""
-    monkeypatch.setattr(sys, "argv", [prog, *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    out, err = capsys.readouterr()
-    assert out == ""
+    code, out, err = call(main, monkeypatch, capsys, *arguments)
+    assert (code, out) == (2, "")
     assert err.startswith(f"{prog}: error: ")
     return err.splitlines()
 

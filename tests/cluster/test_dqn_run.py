@@ -28,9 +28,10 @@ def dqn(*arguments, cwd, **env):
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory):
+def reference(tmp_path_factory, empty_database):
     """The undisturbed run, in one process."""
     cwd = tmp_path_factory.mktemp("reference")
+    shutil.copy(empty_database, cwd)
     done = dqn("--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return cwd / "runs/ref"
@@ -46,6 +47,7 @@ def same(run, reference):
     return True
 
 
+@pytest.mark.usefixtures("database")
 def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, tmp_path):
     run = tmp_path / "runs/k"
     process = start("gridsim-dqn", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path)
@@ -99,6 +101,7 @@ def test_run_keeps_the_contracts(reference):
     assert json.loads(done.stdout) == found["held_out"]
 
 
+@pytest.mark.usefixtures("database")
 def test_an_ended_run_keeps_no_replay_and_can_be_extended(reference, tmp_path):
     home = reference.parent.parent
     kept = [path for part in ("runs", "mlartifacts") for path in (home / part).rglob("*") if path.is_file()]
@@ -112,6 +115,7 @@ def test_an_ended_run_keeps_no_replay_and_can_be_extended(reference, tmp_path):
     assert summary(run)["updates"] > summary(reference)["updates"]
 
 
+@pytest.mark.usefixtures("database")
 def test_a_run_that_diverges_says_so(tmp_path):
     done = dqn("--workers", "0", "--name", "d", *SMALL, "--learning-rate", "1e38", cwd=tmp_path)
     assert done.returncode == 1

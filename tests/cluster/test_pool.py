@@ -3,7 +3,6 @@
 import re
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,7 +33,6 @@ from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
-from gridsim.maps.roads import freeze
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import FIELDS
 
@@ -270,31 +268,6 @@ def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
     assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
-def test_states_before_the_end_are_those_of_the_member_that_drove_there() -> None:
-    """The last member drives the last two episodes, which ask for them; alone and in parts."""
-    maps = [build(*name) for name in MAPS]
-    episodes, worlds = lane_starts(maps, np.array([0, 1, 1, 0]), np.random.default_rng(1), 2)
-    episodes["rewind"][2:] = 5, 9
-    task = replace(make_task(MAPS, episodes), worlds=freeze(worlds))
-    recipes = make_recipes(6)
-    asked = [Chunk(slice(5, 6), slice(2, 4)), Chunk(slice(0, 5), slice(0, 2))]
-    outcome = SerialPool(lambda *name: maps[name[1]]).evaluate(task, recipes, asked=asked)
-    results, rewound, then, _ = Worker().evaluate(task, maps, recipes[5:])
-    assert not outcome.rewound[:2].any()
-    assert not outcome.worlds[:2].any()
-    assert outcome.rewound[2:].tobytes() == rewound[0].tobytes()
-    assert outcome.worlds[2:].tobytes() == then[0].tobytes()
-    assert outcome.results[5, 2:].tobytes() == results[0, 2:].tobytes()
-    assert (outcome.rewound[2:, :2] != 0.0).all()
-
-    taken = new_outcome(task, recipes, asked)
-    for rows, columns in ((slice(5, 6), slice(3, 4)), (slice(0, 5), slice(0, 2)), (slice(5, 6), slice(2, 3))):
-        taken.add(0, Chunk(rows, columns), *Worker().answer(task, maps, recipes[rows], columns.start, columns.stop))
-    assert taken.whole()
-    for name in ("results", "rewound", "worlds"):
-        assert getattr(taken, name).tobytes() == getattr(outcome, name).tobytes()
-
-
 def test_a_member_is_identified_by_its_recipe() -> None:
     recipes = make_recipes(9)
     recipes["kind"][8] = Kind.MIRRORED
@@ -331,18 +304,3 @@ def test_chunks_change_nothing_for_the_real_worker() -> None:
     assert outcome.results.tobytes() == whole.tobytes() == single.tobytes()
     assert whole["distance"].max() > 0
     assert seconds > 0
-
-
-def test_every_input_of_the_kernels_is_read_only() -> None:
-    """As it is when it comes out of an object store: Numba would compile once more for anything else."""
-    seen: list[np.ndarray] = []
-
-    class Looking(Answering):
-        def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
-            seen.extend([task.parents, task.episodes, recipes])
-            seen.extend(value for value in maps[0].road if isinstance(value, np.ndarray))
-            return super().evaluate(task, maps, recipes)
-
-    SerialPool(build, Looking).evaluate(make_task(MAPS[:1]), make_recipes(20))
-    assert len(seen) > 3
-    assert all(not array.flags.writeable and array.flags.c_contiguous for array in seen)

@@ -5,17 +5,16 @@ import functools
 import os
 import re
 import signal
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import importable, wait_until
+from commands import wait_until
 from driving import to_bytes
 from test_pool import (
     MAPS,
@@ -32,12 +31,11 @@ from test_pool import (
 
 from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool
-from cluster.workers.ray_session import check_address
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
-pytestmark = pytest.mark.e2e
+pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 
 NOBODY = 1_000_000  # stands for a member where there is none: as workers are prepared
 BANNED = {"torch", "mlflow", "pygame", "matplotlib", "tyro", "rich"}
@@ -90,14 +88,6 @@ class Inspecting(Worker):
 class Unfit(Answering):
     def __init__(self) -> None:
         raise RuntimeError("not in this state")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _stand_ins_can_be_imported() -> Iterator[None]:
-    """By the workers too, which know nothing of pytest's search path."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", importable(__file__))
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -206,18 +196,6 @@ def test_a_member_that_always_kills_is_lost_alone(pool: RayPool, folder: Path) -
     assert 3 <= 100 - int((folder / "kill-300").read_text()) <= 6, "workers that it cost"
 
 
-def test_an_episode_that_always_kills_is_left_out(pool: RayPool, folder: Path) -> None:
-    (folder / "kill-150").write_text("100")
-    collected = pool.collect(make_collect_task(400))
-    assert np.flatnonzero(collected.lost).tolist() == [150]
-    wanted = SerialPool(never_built, Answering).collect(make_collect_task(400)).experience
-    kept = wanted.rewards != 150
-    for mine, theirs in zip(collected.experience, wanted, strict=True):
-        assert np.array_equal(mine, theirs[kept])
-    (warning,) = collected.warnings
-    assert warning.startswith("episode 150 (key 0x96, exploration 0) killed its worker 3 times")
-
-
 @pytest.mark.parametrize("times", [0, 2])
 def test_experience_keeps_its_order_where_workers_die(pool: RayPool, folder: Path, times: int) -> None:
     task, progress = make_collect_task(400), [(0, 0)]
@@ -321,21 +299,6 @@ def test_workers_that_cannot_start_are_given_up() -> None:
         pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: not in this state"),
     ):
         pool.evaluate(make_task(), make_recipes(20))
-
-
-@pytest.mark.usefixtures("no_pool")
-def test_a_cluster_is_joined_with_what_it_has_and_left_as_it_was(
-    cluster: Callable[..., tuple[str, subprocess.Popen]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    address, _ = cluster(2, PYTHONPATH=importable(__file__))
-    monkeypatch.setenv("RAY_ADDRESS", address)
-    with contextlib.closing(RayPool(4, never_built, "auto", worker_factory=Answering)) as pool:
-        assert pool.address == address
-        assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
-        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2)
-        processes = [psutil.Process(pid) for pid in pool.pids()]
-    assert gone(processes) == []
-    check_address(address)
 
 
 @pytest.mark.parametrize("workers", [0, -1])

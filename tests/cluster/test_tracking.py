@@ -4,7 +4,6 @@ import contextlib
 import os
 import re
 import shutil
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -133,42 +132,6 @@ def test_a_run_that_mlflow_does_not_know_gets_every_row(uri, tmp_path, gone):
     again = begin(there, 6)
     assert again != run_id
     assert steps(there, again) == list(range(6))
-
-
-RUN = """
-import sys, time
-from tracked import check_uri, row, tracker
-logged = tracker(check_uri("sqlite:///mlflow.db"))
-for step in range(100000):
-    logged.log_row(step, row(step))
-    time.sleep(0.02)
-    if step % 10 == 9:
-        print(logged.run_id, flush=True)
-"""
-
-
-@pytest.mark.e2e
-def test_killed_at_any_moment_and_resumed(tmp_path, monkeypatch):
-    """None is a kill among the rows. Before that, MLflow is being imported or its database created."""
-    for seconds in (0.3, 1.8, None):
-        with subprocess.Popen(
-            [sys.executable, "-c", RUN], cwd=tmp_path, stdout=subprocess.PIPE, env=with_path(), text=True
-        ) as run:
-            assert run.stdout
-            if seconds is None:
-                assert any(line != "None\n" for line in run.stdout)
-                time.sleep(2.5)  # another batch or two
-            else:
-                time.sleep(seconds)
-            run.send_signal(signal.SIGKILL)
-    monkeypatch.chdir(tmp_path)
-    uri = check_uri(None)
-    assert uri == f"sqlite:///{tmp_path}/mlflow.db"
-    resumed = tracker(uri, 1000)
-    assert resumed.close("FINISHED") is None
-    assert 0 < resumed.sent["row"] < 1000
-    assert steps(uri, resumed.run_id) == list(range(1000))
-    assert len(runs(uri)) == 1
 
 
 QUIET = """

@@ -4,16 +4,14 @@ import contextlib
 import http.server
 import os
 import re
-import shutil
 import socket
 import sqlite3
-import subprocess
 import threading
 import time
 
 import pytest
 from commands import wait_until
-from tracked import client, free_port, mlflow_server, row, steps, tracker
+from tracked import client, row, steps, tracker
 
 from cluster.tracking.address import TrackingError, check_uri
 
@@ -51,34 +49,6 @@ def test_a_database_that_is_locked_for_a_while(uri, impatient):
     assert steps(uri, logged.run_id) == [0]
 
 
-def test_a_disk_that_is_full_for_a_while(empty_database, tmp_path, impatient):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(disk)], capture_output=True).returncode:
-        pytest.skip("mounting a small disk takes root's rights")
-    try:
-        shutil.copy(empty_database, disk / "mlflow.db")
-        (tmp_path / "film.mp4").write_bytes(os.urandom(100_000))
-        logged = tracker(check_uri(f"sqlite:///{disk}/mlflow.db"))
-        logged.wait_ready()
-        with contextlib.suppress(OSError), open(disk / "filler", "wb", buffering=0) as filler:
-            while filler.write(bytes(4096)):
-                pass
-        for step in range(6):
-            logged.log_row(step, row(step))
-        logged.log_files([tmp_path / "film.mp4"])
-        wait_until(lambda: logged.error)
-        assert re.search("full|disk I/O error|No space left", logged.error)
-        time.sleep(0.5)  # and again, and again
-        (disk / "filler").unlink()
-        assert logged.close("FINISHED") is None
-        assert steps(logged.uri, logged.run_id) == list(range(6))
-        stored = disk / "mlartifacts" / logged.run_id / "artifacts/film.mp4"
-        assert stored.read_bytes() == (tmp_path / "film.mp4").read_bytes()
-    finally:
-        subprocess.run(["umount", "--lazy", str(disk)], check=True)
-
-
 @pytest.fixture
 def silent():
     """The address of a server that takes connections and never says a word."""
@@ -97,41 +67,6 @@ def test_a_server_that_says_nothing_is_waited_for_no_longer_than_allowed(silent,
     start = f"not logged to MLflow at {silent}: 3 rows (step 0 to 2), the status KILLED: no answer "
     assert report in (start + "within 1 s", start + "in time")
     wait_until(lambda: stuck.error == "no answer in time")
-
-
-@pytest.mark.e2e
-def test_a_server_that_goes_away_and_comes_back(tmp_path, empty_database, capfd):
-    shutil.copy(empty_database, tmp_path / "served.db")
-    port = free_port()
-    (tmp_path / "summary.json").write_text("{}")
-    with mlflow_server(tmp_path, port) as kill:
-        uri = check_uri(f"http://127.0.0.1:{port}/")
-        assert uri == f"http://127.0.0.1:{port}"
-        logged = tracker(uri, 5)
-        run_id = logged.wait_ready(60)
-        wait_until(lambda: logged.sent["row"] == 5)
-        kill()
-        time.sleep(2.0)  # the pause between two batches
-        for step in range(5, 9):
-            logged.log_row(step, row(step))
-        logged.log_files([tmp_path / "summary.json"])
-        wait_until(lambda: logged.error)
-        started = time.perf_counter()
-        report = logged.close("FINISHED")
-        assert time.perf_counter() - started < 5.0
-        assert report == (
-            f"not logged to MLflow at {uri}: 4 rows (step 5 to 8), 1 file, the status FINISHED: Connection refused"
-        )
-    with mlflow_server(tmp_path, port):
-        resumed = tracker(uri, 9)
-        resumed.log_files([tmp_path / "summary.json"])
-        assert resumed.close("FINISHED") is None
-        assert resumed.run_id == run_id
-        assert steps(uri, run_id) == list(range(9))
-        assert client(uri).get_run(run_id).info.status == "FINISHED"
-        assert [each.path for each in client(uri).list_artifacts(run_id)] == ["summary.json"]
-        assert not os.path.exists(tmp_path / "mlartifacts")
-    assert capfd.readouterr() == ("", "")
 
 
 def refused(uri):

@@ -1,7 +1,6 @@
 """The generation loop among traffic: its episodes, the champion, resuming, lost members, the user's fitness."""
 
 import dataclasses
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -63,26 +62,6 @@ def halfway(maps, tmp_path_factory):
     return path
 
 
-def test_maps_are_begun_before_they_are_needed():
-    class Watched(Maps):
-        begun: ClassVar[set[int]] = set()
-
-        def ahead(self, seeds, later=False):
-            self.begun.update(seeds)
-            super().ahead(seeds, later)
-
-    maps = Watched("seamless", SimConfig())
-    try:
-        evolution = begin(maps)
-        curriculum = evolution.curriculum
-        for generation in range(2):
-            go_on(evolution)
-            assert set(curriculum.map_seeds[: curriculum.maps_in_use(generation + 2)]) <= maps.begun
-        assert set(range(1_000_000, 1_000_008)) <= maps.begun  # some of validation's
-    finally:
-        maps.close()
-
-
 def state_of(evolution):
     arrays, meta = evolution.state()
     return {name: array.tobytes() for name, array in arrays.items()}, meta
@@ -135,24 +114,6 @@ def test_a_run_may_begin_with_a_champion(maps):
         evolution = Evolution(settings, SerialPool(maps.build), maps, genome)
         go_on(evolution)
         assert evolution.elites[0].tobytes() == genome.tobytes()
-        assert np.isfinite(list(evolution.history[0].values())).all()
-
-
-def test_crashes_are_remembered_with_the_traffic_around_them(maps, halfway):
-    arrays, _ = load(halfway)
-    worlds = arrays["crash_worlds"]
-    assert len(worlds) == len(arrays["crashes"]) > 0
-    assert worlds.shape[1:] == (CROWD, FIELDS)
-    assert (worlds[..., LANE] >= 0).any()
-    evolution = begin(maps)
-    evolution.restore(*load(halfway))
-    episodes = evolution.curriculum.episodes(2)
-    starts = evolution.curriculum.config.crash_starts
-    remembered = {world.tobytes() for world in worlds}
-    config = evolution.curriculum.config
-    of_group = [world.tobytes() in remembered for world in episodes.worlds]
-    assert of_group == ([False] * config.starts + [True] * starts) * config.groups
-    assert len(episodes.worlds) == len(episodes.rows)
 
 
 class Watching(SerialPool):
@@ -381,13 +342,3 @@ def test_a_candidate_lost_in_validation_is_no_champion(maps):
     with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
         evolution.validate_last()
     assert evolution.champion is None
-
-
-def test_a_fitness_that_never_is_a_number_does_not_end_a_run(maps):
-    evolution = begin(maps)
-    evolution.score = lambda results, target: np.full(len(results), np.nan)
-    for _ in range(2):
-        go_on(evolution)
-    assert [row["fitness/mean"] for row in evolution.history] == [-1.0, -1.0]
-    resumed = begin(maps)
-    resumed.restore(*evolution.state())

@@ -9,6 +9,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from commands import call
 
 from cluster.commands import watch
 from cluster.commands.watch import checkpoint_time, elite, watch_main
@@ -19,7 +20,7 @@ from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import EvolveSettings
 from evolution.networks.policy import PolicySpec
-from gridsim.car.ego import DISTANCE, End
+from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
@@ -51,18 +52,6 @@ def drive(driver):
     scenario = build("seamless", 2_000_000, driver.sim)
     start = sample_starts(scenario, 1, np.random.default_rng(3))[0]
     return record(driver, scenario, start, 12.0)
-
-
-def test_recording_is_the_environments_drive(driver, drive):
-    env = driver.make_env(maps=[drive.scenario])
-    start = np.array([*poses_of(drive.cars[0])])
-    observation, _ = env.reset(seed=0, options={"map_seed": drive.scenario.seed, "start": start})
-    for _ in range(60):
-        observation, _, _, _, info = env.step(driver.act(observation))
-    assert info["distance_m"] == pytest.approx(float(drive.cars[60, DISTANCE]), abs=0.05)
-    assert drive.seconds == pytest.approx(12.0)
-    assert drive.end == End.RUNNING
-    assert len(drive.cars) == len(drive.ranges) == 121
 
 
 def test_recording_ends_with_its_episode():
@@ -118,28 +107,20 @@ def test_film_is_whole_or_not_there(drive, tmp_path, monkeypatch):
     assert [f.name for f in tmp_path.iterdir()] == ["f.mp4"]
 
 
-def watched(monkeypatch, capsys, *arguments):
-    """gridsim-watch in this process: its exit code and what it says."""
-    monkeypatch.setattr(sys, "argv", ["gridsim-watch", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        watch_main()
-    return stop.value.code, *capsys.readouterr()
-
-
 def test_watch_writes_films(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     film = [CHAMPION, "--output", "a.mp4", "--seconds", 1, "--size", "320x180"]
-    code, out, err = watched(monkeypatch, capsys, *film)
+    code, out, err = call(watch_main, monkeypatch, capsys, *film)
     assert (code, err) == (0, "")
     assert "a.mp4: 1.0 s, 20 pictures" in out
     assert probe(tmp_path / "a.mp4")[2:6] == (320, 180, 20.0, 20)
     film = [CHAMPION, "--output", "b.gif", "--seconds", 2, "--size", "160x90", "--seed", 7, "--scenario", "city"]
-    assert watched(monkeypatch, capsys, *film)[0] == 0
+    assert call(watch_main, monkeypatch, capsys, *film)[0] == 0
     assert probe(tmp_path / "b.gif")[0] == "gif"
     assert probe(tmp_path / "b.gif")[5] == 20
     assert sorted(f.name for f in tmp_path.iterdir()) == ["a.mp4", "b.gif"]
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))  # right use, and it fails
-    code, _, err = watched(monkeypatch, capsys, *film)
+    code, _, err = call(watch_main, monkeypatch, capsys, *film)
     assert (code, err.count("\n")) == (1, 1)
     assert "ffmpeg cannot be started" in err
 
@@ -157,20 +138,20 @@ def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
                 simulator.step(np.array([0]))
     for arguments, pictures in (([], 25), (["--seconds", 2], 20)):
         film = ["drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]
-        code, out, _ = watched(monkeypatch, capsys, *film)
+        code, out, _ = call(watch_main, monkeypatch, capsys, *film)
         assert code == 0
         assert probe(tmp_path / "d.mp4")[5] == pictures
         assert f"{pictures / 10:.1f} s, {pictures} pictures" in out
     (tmp_path / "cut.csv").write_text((tmp_path / "drive.csv").read_text()[:-30])
     for line, said in (("cut.csv", "cut.csv, line 28"), ("drive.csv --follow", "its own driver and road")):
-        code, _, err = watched(monkeypatch, capsys, *line.split(), "--output", "e.mp4")
+        code, _, err = call(watch_main, monkeypatch, capsys, *line.split(), "--output", "e.mp4")
         assert code == 2
         assert said in err
 
 
 def test_window_is_shown_on_a_chosen_driver_for_so_long(dummy, monkeypatch, capsys):
     began = time.monotonic()
-    assert watched(monkeypatch, capsys, CHAMPION, "--seconds", 3, "--size", "320x180") == (0, "", "")
+    assert call(watch_main, monkeypatch, capsys, CHAMPION, "--seconds", 3, "--size", "320x180") == (0, "", "")
     assert time.monotonic() - began > 3.0
 
 
@@ -193,7 +174,7 @@ def test_follow_takes_the_newest_elite_while_the_run_goes_on(going, dummy, monke
             (going / "part").rename(going / "checkpoint.npz")
 
     monkeypatch.setattr(watch.time, "sleep", sleep)
-    code, out, err = watched(monkeypatch, capsys, going, "--follow", "--seconds", 1, "--size", "64x64")
+    code, out, err = call(watch_main, monkeypatch, capsys, going, "--follow", "--seconds", 1, "--size", "64x64")
     assert (code, out, err) == (0, "waiting for the first generation ...\n", "")
 
 
@@ -247,7 +228,7 @@ def test_wrong_use_is_one_clear_line(going, tmp_path, line, expected, monkeypatc
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
     arguments = line.replace("RUN", str(going)).replace("CHAMPION", str(CHAMPION)).split()
-    code, out, err = watched(monkeypatch, capsys, *arguments)
+    code, out, err = call(watch_main, monkeypatch, capsys, *arguments)
     assert (code, out) == (2, "")
     assert err.startswith("gridsim-watch: error: ")
     assert err.count("\n") <= 2

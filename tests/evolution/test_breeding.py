@@ -100,16 +100,6 @@ def test_a_step_and_its_mirror_image_lie_about_the_centre(spec):
     assert plus.tobytes() == (-minus).tobytes()
 
 
-def test_steps_are_normal_and_as_large_as_the_row_of_steps():
-    parents = around(np.random.default_rng(2))
-    children = breed(parents, many(Kind.STEP, 0, 1, 3000), 4, SPEC, STILL).astype(float)
-    noise = ((children - parents[0].astype(float)) / parents[1].astype(float))[:, FREE]
-    assert np.abs(noise.mean(axis=0)).max() < 5.0 / np.sqrt(3000)
-    assert np.abs(noise.std(axis=0) - 1.0).max() < 5.0 / np.sqrt(2 * 3000)
-    wide = np.flatnonzero(parents[1, FREE] > 1e-2)  # the others' noise is rounded beside the centre
-    assert is_normal(noise[:, wide][:, ::5])
-
-
 @pytest.mark.parametrize("spec", [SPEC, PolicySpec.parse("mlp:4"), CNN], ids=str)  # blocks of four numbers, and not
 def test_moments_are_sums_over_the_noise_of_steps(spec):
     """The noise is that of a child of a zero centre with unit steps."""
@@ -167,17 +157,6 @@ def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data)
     whole = breed(parents, made, key, SPEC, Mutation(rate=0.1))
     chosen = data.draw(st.lists(st.integers(0, len(made) - 1), min_size=1, max_size=20))
     assert breed(parents, made[chosen], key, SPEC, Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()
-
-
-@pytest.mark.parametrize("kind", [Kind.NEW, Kind.STEP, Kind.MIRRORED, Kind.CROSS])
-def test_key_and_seed_make_the_child(parents, kind):
-    made = many(kind, 0, 1, 3)
-    made["seed"] = [1, 2, 1]
-    one, other = (breed(parents, made, key, SPEC, Mutation(rate=0.5)) for key in (1, 2))
-    assert one[0].tobytes() == one[2].tobytes()
-    assert one[0].tobytes() != one[1].tobytes()
-    assert all(a.tobytes() != b.tobytes() for a, b in zip(one, other, strict=True))
-    assert breed(parents, made, 1, SPEC, Mutation(rate=0.5)).tobytes() == one.tobytes()
 
 
 @pytest.mark.parametrize("kind", [Kind.NEW, Kind.STEP, Kind.CROSS])

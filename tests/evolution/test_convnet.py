@@ -5,15 +5,13 @@ import math
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from searching import new_genomes
 
 from evolution.networks import convnet
 from evolution.networks.dense import plain_tile, vector_tile
 from evolution.networks.policy import CnnSpec, PolicySpec
-from evolution.search.breeding import RECIPE, Kind, Mutation, breed
 from gridsim.config import SimConfig
-from gridsim.sensing.grid import grid_table, grids, push_frames
+from gridsim.sensing.grid import grid_table, grids
 
 torch = pytest.importorskip("torch")
 
@@ -34,21 +32,10 @@ def decide(genome, layers, speed, room):
     return convnet.decide(genome, layers, speed, room)
 
 
-@numba.njit
-def push(grid, begun, room):
-    convnet.push(grid, begun, room)
-
-
 def cnn(text):
     spec = PolicySpec.parse(text)
     assert isinstance(spec, CnnSpec)
     return spec
-
-
-def new_genomes(spec, n, seed=1):
-    recipes = np.zeros(n, dtype=RECIPE)
-    recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
-    return breed(np.zeros((0, spec.size), dtype=F), recipes, seed, spec, Mutation())
 
 
 def random_grids(n, rng):
@@ -122,14 +109,6 @@ def test_vector_code_is_the_plain_tile(positions, lanes, chains, rectify):
     assert np.isnan(seen).any()
 
 
-@pytest.mark.parametrize("chains", [1, 4])
-def test_a_tile_of_one_run_is_a_dense_layer(chains):
-    rng = np.random.default_rng(3)
-    x, w, y = rng.normal(size=7).astype(F), rng.normal(size=(8, 16)).astype(F), np.zeros(16, dtype=F)
-    plain_tile(1, 16, False, chains)(x, 0, 0, 1, 0, 1, 0, 7, w.ravel(), 16, 16, 0, y, 0, 0)
-    assert y == pytest.approx(w[0] + x @ w[1:].astype(float), abs=2e-5)
-
-
 def test_a_gene_that_is_not_a_number_is_no_action():
     """Also a weight whose input is exactly 0, from a rectified unit."""
     spec, rng = cnn("cnn:8,8,16@1"), np.random.default_rng(4)
@@ -140,38 +119,6 @@ def test_a_gene_that_is_not_a_number_is_no_action():
         spoilt[gene] = math.nan
         assert decide(spoilt, spec.layers, F(5), room) == -1, gene
     assert decide(genome, spec.layers, F(5), room) >= 0  # and nothing of it stays
-
-
-@given(begins=st.lists(st.booleans(), min_size=1, max_size=8))
-@settings(max_examples=20, derandomize=True, deadline=None)
-def test_frames_are_the_last_ones_newest_last(begins):
-    spec = cnn("cnn:8,8,8@3")
-    room = convnet.scratch(spec)
-    rng = np.random.default_rng(5)
-    stack = np.zeros((1, 3, 80, 80), dtype=np.uint8)
-    for k, begun in enumerate(begins):
-        new = random_grids(1, rng)
-        push(new[0].ravel(), begun or k == 0, room)
-        push_frames(stack, new, np.array([begun or k == 0]))
-    assert room.frames == pytest.approx(stack.ravel() / 255, abs=1e-6)
-
-
-# --- In the rollout --------------------------------------------------------------------------------------------------
-
-
-# --- Acting on an environment's observations -------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("text", ["cnn:8,16,32@1", "cnn:8,8,8@4"])
-def test_act_on_takes_one_or_many(text):
-    spec, rng = cnn(text), np.random.default_rng(7)
-    genome = new_genomes(spec, 1)[0]
-    stack = random_grids(5 * spec.frames, rng).reshape(5, spec.frames, 80, 80)
-    stack = stack[:, 0] if spec.frames == 1 else stack
-    speeds = rng.uniform(0, 20, 5).astype(F)
-    actions = convnet.act_on(spec, genome, stack, speeds)
-    singles = [convnet.act_on(spec, genome, grid, float(v)) for grid, v in zip(stack, speeds, strict=True)]
-    assert np.asarray(actions).tolist() == singles
 
 
 @pytest.mark.parametrize(

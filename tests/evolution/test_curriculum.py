@@ -7,10 +7,8 @@ from evolution.episodes.curriculum import Curriculum, CurriculumConfig
 from evolution.episodes.rollout import RESULT
 from gridsim.car.ego import End
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import FIELDS, LANE
 
 CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
-CARS = 4
 
 
 def new(config=CONFIG, traffic=2):
@@ -124,9 +122,3 @@ def test_maps_come_in_one_by_one(curriculum):
     assert [curriculum.maps_in_use(generation) for generation in (0, 3, 4, 8)] == [2, 2, 3, 3]
     assert set(curriculum.episodes(0).maps) <= set(curriculum.map_seeds[:2])
     assert len(set(curriculum.map_seeds)) == 3
-
-
-def test_training_has_twice_the_cars(curriculum):
-    assert curriculum.episodes(0).worlds.shape[1:] == (CARS, FIELDS)
-    assert curriculum.leader_episodes(0).worlds.shape[1:] == (CARS, FIELDS)
-    assert (curriculum.leader_episodes(0).worlds[..., LANE] >= 0).mean() > 0.9

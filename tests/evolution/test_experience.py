@@ -14,7 +14,6 @@ from evolution.dqn.experience import (
     empty,
     join,
     store_grid,
-    store_rays,
     to_fixed_point,
     unpack,
 )
@@ -26,11 +25,6 @@ from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 F = np.float32
 AREA = CELLS * CELLS
 SPECS = [MlpSpec((5,)), MlpSpec((5,), motion=True), MlpSpec((5,), steering=True), CnnSpec((8, 8, 8), frames=3)]
-
-
-@njit
-def _keep_rays(inputs, row):
-    store_rays(inputs, row)
 
 
 @njit
@@ -64,32 +58,6 @@ def test_fixed_point_is_the_nearest_and_clipped(value: float) -> None:
     code = int(_fixed(F(value)))
     assert -32768 <= code <= 32767
     assert abs(code / 4096 - min(max(value, -8.0), 32767 / 4096)) <= 0.5 / 4096 + 1e-6
-
-
-@pytest.mark.parametrize("spec", SPECS[:3], ids=str)
-def test_rays_come_back_as_the_network_saw_them(spec: PolicySpec) -> None:
-    inputs = np.random.default_rng(1).uniform(-1.0, 2.0, (50, spec.inputs + 3)).astype(F)
-    x = empty(spec, 50)
-    for seen, row in zip(inputs, x.observations, strict=True):
-        _keep_rays(seen, row)
-    rows = np.array([3, 49, 0, 3])
-    back = unpack(spec, x.observations, rows, rows)
-    assert back.dtype == np.float32
-    assert np.abs(back - inputs[rows, : spec.inputs]).max() <= 0.5 / UNITS + 1e-7
-    assert (back == x.observations[rows] / 4096.0).all()
-
-
-def test_a_frame_is_two_bits_a_cell_and_the_speed() -> None:
-    """By the layout's description, cell by cell."""
-    rng = np.random.default_rng(2)
-    row = np.empty(1602, dtype=np.uint8)
-    for speed in (-3.0, 0.0, 9.9, 10.0, 30.0):
-        grid = rng.choice(np.array([UNKNOWN, FREE, OCCUPIED]), AREA)
-        _keep_grid(grid, F(speed), row)
-        codes = [int(row[k // 4]) >> 2 * (k % 4) & 3 for k in range(AREA)]
-        assert codes == np.searchsorted([UNKNOWN, FREE, OCCUPIED], grid).tolist()
-        kept = int.from_bytes(row[1600:].tobytes(), "little", signed=True)
-        assert kept == round((speed / float(SPEED_SCALE) - 1.0) * 4096)
 
 
 @njit

@@ -27,9 +27,6 @@ def one(drives):
     return results([[d for d, _ in drives]], [[d * share for d, share in drives]])
 
 
-# --- Elements and scalar ---------------------------------------------------------------------------------------------
-
-
 @given(drives=episodes, target=st.floats(1.0, 2000.0))
 def test_everything_is_a_share(drives, target):
     row = one(drives)
@@ -66,13 +63,6 @@ def test_further_and_better_paced_is_never_worse(drives, which, more):
 def test_the_first_bend_is_worth_as_much_as_a_long_way_later():
     value = scalar(results([[0.0], [20.0], [400.0], [420.0]], [[0.0], [20.0], [400.0], [420.0]]), TARGET)
     assert value[1] - value[0] > 5 * (value[3] - value[2])
-
-
-def test_an_element_is_the_mean_over_episodes():
-    drives = [[10.0, 200.0], [40.0, 600.0]]
-    both = elements(results(drives, drives), TARGET)
-    single = [[elements(results([[d]], [[d]]), TARGET)[0] for d in row] for row in drives]
-    assert both == pytest.approx(np.mean(single, axis=1))
 
 
 def test_each_episode_may_have_its_own_target():

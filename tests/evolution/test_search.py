@@ -128,17 +128,6 @@ def test_a_score_that_is_not_a_number_loses(kind, bad):
     assert states[0] == states[1]
 
 
-@pytest.mark.parametrize("kind", SEARCHES)
-def test_a_generation_of_nothing_but_not_a_number_goes_on(kind):
-    search = kind(SPEC, SearchConfig(population=16, groups=2), seed=8)
-    for scores in (np.full(16, np.nan), np.full(16, np.nan), np.arange(16.0)):
-        search.ask()
-        search.tell(scores)
-    assert search.generation == 3
-    search.ask()
-    assert np.isfinite(search.genomes(np.arange(16))).all()
-
-
 @pytest.mark.parametrize("kind", [Recombination, TwoParents, partial(TwoParents, random=True)])
 @pytest.mark.parametrize("generations", [0, 1, 4])
 def test_a_restored_search_goes_on_bit_for_bit(kind, generations):

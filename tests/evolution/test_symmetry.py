@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from searching import new_genomes
 
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
@@ -17,12 +18,6 @@ SPECS = st.builds(
     motion=st.booleans(),
     steering=st.booleans(),
 )
-
-
-def drawn(spec, seed=0, n=1):
-    recipes = np.zeros(n, dtype=RECIPE)
-    recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
-    return breed(np.zeros((0, spec.size), dtype=F), recipes, seed, spec, Mutation())
 
 
 def in_a_mirror(spec, observations):
@@ -48,7 +43,7 @@ def test_in_a_mirrored_world_it_takes_the_mirrored_action(spec, seed):
     rng = np.random.default_rng(seed)
     observations = rng.random((60, spec.inputs)).astype(F)
     observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
-    genome = drawn(spec, seed)[0]
+    genome = new_genomes(spec, seed=seed)[0]
     mirrored = in_a_mirror(spec, observations)
     one, other = (act_on(spec, genome, seen, 50.0, 20.0, 0.5) for seen in (observations, mirrored))
     # But for near ties, where the order of sums decides.
@@ -62,7 +57,7 @@ def test_every_gene_is_free_or_bound_to_a_free_one(policy):
     assert sorted([*free, *bound]) == list(range(spec.size))
     assert np.isin(source[factor != 0.0], free).all()
     assert len(free) < 0.53 * spec.size
-    genomes = drawn(spec, n=5)
+    genomes = new_genomes(spec, 5)
     assert (genomes[:, bound] == factor * genomes[:, source]).all()
     assert len(np.unique(genomes[0, free])) > 0.4 * min(len(free), 4096)
 
@@ -72,14 +67,14 @@ def test_a_layer_of_one_unit_can_tell_left_from_right(policy):
     spec = PolicySpec.parse(policy)
     assert len(symmetry(spec).free) == spec.size
     observations = np.random.default_rng(1).random((300, spec.inputs)).astype(F)
-    done = np.array([act_on(spec, genome, observations, 50.0, 20.0, 0.5) for genome in drawn(spec, n=40)])
+    done = np.array([act_on(spec, genome, observations, 50.0, 20.0, 0.5) for genome in new_genomes(spec, 40)])
     assert {*np.unique(done)} >= {Action.LEFT, Action.RIGHT, Action.ACCELERATE_LEFT, Action.ACCELERATE_RIGHT}
 
 
 @pytest.mark.parametrize("frames", [1, 3])
 def test_kernels_of_a_cnn_come_in_mirrored_pairs(frames):
     spec = CnnSpec((8, 16, 24), frames=frames)
-    genome, at, layers = drawn(spec)[0], 0, []
+    genome, at, layers = new_genomes(spec)[0], 0, []
     for n, m in spec.shapes():
         layers.append((genome[at : at + n * m].reshape(n, m), genome[at + n * m : at + (n + 1) * m]))
         at += (n + 1) * m

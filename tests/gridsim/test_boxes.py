@@ -5,8 +5,6 @@ import math
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gridsim.car.ego import DISTANCE, IDLE, End
 from gridsim.car.vehicle import Action
@@ -17,7 +15,7 @@ from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.sensing.boxes import boxes_touch, cast_boxes, hits_box, stands_ahead, top_speed_near
+from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
 from gridsim.sensing.rays import fan
 from gridsim.traffic.world import ALONG, COS, FIELDS, JUNCTION_BEHIND, LANE, PERMIT, SIN, SPEED, SPEED_FACTOR, X, Y
 
@@ -121,25 +119,13 @@ def test_rays_are_the_oracles():
         ],
         axis=-1,
     )
+    boxes[300:600, :, 2] = sensors[300:600, 2, None]  # rays that are parallel to two sides
     boxes, sensors = boxes.astype(F).astype(float), sensors.astype(F).astype(float)
     ranges = cast(sensors, np.stack([parked(*row) for row in boxes]))
     exact = sum(int(check_rays(*scene).sum()) for scene in zip(sensors, boxes, ranges, strict=True))
     assert exact > 0.98 * ranges.size
     assert 0.03 < (ranges == 0.0).all(axis=1).mean() < 0.3  # from within a box
     assert 0.2 < (ranges < 50.0).mean() < 0.8
-
-
-@pytest.mark.parametrize("heading", [0.0, math.pi / 2, -math.pi / 2, 0.3])
-def test_rays_along_and_beside_a_box(heading):
-    """Square to the box's sides, where a ray is parallel to two of them; before it, beside it, and behind."""
-    c, s = math.cos(heading), math.sin(heading)
-    for forward, aside in ((10, 0), (2.001, 0), (2.5, 0), (0, 2.0), (0, -1.01), (-8, 0), (30, 3), (45, -1), (60, 0)):
-        sensor = np.array([1.0, 100.0, heading], dtype=F).astype(float)
-        box = np.array([(1.0 + forward * c - aside * s) % SIDE, (100.0 + forward * s + aside * c) % SIDE, heading])
-        box = box.astype(F).astype(float)
-        ranges = cast(sensor[None], parked(box)[None])[0]
-        assert np.isfinite(ranges).all()
-        check_rays(sensor, box[None], ranges)
 
 
 def test_a_box_only_ever_shortens_a_range_and_who_is_not_there_does_not():
@@ -150,29 +136,6 @@ def test_a_box_only_ever_shortens_a_range_and_who_is_not_there_does_not():
 
 
 # --- Overlap ---------------------------------------------------------------------------------------------------------
-
-headings = st.one_of(st.floats(-math.pi, math.pi), st.sampled_from([0.0, math.pi / 2, math.pi / 4, math.pi]))
-
-
-@given(st.floats(0.0, 5.5), st.floats(-math.pi, math.pi), headings, headings)
-def test_boxes_touch_where_their_outlines_share_ground(away, bearing, heading, other):
-    dx, dy = F(away * math.cos(bearing)), F(away * math.sin(bearing))
-    touch = boxes_touch(K, dx, dy, *(F(f(h)) for h in (heading, other) for f in (math.cos, math.sin)))
-    poses = np.array([[0.0, 0.0, heading], [float(dx), float(dy), other]])
-    smaller, larger = (oracle.overlap_area(*oracle.corners(CONFIG, poses, margin)) for margin in (-1e-4, 1e-4))
-    assert touch or smaller == 0.0
-    assert not touch or larger > 0.0
-
-
-def test_the_oracles_area_is_that_of_closed_forms():
-    def area(*other):
-        return oracle.overlap_area(*oracle.corners(CONFIG, np.array([[5.0, 7.0, 0.0], other])))
-
-    assert area(5.0, 7.0, 0.0) == pytest.approx(8.0)
-    assert area(8.0, 7.5, 0.0) == pytest.approx(1.0 * 1.5)
-    assert area(5.0, 7.0, math.pi / 2) == pytest.approx(4.0)
-    assert area(5.0 + 2.0 + math.sqrt(5.0), 7.0, math.atan(0.5)) == pytest.approx(0.0)  # corner to edge
-    assert area(20.0, 7.0, 0.5) == 0.0
 
 
 def cross_product(a, b):
@@ -196,12 +159,14 @@ def outlines_meet(one, other):
     return crossing.any(axis=(1, 2)) | within[0] | within[1]
 
 
-def test_all_contacts_of_a_car_of_other_dimensions_are_found():
-    """100,000 pairs of cars of 6 m x 2.2 m, some across the seam."""
-    config, rng, n = SimConfig(vehicle=VehicleConfig(length=6.0, width=2.2)), np.random.default_rng(4), 100_000
+@pytest.mark.parametrize("vehicle", [VehicleConfig(), VehicleConfig(length=6.0, width=2.2)])
+def test_all_contacts_are_found(vehicle):
+    """100,000 pairs of cars, some across the seam, some parallel."""
+    config, rng, n = SimConfig(vehicle=vehicle), np.random.default_rng(4), 100_000
     away, bearing = rng.uniform(0.0, 7.5, n), rng.uniform(-math.pi, math.pi, n)
     one = np.column_stack([rng.uniform(0.0, SIDE, (n, 2)), rng.uniform(-math.pi, math.pi, n)]).astype(F)
     other = one + np.column_stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(-3.0, 3.0, n)])
+    other[:10_000, 2] = one[:10_000, 2]
     hits = np.zeros(n, dtype=bool)
     poses = np.column_stack([one[:, :2], np.cos(one[:, 2]), np.sin(one[:, 2])]).astype(F)
     _hits(constants(config), poses, parked(*np.column_stack([other[:, :2] % SIDE, other[:, 2]]))[:, None], hits)
@@ -211,7 +176,7 @@ def test_all_contacts_of_a_car_of_other_dimensions_are_found():
     )
     assert hits[smaller].all()
     assert larger[hits].all()
-    assert (hits & (away > 5.0)).sum() > 3000
+    assert (hits & (away > vehicle.length - 1.0)).sum() > 1000
 
 
 def test_the_fastest_of_the_near_boxes_is_found_across_the_seam():
@@ -327,12 +292,6 @@ def test_nothing_tunnels_through_crosswise(cross, offset):
             on_lane(1, south, 30.0, (128.0, south, math.pi / 2)),
         )
         assert end == End.COLLISION
-
-
-def test_a_car_from_behind_is_run_into_too(cross):
-    """The ego car stands; the other cannot brake."""
-    _, end = meet(cross, [100.0, 128.0, 0.0, 0.0, 0.0], on_lane(0, 140.0, 30.0, (116.0, 128.0, math.pi)))
-    assert end == End.COLLISION
 
 
 # --- Standing behind a standing car ----------------------------------------------------------------------------------

@@ -10,9 +10,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from driving import SENSING, drive
-from gymnasium.spaces import flatten
-from gymnasium.wrappers import FlattenObservation, FrameStackObservation, RecordEpisodeStatistics, RecordVideo
+from driving import drive
+from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
 from gridsim.car.ego import End
@@ -24,27 +23,12 @@ from gridsim.maps import map
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.sensing import grid
-from gridsim.view.render import NoDisplayError
 
-F = np.float32
 KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing._reward, grid._fill_grids]
 KERNELS += [grid._push_frames, episodes._draw, map._starts_at]
 
 
 # --- pictures
-
-
-def test_a_window_without_a_display_is_a_clear_error(
-    maps: dict[str, list[Map]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(variable, raising=False)
-    for env in (GridSimEnv, GridSimVectorEnv):
-        human = env(maps=maps["seamless"][:1], render_mode="human")
-        with pytest.raises(NoDisplayError, match="DISPLAY") as error:
-            human.reset(seed=0)
-        assert "\n" not in str(error.value)
-        human.close()
 
 
 @pytest.mark.usefixtures("dummy")
@@ -116,57 +100,6 @@ def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_pa
 
 
 # --- other wrappers
-
-
-@pytest.mark.parametrize(("observation", "frames"), SENSING)
-@pytest.mark.parametrize("actions", ["discrete", "continuous"])
-def test_wrappers_of_a_single_environment(observation: str, frames: int, actions: str) -> None:
-    options: dict[str, Any] = {"maps": 1, "observation": observation, "frames": frames, "actions": actions}
-    plain = gymnasium.make("GridSim/City-v0", **options)
-    env: Any = RecordEpisodeStatistics(
-        FrameStackObservation(FlattenObservation(gymnasium.make("GridSim/City-v0", **options)), 3)
-    )
-    first, _ = plain.reset(seed=2)
-    seen, _ = env.reset(seed=2)
-    past = [flatten(plain.observation_space, first)] * 3
-    total, steps, over = 0.0, 0, False
-    action: Any = int(Action.ACCELERATE) if actions == "discrete" else np.array([1.0, 0.1], dtype=np.float32)
-    while not over:
-        np.testing.assert_array_equal(seen, np.array(past))
-        assert seen in env.observation_space
-        now, reward, terminated, truncated, _ = plain.step(action)
-        past = [*past[1:], flatten(plain.observation_space, now)]
-        seen, wrapped, *_, info = env.step(action)
-        assert wrapped == reward
-        total, steps, over = total + float(reward), steps + 1, terminated or truncated
-    assert info["episode"]["l"] == steps > 5
-    assert info["episode"]["r"] == pytest.approx(total, abs=1e-4)
-
-
-CHANGED: list[tuple[Any, dict[str, Any], int, Any]] = [
-    (wrappers.FlattenObservation, {"observation": "image"}, 0, lambda seen: seen.reshape(3, -1)),
-    (lambda env: wrappers.ReshapeObservation(env, (4, 8)), {}, 0, lambda seen: seen.reshape(-1, 4, 8)),
-    (
-        lambda env: wrappers.RescaleObservation(env, np.zeros(32, dtype=F), np.full(32, 2.0, dtype=F)),
-        {},
-        0,
-        lambda seen: (seen - [*[0.0] * 31, -0.1]) * 2.0 / [*[1.0] * 31, 1.1],
-    ),
-    (wrappers.ClipAction, {"actions": "continuous"}, 0, lambda seen: seen),
-    (lambda env: wrappers.ClipReward(env, 0.0, 0.4), {}, 1, lambda reward: np.clip(reward, 0.0, 0.4)),
-]
-
-
-@pytest.mark.parametrize(("wrap", "options", "part", "change"), CHANGED)
-def test_vector_wrappers_change_what_they_should(wrap: Any, options: Any, part: int, change: Any) -> None:
-    made: list[Any] = [gymnasium.make_vec("GridSim/City-v0", num_envs=3, maps=1, **options) for _ in range(2)]
-    env, plain = wrap(made[0]), made[1]
-    env.reset(seed=3)
-    plain.reset(seed=3)
-    for row in drive(made[1].unwrapped, 40, seed=4):
-        ours, theirs = env.step(row), plain.step(row)
-        np.testing.assert_allclose(ours[part], change(theirs[part]), atol=1e-6)
-        np.testing.assert_array_equal(ours[2:4], theirs[2:4])
 
 
 def test_vector_wrappers_of_what_is_known_of_episodes() -> None:

@@ -194,14 +194,6 @@ def test_any_values(small, changes, drop):
     loads_or_is_refused(path)
 
 
-@FUZZ
-@given(starts=st.lists(st.lists(st.floats(-5, 45), min_size=2, max_size=3), max_size=4), speed=st.floats(0, 40))
-def test_any_starts(small, starts, speed):
-    path = small[0] / "starts.yaml"
-    path.write_text(yaml.safe_dump({**GOOD, "starts": starts, "speed": [speed / 2, speed]}))
-    loads_or_is_refused(path)
-
-
 @settings(max_examples=25)
 @given(st.integers(0, 2**32), st.floats(0.02, 0.98), st.integers(1, 32), st.sampled_from([1, 4, 10]), st.booleans())
 def test_any_pixels(small, seed, share, grain, ppm, torus):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gridsim.config import VehicleConfig
-from gridsim.reference.profile import ACCELERATION, BRAKING, LATERAL, arc_length, profile, top_speed
+from gridsim.reference.profile import ACCELERATION, BRAKING, arc_length, profile, top_speed
 
 INTERVAL = (5.0, 12.0)
 TOP = top_speed(INTERVAL)
@@ -19,17 +19,6 @@ def test_profile_of_a_straight_is_flat_out_and_then_steady():
     assert speed[[0, 6, 20, 200]] == pytest.approx([0.0, math.sqrt(18.0), math.sqrt(60.0), TOP], rel=1e-6)
     assert steering == pytest.approx(0.0, abs=1e-12)
     assert profile(points, INTERVAL, TOP, CAR)[0][0] == pytest.approx(TOP)
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_profile_of_a_circle_is_the_bicycles(side):
-    angle = np.linspace(0.0, 3.0, 500)
-    points = 15.0 * np.stack([np.sin(angle), side * (1.0 - np.cos(angle))], axis=1)
-    speed, steering = profile(points, INTERVAL, 30.0, CAR)
-    inside = slice(1, -1)
-    assert speed[inside] == pytest.approx(math.sqrt(LATERAL * 15.0), rel=2e-3)
-    slip = math.asin(1.25 / 15.0)
-    assert steering[inside] == pytest.approx(side * math.atan(2.0 * math.tan(slip)), rel=5e-3)
 
 
 def test_profile_brakes_and_accelerates_no_harder_than_it_may():

@@ -148,43 +148,12 @@ def test_grid_is_drawn_ahead_with_left_on_the_left(scenario, state):
     assert 320 - column == pytest.approx(14.75 * renderer.pixels_per_m, abs=4)
 
 
-def test_path_and_text(scenario, state):
-    car, _ = state
-    renderer = Renderer(scenario, (640, 480))
-    path = np.array([car[[X, Y]] - k * 0.5 * car[[COS, SIN]] for k in range(16)])
-    plain, image = renderer.draw(car), renderer.draw(car, path=path, text=("7.0 m/s", "above"))
-    behind = round(480 * render.CAR_AT + 5.0 * renderer.pixels_per_m)
-    assert distance(image[behind, 318:322], paint.PATH).min() < 30
-    assert distance(plain[behind, 318:322], paint.PATH).min() > 60
-    assert (image[450:, 16:120].max(axis=-1) > 230).sum() > 40  # bright letters
-    assert (image[6:40, 16:120].max(axis=-1) > 230).sum() > 40
-
-
-def test_view_repeats_over_the_torus(scenario):
-    renderer = Renderer(scenario, (320, 240))
-    width = float(scenario.road.width)
-    near, far = renderer.draw(car_at(0.5, 100.0)), renderer.draw(car_at(width + 0.5, 100.0))
-    assert (np.abs(near.astype(int) - far) > 2).mean() < 0.002  # but for rounding of positions
-
-
 def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
     flat = dataclasses.replace(scenario, torus=False)
     image = Renderer(flat, (320, 240)).draw(car_at(0.0, 100.0, np.pi))  # heading out of the map
     ahead = image[: int(240 * render.CAR_AT) - 25]
     ground = np.minimum(distance(ahead, paint.GROUND), distance(ahead, paint.GROUND_OTHER))
     assert ground.max() <= 1
-
-
-def test_marks_lie_between_lanes_and_not_in_junctions(scenario):
-    marks = Renderer(scenario)._marks
-    assert len(marks) > 100
-    points = scenario.lanes.points.astype(float)
-    size = np.array([scenario.road.width, scenario.road.height], dtype=float)
-    for x, y in marks[::7, :2]:
-        gap = points - [x, y]
-        gap -= np.round(gap / size) * size
-        assert np.hypot(*gap.T).min() > 1.2  # half a lane from any lane's centre line
-        assert clearance(scenario.road, np.float32(x), np.float32(y)) > 2.0
 
 
 def test_between_goes_over_the_seam_and_keeps_the_heading_a_unit(scenario):

@@ -7,6 +7,7 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import read, small_road
 
 from gridsim.maps.roads import (
     CELLS_PER_M,
@@ -17,13 +18,10 @@ from gridsim.maps.roads import (
     START_UNITS,
     Strips,
     clearance_nodes,
-    clearances,
     freeze,
-    make_road,
     power_of_two,
 )
 
-F = np.float32
 SIDE = 64.0  # m, of the small maps
 CEILING = FIELD_FLOOR + 255 / FIELD_UNITS  # m, the greatest clearance a field can hold
 
@@ -38,35 +36,7 @@ def exact(scenario):
     return oracle.ExactRoad(scenario.strips, float(scenario.road.width), float(scenario.road.height))
 
 
-def small_road(lines=(), arcs=(), side=SIDE):
-    strips = Strips.of(lines, arcs)
-    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 50.0), oracle.ExactRoad(strips, side, side)
-
-
-def read(road, points):
-    return clearances(road, freeze(np.asarray(points, dtype=F)))
-
-
 # --- The oracle itself -----------------------------------------------------------------------------------------------
-
-
-def test_the_oracles_two_halves_agree(exact):
-    """Rays are intersections, clearance is distances: walk along rays in steps of 2 cm and look where they leave."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0.0, 256.0, (2000, 2))
-    points = np.repeat(points[exact.clearance(points) > 0.05][:60], 2, axis=0)
-    angles = rng.uniform(-math.pi, math.pi, len(points))
-    t, grazing = np.arange(0.0, 50.0, 0.02), 0
-    for point, angle, reach in zip(points, angles, exact.cast(points, angles[:, None], 50.0)[:, 0], strict=True):
-        along = point + t[:, None] * [math.cos(angle), math.sin(angle)]
-        inside = exact.clearance(along) >= 0.0
-        left = t[np.argmin(inside)] if not inside.all() else 50.0
-        if abs(left - reach) > 0.02 + 1e-9:
-            # A chord of less than a step off the road may be stepped over; nothing else may differ.
-            assert left > reach
-            assert exact.clearance(along[t <= left]).min() < 0.02
-            grazing += 1
-    assert grazing <= 2
 
 
 def test_the_oracle_knows_a_ring_and_a_strip():
@@ -164,19 +134,6 @@ def test_no_start_range_exceeds_the_true_range(scenario, exact, wide):
     # It is there to save steps: on the road's inner metres it covers most of the way.
     inner = exact.clearance(points) > 1.0
     assert start[inner].sum() > 0.35 * true[inner].sum()
-
-
-def test_the_table_repeats_its_first_bins_behind_the_last(scenario):
-    table = start_table(scenario.road)
-    extra = table.shape[1] - HEADING_BINS
-    assert extra > 0
-    assert (table[:, HEADING_BINS:] == table[:, np.arange(extra) % HEADING_BINS]).all()
-
-
-def test_in_the_open_the_table_reaches_as_far_as_the_field_can_tell():
-    road, _ = small_road(lines=[[0, 0, 64, 0, 40.0], [0, 32, 64, 32, 40.0]])  # road everywhere
-    assert (road.start_row >= 0).all()
-    assert (road.start == 50 * START_UNITS).all()
 
 
 # --- What kernels read -----------------------------------------------------------------------------------------------

@@ -85,18 +85,6 @@ def test_stopping_distance(speed):
     assert late < 0.011
 
 
-@given(speed=speeds)
-def test_brake_slows_down_and_never_reverses(speed):
-    car = Driver(speed=speed)
-    for _ in range(45):
-        before = car.speed
-        car.do(Action.BRAKE)
-        assert -STILL <= math.copysign(1.0, before) * car.speed <= max(abs(before), STILL)
-        assert abs(before) - abs(car.speed) <= 0.8 * (1 + 1e-5)
-    assert abs(car.speed) <= STILL
-    assert car.x[-1] * speed >= 0.0
-
-
 @pytest.mark.parametrize("pedal", [-1.0, -0.3])
 @pytest.mark.parametrize("speed", [12.3, 0.5, -2.0])
 def test_the_pedal_brakes_to_a_stand_and_not_further(pedal, speed):
@@ -129,18 +117,6 @@ def test_limits_hold_whatever_is_done(speed, steering, taken):
 
 
 # --- Steering --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("action", "sign"),
-    [(Action.LEFT, 1), (Action.RIGHT, -1), (Action.ACCELERATE_LEFT, 1), (Action.ACCELERATE_RIGHT, -1)],
-)
-def test_steering_is_rate_limited_and_returns(action, sign):
-    car, angles = Driver(speed=1.0), []
-    for what in [action] * 6 + [Action.NONE] * 6:
-        car.do(what)
-        angles.append(math.degrees(car.steering))
-    assert angles == pytest.approx([sign * a for a in (6, 12, 18, 24, 27, 27, 21, 15, 9, 3, 0, 0)], abs=1e-4)
 
 
 @given(action=actions, speed=speeds, steering=steerings)
@@ -215,15 +191,6 @@ def test_the_heading_stays_a_unit_vector():
 
 
 # --- The configuration -----------------------------------------------------------------------------------------------
-
-
-def test_constants_are_si_and_radians():
-    assert K.half_length == 2.0
-    assert K.half_width == 1.0
-    assert K.front_axle == 1.25
-    assert K.steering_limit == pytest.approx(math.radians(27.0))
-    assert K.ray_first == pytest.approx(-math.radians(60.0))
-    assert K.ray_first + 30 * K.ray_step == pytest.approx(math.radians(60.0), abs=1e-6)
 
 
 @pytest.mark.parametrize(

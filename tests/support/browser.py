@@ -1,6 +1,5 @@
 """Chromium, that shows a page as a user's browser would."""
 
-import base64
 import itertools
 import json
 import os
@@ -62,10 +61,6 @@ class Browser:
     def wait_for_text(self, text, seconds=60.0):
         """Wait until the page holds a text, as HTML."""
         self.wait_for(f"document.documentElement.outerHTML.includes({json.dumps(text)})", seconds)
-
-    def picture(self, path):
-        """Write what the page shows to a PNG file."""
-        path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot")["data"]))
 
     def _call(self, method, **parameters):
         number = next(self._number)

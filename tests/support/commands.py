@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
+import pytest
 
 BIN = Path(sys.executable).parent
 
@@ -39,6 +40,14 @@ def finish(*arguments, cwd, timeout=240, **env):
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
+def call(main, monkeypatch, capsys, *arguments):
+    """A command's function (`evolve_main`) in this process: (exit code, what it prints, its errors)."""
+    monkeypatch.setattr(sys, "argv", [f"gridsim-{main.__name__.removesuffix('_main')}", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code, *capsys.readouterr()
+
+
 def summary(folder):
     return json.loads((folder / "summary.json").read_text())
 
@@ -58,6 +67,18 @@ def all_in_mlflow(run):
         steps = [metric.step for metric in client.get_metric_history(ended["mlflow_run_id"], name)]
         assert sorted(steps) == list(range(ended["generations"])), f"{name}: lost or doubled"
     return client.get_run(ended["mlflow_run_id"]).info.status == "FINISHED"
+
+
+def same_run(run, reference):
+    """Whether two runs of evolution came to the same by the same way, and MLflow has all of the first once."""
+    mine, theirs = summary(run), summary(reference)
+    assert mine["champion_sha256"] == theirs["champion_sha256"]
+    assert mine["car_steps"] == theirs["car_steps"]
+    assert mine["lost_chunks"] == 0
+    for row, other in zip(rows(run), rows(reference), strict=True):
+        for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
+            assert row[name] == other[name]
+    return all_in_mlflow(run)
 
 
 def duration_s(run):

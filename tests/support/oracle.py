@@ -465,23 +465,6 @@ def rays_to_boxes(
     return np.where(hit, way, np.inf).reshape(len(angles), -1).min(axis=1)
 
 
-def overlap_area(one: np.ndarray, other: np.ndarray) -> float:
-    """Area (m2) that two convex polygons [n, 2], counter-clockwise, share: Sutherland and Hodgman 1974."""
-    kept = list(one)
-    for a, b in zip(other, np.roll(other, -1, axis=0), strict=True):
-        ahead, kept = kept, []
-        for p, q in zip(ahead, ahead[1:] + ahead[:1], strict=True):
-            left, right = _cross(b - a, p - a), _cross(b - a, q - a)
-            if left >= 0.0:
-                kept.append(p)
-            if left * right < 0.0:
-                kept.append(p + (q - p) * left / (left - right))
-    if len(kept) < 3:
-        return 0.0
-    outline = np.array(kept)
-    return float(_cross(outline, np.roll(outline, -1, axis=0)).sum() / 2)
-
-
 def idm(config: SimConfig, speed: float, desired: float, gap: float, leader: float) -> float:
     """Acceleration (m/s2) by Treiber, Hennecke and Helbing 2000: gap m from bumper to bumper, inf without a leader."""
     t = config.traffic

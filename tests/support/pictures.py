@@ -1,21 +1,21 @@
-"""Pictures of roads for the tests of maps, and what is where on the maps made of them."""
+"""Small roads, pictures of roads, and what is where on the maps made of them."""
 
 import math
 
 import numpy as np
+import oracle
 import yaml
 from PIL import Image
 
 from gridsim.car.ego import collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
-from gridsim.maps.roads import Strips, clearances, freeze
+from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze, make_road
 
 PPM = 16
 W, H = 100.0, 72.0  # m
 LINES = np.array([[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]])
 ARCS = np.array([[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]])
-STRIPS = Strips.of(LINES, ARCS)
 
 
 def distance(x, y):
@@ -68,6 +68,12 @@ def crashes(road, starts):
 
 def read(road, points):
     return clearances(road, freeze(np.asarray(points, dtype=np.float32)))
+
+
+def small_road(lines=(), arcs=(), side=64.0):
+    """A road on a torus of so many metres, for 5 to 12 m/s and rays of 50 m; and the same for the oracle."""
+    strips = Strips.of(lines, arcs)
+    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 50.0), oracle.ExactRoad(strips, side, side)
 
 
 def strip(cx, cy, angle, half_width, half_length=45.0):

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from evolution.search.breeding import RECIPE, Kind, Mutation, breed
+
 
 def told(search, score):
     """One generation: asked for, and told `score(genomes)`; returns the genomes."""
@@ -21,3 +23,10 @@ def leader(search):
 def first_gene(genomes):
     """A score: the first gene of each genome."""
     return genomes[:, 0].astype(float)
+
+
+def new_genomes(spec, n=1, seed=0):
+    """Random genomes float32 [n, genes]."""
+    recipes = np.zeros(n, dtype=RECIPE)
+    recipes["kind"], recipes["seed"] = Kind.NEW, np.arange(n)
+    return breed(np.zeros((0, spec.size), dtype=np.float32), recipes, seed, spec, Mutation())
