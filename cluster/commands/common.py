@@ -15,6 +15,7 @@ import shutil
 import signal
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -214,8 +215,9 @@ def stoppable() -> Iterator[None]:
 def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
     """Run a command, which Ctrl-C and SIGTERM stop, and end this process with the code that `body` returns.
 
-    Errors for the user are shown in one line, and a second one if there is a hint for their kind.
+    Errors for the user are shown in one line, and a second one if there is a hint for their kind; warnings in one line.
     """
+    warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
     try:
         with stoppable():
             code = body()
