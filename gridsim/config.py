@@ -21,7 +21,7 @@ CLEARANCE_SHARE = 0.7  # weight of the shortest ray
 CRASH_REWARD = -1.0
 
 # Lanes. Own choices, unless a source is named.
-CROSSING_GAP = 2.9  # m between two lanes' centre lines below which cars on them, 2 m wide, may touch
+CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
 
 # Traffic, beside `TrafficConfig`. These are float32 because kernels read them as globals. Own choices, unless a source
 # is named.
@@ -38,7 +38,9 @@ CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
 STOP_LINE_GAP = _F(0.25)
 SWERVE_RADIUS = _F(16.0)  # m, of the arcs by which a car moves sideways, at least; as tight as bends are
 STEEPEST_SWERVE = _F(0.2)  # m sideways for each m of way, at most
-PATH_SAMPLE = _F(1.25)  # m between points of a path that are tested; below half a car's width plus CAUTION
+LANE_CHANGE_ALONE = _F(20.0)  # m within which no two cars change to or from the same lane at a time
+WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
+JUNCTION_MARGIN = _F(0.5)  # m past what a lane crosses, until which a car's rear still blocks it
 
 # How traffic meets the ego car.
 MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
@@ -51,6 +53,8 @@ EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predict
 # Junctions.
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
 EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
+EGO_BEHIND = _F(2.5)  # m to the side within which the ego car, if it is behind, follows a car
+EGO_INSIDE = _F(0.5)  # m from a lane's centre line within which the ego car's side is when it blocks the lane
 EGO_SECTOR_COSINE = _F(0.6)  # of the angle from its heading within which the ego car may be soon
 
 
@@ -108,10 +112,10 @@ class TrafficConfig:
     threshold: float = 0.2  # m/s2 that a change of lanes must gain
     safe_braking: float = 3.0  # m/s2 of braking that a change of lanes may force on the car behind
     lane_change_speed: float = 1.25  # m/s sideways, at most
-    kerb: float = 1.3  # m from the middle of a car that moves to the right to the road's edge, at least
+    verge: float = 0.3  # m from the side of a car that moves to the right to the road's edge, at least
     give_way: float = 0.9  # m that a car moves to the right for oncoming cars, at most
     taper: float = 0.1  # m to the right for each m of way, while it does
-    apart: float = 2.35  # m between the middles of two lanes, below which cars on them may touch
+    beside: float = 0.35  # m between the sides of cars on two lanes that cross, below which they may touch
     spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
     spawn_gap_ego: float = 22.0  # m between a car and the ego car at the start, at least
     courtesy: float = 10.0  # m; waiting behind a standing car within this distance is not idleness

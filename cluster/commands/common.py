@@ -14,6 +14,7 @@ import shutil
 import signal
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -185,9 +186,10 @@ def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
 def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
     """Run a command, which Ctrl-C and SIGTERM stop, and exit with the code that `body` returns.
 
-    Errors for the user are shown in one line, and a second one if there is a hint for their kind.
+    Errors for the user are shown in one line, and a second one if there is a hint for their kind; warnings in one line.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
     try:
         sys.exit(body())
     except KeyboardInterrupt:  # before there was anything to save, or for the second time

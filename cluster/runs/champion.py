@@ -32,6 +32,8 @@ from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED, check_name, default_traffic
 
+GONE = ("apart", "kerb")  # numbers of traffic that older champions hold
+
 
 @dataclass(frozen=True)
 class Champion:
@@ -144,7 +146,7 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
             VehicleConfig(**sim["vehicle"]),
             SensorConfig(**sim["sensors"]),
             EpisodeConfig(**sim["episode"]),
-            TrafficConfig(**sim.get("traffic", {})),
+            TrafficConfig(**{k: v for k, v in sim.get("traffic", {}).items() if k not in GONE}),
         )
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError) as error:

@@ -38,7 +38,6 @@ from evolution.episodes.curriculum import HELD_OUT_SEEDS
 from gridsim.car.ego import DISTANCE
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.files import problems_of
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
 
@@ -237,9 +236,7 @@ class Session:
 
     def learn(self) -> None:
         """Learn to the end, saving once a second and at the end."""
-        learning, scenario = self.learning, self.run.settings.scenario
-        for problem in problems_of(scenario, learning.sim) if is_map_file(scenario) else ():
-            learning.warn(problem)
+        learning = self.learning
         log_rows(self.tracker, learning.history)
         self._state, self._saved_steps = learning.state(), learning.steps
         if learning.history:

@@ -142,8 +142,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.traffic = default_traffic(scenario) if traffic is None else traffic
         self.simulator = Simulator([], num_envs, self.config, max_steps=max_episode_steps, traffic=self.traffic)
         self._episodes = Episodes(num_envs, scenario, maps, map_seed, self.config)
-        for problem in self._episodes.problems:
-            gymnasium.logger.warn("%s", problem)
         self.simulator.scenarios = self._episodes.maps
         self.render_mode = render_mode
         self._views: dict[int, Renderer] = {}  # by map

@@ -48,7 +48,6 @@ class Episodes:
         maps: those that are built; a simulator's scenarios.
         keys: uint64 [n], each car's seed.
         numbers: uint64 [n], of each car's episode since it was seeded.
-        problems: what makes a map's file doubtful, a line each.
     """
 
     def __init__(self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, config: SimConfig):
@@ -57,12 +56,8 @@ class Episodes:
         Raises: ValueError with one line where there is no map.
         """
         self.scenario, self.config = scenario, config
-        self.problems: list[str] = []
         if isinstance(maps, int) and is_map_file(scenario):
-            from gridsim.maps.files import problems_of  # imported here, because workers never read files
-
             maps = [build(scenario, map_seed, config)] * min(maps, 1)
-            self.problems = problems_of(scenario, config)
         self.maps: list[Map] = [] if isinstance(maps, int) else list(maps)
         self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in maps]
         if not self._seeds:

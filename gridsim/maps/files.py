@@ -35,8 +35,6 @@ from gridsim.maps.network import make_network
 from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
 from gridsim.maps.roads import (
     CELLS_PER_M,
-    FIELD_FLOOR,
-    FIELD_UNITS,
     HEADING_BINS,
     HEADING_WRAP,
     START_CELLS_PER_M,
@@ -64,6 +62,10 @@ SHORTEST_SIDE = 16  # m
 MOST_BORDER = 0.5  # share of a picture's border that is road, from which on it is taken for inverted
 
 
+class MapWarning(UserWarning):
+    """What is probably wrong with a map; the message is one line for the user."""
+
+
 @dataclass(frozen=True)
 class MapFile:
     """The contents of a map file."""
@@ -82,32 +84,10 @@ class MapFile:
 def load_map(name: str, config: SimConfig | None = None) -> Map:
     """The map of a file; the same object as long as the file does not change.
 
+    Warns (MapWarning) when it is built, if the road is very short or the picture seems inverted.
     Raises: GridSimError with one line that names the problem.
     """
     return _load(os.path.abspath(name), map_digest(name), config or SimConfig())
-
-
-def problems_of(name: str, config: SimConfig) -> list[str]:
-    """Warnings, a line each: a road so short that a second lap counts no distance, and one that may be inverted."""
-    road, revisit, stem = load_map(name, config).road, config.episode.revisit, Path(name).stem
-    nodes = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns)) / FIELD_UNITS + FIELD_FLOOR
-    length = road_length(nodes)
-    problems = []
-    if length <= 1.05 * revisit:  # 5 % for the error of the estimate
-        problems.append(
-            f"{stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
-            "nothing: cars end idle in their second lap. Make the road longer, or its resolution larger"
-        )
-    file = read_map_file(Path(os.path.abspath(name)))
-    free = read_free(file)
-    border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
-    if border >= MOST_BORDER and not file.torus:
-        problems.append(
-            f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
-            f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
-            "surroundings as wall"
-        )
-    return problems
 
 
 def map_digest(name: str) -> str:
@@ -333,6 +313,27 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
     return columns, rows
 
 
+def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit: float) -> None:
+    """Warn of a road so short that a second lap counts no distance, and of a picture that seems inverted."""
+    length = road_length(nodes)
+    if length <= 1.05 * revisit:  # 5 % for the error of the estimate
+        warnings.warn(
+            f"{stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
+            "nothing: cars end idle in their second lap. Make the road longer, or its resolution larger",
+            MapWarning,
+            stacklevel=1,
+        )
+    border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
+    if border >= MOST_BORDER and not file.torus:
+        warnings.warn(
+            f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
+            f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
+            "surroundings as wall",
+            MapWarning,
+            stacklevel=1,
+        )
+
+
 @lru_cache(maxsize=4)
 def _load(name: str, _digest: str, config: SimConfig) -> Map:
     """Build a map. The digest is part of the cache's key, so that a changed file is read again."""
@@ -351,6 +352,7 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
             poses = find_starts(nodes, config.vehicle)
     except ValueError as error:
         raise GridSimError(f"{path}: {error}") from None
+    _warn(path.stem, file, free, nodes, config.episode.revisit)
     starts = np.zeros((len(poses), 5), dtype=np.float32)
     starts[:, :3], starts[:, 3] = poses, START_SPEED
     width, height = columns / CELLS_PER_M, rows / CELLS_PER_M

@@ -104,7 +104,7 @@ def _room_on_right(lanes: Lanes, config: SimConfig, clearance: Callable[[np.ndar
         side = middle + vehicle.width / 2 * right
         for share in _ALONG_SIDE:
             gap = np.minimum(gap, clearance(freeze((side + share * vehicle.length / 2 * forward).astype(np.float32))))
-        fits = gap >= traffic.kerb - vehicle.width / 2
+        fits = gap >= traffic.verge
         low, high = np.where(fits, tried, low), np.where(fits, high, tried)
         tried = (low + high) / 2
     return low
@@ -160,7 +160,7 @@ def make_network(
             points, offsets, steps, successors, f(speed_limit), f(traffic.lateral), f(traffic.comfort), speeds
         )
         crossing = lanes.crossing_offsets, lanes.crossings
-        _clear_points(points, offsets, steps, *crossing, *sides, f(traffic.apart), clear)
+        _clear_points(points, offsets, steps, *crossing, *sides, f(config.vehicle.width + traffic.beside), clear)
     if clearance is not None:
         beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
         room = _room_on_right(lanes, config, clearance)

@@ -15,12 +15,12 @@ import numpy as np
 
 from gridsim.config import (
     CAUTION,
+    LANE_CHANGE_ALONE,
     LANE_CHANGE_PERIOD,
     LANE_CHANGE_SIGHT,
     LOOK_AHEAD,
     LOOK_AHEAD_TIME,
     NEIGHBOUR_WIDENING,
-    PATH_SAMPLE,
     STEEPEST_SWERVE,
     STOP_LINE_GAP,
     SWERVE_RADIUS,
@@ -30,7 +30,14 @@ from gridsim.config import (
 )
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
-from gridsim.traffic.encounters import meets_ego, room_to_right, shifted_right, touches_ego, way_to_ego_collision
+from gridsim.traffic.encounters import (
+    is_there,
+    meets_ego,
+    room_to_right,
+    shifted_right,
+    touches_ego,
+    way_to_ego_collision,
+)
 from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import (
     ACCELERATION,
@@ -53,6 +60,8 @@ from gridsim.traffic.world import (
     X,
     Y,
     choose_lane,
+    lane_after,
+    point_at,
     set_pose,
 )
 
@@ -176,9 +185,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
     beside = max(abs(shift), min(furthest, drivers.give_way))  # the path's distance from the lane, at most
     reach_x = abs(cosine) * half_length + abs(sine) * half_width + beside
     reach_y = abs(sine) * half_length + abs(cosine) * half_width + beside
-    for _ in range(3):
-        if travelled > horizon:
-            return _F(1e9)
+    while lane >= 0 and travelled <= horizon:
         length = lane_length(network, lane)
         box = network.boxes[_N(lane)]
         beside_x = abs(wrapped_any(box[0] - x, network.width)) - box[2]
@@ -203,14 +210,11 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < _ZERO:
                     return travelled
-                hop = max(free, PATH_SAMPLE)  # the path is free at least so far
+                hop = max(free, drivers.half_width + CAUTION)  # the path is free at least so far
                 along += hop
                 travelled += hop
         along -= length
-        if lane == _I(car[LANE]):
-            lane = _I(car[NEXT])
-        else:
-            lane = _I(car[SECOND_NEXT])
+        lane = lane_after(car, lane)
     return _F(1e9)
 
 
@@ -257,7 +261,7 @@ def _find_gaps(network, drivers, world, ego):
         world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
     # Searched beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
     beyond = _F(2.0) * (drivers.half_length + CAUTION)
-    ego_is_there = ego[COS] * ego[COS] + ego[SIN] * ego[SIN] > _HALF
+    ego_is_there = is_there(ego)
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
@@ -280,9 +284,7 @@ def _find_gaps(network, drivers, world, ego):
 @leaf
 def _desired(network, car):
     """A car's desired speed (m/s) at its place."""
-    lane = _N(_I(car[LANE]))
-    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-    return car[SPEED_FACTOR] * network.speeds[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
+    return car[SPEED_FACTOR] * network.speeds[point_at(network, car)]
 
 
 @leaf
@@ -343,7 +345,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             if j == i:
                 continue
             other = world[j] if j < world.shape[0] else ego
-            if (j < world.shape[0] and other[LANE] < _ZERO) or (other[COS] == _ZERO and other[SIN] == _ZERO):
+            if (j < world.shape[0] and other[LANE] < _ZERO) or not is_there(other):
                 continue
             dx, dy = other[X] - car[X], other[Y] - car[Y]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
@@ -353,7 +355,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
                 ahead = _way_between(network, target, along, other)
                 behind = -_way_between(network, lane, car[ALONG], other)
                 changes = ahead > _F(1e8) and behind < _F(-1e8) and other[SHIFT] != _ZERO
-                if changes and dx * dx + dy * dy < _F(400.0):
+                if changes and dx * dx + dy * dy < LANE_CHANGE_ALONE * LANE_CHANGE_ALONE:
                     free = False  # another car is changing lanes, to or from the target lane
                 wish = _desired(network, other)
             else:
@@ -402,7 +404,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         for j in range(world.shape[0]):
             if j != i and world[j, LANE] >= _ZERO:
                 update_gap(network, drivers, car, world[j], False)
-        if ego[COS] != _ZERO or ego[SIN] != _ZERO:
+        if is_there(ego):
             update_gap(network, drivers, car, ego, True)
         if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe:
             car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO

@@ -19,17 +19,23 @@ from gridsim.config import (
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, wrapped, wrapped_any
 from gridsim.sensing.boxes import boxes_touch
-from gridsim.traffic.world import ALONG, COS, LANE, NEXT, SECOND_NEXT, SHIFT, SIN, SPEED, X, Y
+from gridsim.traffic.world import ALONG, COS, LANE, SHIFT, SIN, SPEED, X, Y, lane_after, point_at
 
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 
 @leaf
+def is_there(ego):
+    """Whether there is an ego car."""
+    return ego[COS] != _ZERO or ego[SIN] != _ZERO
+
+
+@leaf
 def meets_ego(network, car, ego):
     """Whether the ego car is near, ahead, and oncoming or crossing, or was when the car moved over for it."""
     same_way = car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO
-    if (ego[COS] == _ZERO and ego[SIN] == _ZERO) or same_way:
+    if same_way or not is_there(ego):
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
     return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > MEETING_OVER
@@ -38,7 +44,7 @@ def meets_ego(network, car, ego):
 @leaf
 def touches_ego(network, drivers, car, ego):
     """Whether a car touches the ego car, if there is one."""
-    if ego[COS] == _ZERO and ego[SIN] == _ZERO:
+    if not is_there(ego):
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
     return boxes_touch(drivers, dx, dy, car[COS], car[SIN], ego[COS], ego[SIN])
@@ -47,9 +53,7 @@ def touches_ego(network, drivers, car, ego):
 @leaf
 def room_to_right(network, car):
     """`Network.room` (m) at a car's place."""
-    lane = _N(_I(car[LANE]))
-    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-    return network.room[_N(min(at, _I(network.offsets[lane + _N(1)] - 1)))]
+    return network.room[point_at(network, car)]
 
 
 @leaf
@@ -87,11 +91,8 @@ def way_to_ego_collision(network, drivers, car, ego):
         way = car[SPEED] * t
         while way - begin >= length:
             begin += length
-            if lane == _I(car[LANE]):
-                lane = _I(car[NEXT])
-            elif lane == _I(car[NEXT]):
-                lane = _I(car[SECOND_NEXT])
-            else:
+            lane = lane_after(car, lane)
+            if lane < 0:
                 return _F(1e9)
             length = lane_length(network, lane)
         k = _N(network.offsets[_N(lane)]) + _N(_I((way - begin) / network.steps[_N(lane)]))

@@ -9,9 +9,19 @@ import math
 
 import numpy as np
 
-from gridsim.config import CAUTION, CROSSING_TIME, EGO_CLEARANCE, EGO_SECTOR_COSINE
+from gridsim.config import (
+    CAUTION,
+    CROSSING_TIME,
+    EGO_BEHIND,
+    EGO_CLEARANCE,
+    EGO_INSIDE,
+    EGO_SECTOR_COSINE,
+    JUNCTION_MARGIN,
+    WALKING_PACE,
+)
 from gridsim.jit import leaf
 from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
+from gridsim.traffic.encounters import is_there
 from gridsim.traffic.world import (
     ALONG,
     COS,
@@ -98,10 +108,10 @@ def may_enter(network, drivers, world, i, ego):
             other = network.crossings[c]
             if permit == other:
                 return False
-            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + _HALF:
+            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + JUNCTION_MARGIN:
                 return False
             if past == other and lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
-                network.clear[c] + _HALF
+                network.clear[c] + JUNCTION_MARGIN
             ):
                 return False
         waits = _I(-1)  # lane of this junction at whose end the other car may have to wait
@@ -120,7 +130,7 @@ def may_enter(network, drivers, world, i, ego):
             if there == lane or permit == lane:
                 return False
             for k in range(network.successors.shape[1]):
-                slow = there == network.successors[lane, k] and world[j, SPEED] < _F(2.0)
+                slow = there == network.successors[lane, k] and world[j, SPEED] < WALKING_PACE
                 if slow and world[j, ALONG] < place + drivers.half_length:
                     return False
         elif there == beyond:
@@ -132,16 +142,16 @@ def may_enter(network, drivers, world, i, ego):
             needed += place
     # The ego car goes first, unless it is behind this car. Its turn is unknown, so all the ground ahead of it is kept
     # free. A car that is already in a junction, as in a roundabout, drives on.
-    if ego[COS] != _ZERO or ego[SIN] != _ZERO:
+    if is_there(ego):
         dx, dy = ego[X] - car[X], ego[Y] - car[Y]
         dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
         forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
         same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
         way = EGO_CLEARANCE + CROSSING_TIME * max(ego[SPEED], _ZERO)
         far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
-        if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < _F(2.5))):
+        if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < EGO_BEHIND)):
             if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):
                 return False
-            rear = _way_to_point(network, beyond, ego[X], ego[Y], _F(1.5)) - drivers.half_length
+            rear = _way_to_point(network, beyond, ego[X], ego[Y], drivers.half_width + EGO_INSIDE) - drivers.half_length
             room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
     return room >= needed

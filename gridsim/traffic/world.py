@@ -74,6 +74,22 @@ def set_pose(network, car):
 
 
 @leaf
+def point_at(network, car):
+    """Index of the point of its lane that a car has passed last."""
+    lane = _U(_I(car[LANE]))
+    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
+    return _U(min(at, _I(network.offsets[lane + _U(1)] - 1)))
+
+
+@leaf
+def lane_after(car, lane):
+    """The lane after `lane` on a car's way, which is known for its next two lanes; else -1."""
+    if lane == _I(car[LANE]):
+        return _I(car[NEXT])
+    return _I(car[SECOND_NEXT]) if lane == _I(car[NEXT]) else _I(-1)
+
+
+@leaf
 def _draw(car):
     """A car's next random number in [0, 1)."""
     car[DRAWS] += _ONE
@@ -125,8 +141,7 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
                 car[SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
                 car[NEXT] = _F(choose_lane(network, lane, car))
                 car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
-                at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-                car[SPEED] = SPAWN_SPEED * car[SPEED_FACTOR] * network.speeds[at]
+                car[SPEED] = SPAWN_SPEED * car[SPEED_FACTOR] * network.speeds[point_at(network, car)]
                 break
             car[LANE] = -_ONE
 

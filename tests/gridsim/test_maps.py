@@ -4,10 +4,12 @@ import math
 import os
 import re
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import finish
 from pictures import (
     PPM,
     H,
@@ -30,10 +32,13 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.files import MapFile, load_map, map_digest, problems_of, read_free, read_map_file
+from gridsim.maps.files import MapFile, MapWarning, load_map, map_digest, read_free, read_map_file
 from gridsim.maps.map import Map, sample_starts, starts_at
 from gridsim.maps.raster import signed_clearance
 from gridsim.maps.scenarios import build, label
+
+pytestmark = pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")  # most are small, or all road
+CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 
 
 @pytest.fixture(scope="module")
@@ -95,23 +100,29 @@ def ring(x, y, radius, half_width):
 )
 def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
     pixels = picture(lambda x, y: ring(x - 45, y - 45, radius, half_width), 90.0, 90.0)
-    said = problems_of(save(tmp_path / "ring.png", pixels), SimConfig())
+    with warnings.catch_warnings(record=True, action="always") as said:
+        load_map(save(tmp_path / "ring.png", pixels))
     assert len(said) == short
     if short:
-        about = re.match(r"ring has about (\d+) m of road\. What is driven again within 200 m counts nothing", said[0])
+        told = r"ring has about (\d+) m of road\. What is driven again within 200 m counts nothing"
+        about = re.match(told, str(said[0].message))
         assert about is not None
         assert float(about[1]) == pytest.approx(2 * math.pi * radius, rel=0.1)
 
 
-def test_an_inverted_picture_is_told_and_where_it_is_used(tmp_path):
+def test_an_inverted_picture_is_told_by_environments_and_commands(tmp_path):
     pixels = picture(lambda x, y: ring(x - 45, y - 45, 36.0, 5.0), 90.0, 90.0)
     save(tmp_path / "dark.png", 255 - pixels)
     expected = "100% of dark's border is road. If the road is what is dark, set negate: 1 in its YAML"
-    assert problems_of(str(tmp_path / "dark.png"), SimConfig())[0].startswith(expected)
-    with pytest.warns(UserWarning, match="100% of dark's border is road"):
+    with pytest.warns(MapWarning, match=expected):
         GridSimEnv(str(tmp_path / "dark.png"))
-    name = write_yaml(tmp_path, image="dark.png", negate=1)
-    assert problems_of(name, SimConfig()) == []
+    done = finish("gridsim-evaluate", str(CHAMPION), "--scenario", "dark.png", "--episodes", "1", cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stderr.startswith(f"gridsim-evaluate: warning: {expected}")
+    assert done.stderr.count("\n") == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_map(write_yaml(tmp_path, image="dark.png", negate=1))
 
 
 def test_a_track_in_a_large_picture_loads_as_fast_as_one_in_a_small_one(tmp_path):

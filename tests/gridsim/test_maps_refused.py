@@ -16,6 +16,8 @@ from cluster.runs.settings import EvolveSettings, SettingsError, from_dict
 from gridsim.errors import GridSimError
 from gridsim.maps.files import MAX_PIXELS, load_map
 
+pytestmark = pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")
+
 
 def refused(name):
     """The one line with which a file is refused."""

@@ -11,7 +11,7 @@ from pictures import crashes
 
 from gridsim.car.ego import STEERING
 from gridsim.car.vehicle import path_curvature
-from gridsim.config import SimConfig, constants
+from gridsim.config import SimConfig, VehicleConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
@@ -48,11 +48,11 @@ FAR = np.full(5, 1e6, dtype=F)  # a start that is near nothing
 DT = CONFIG.episode.control_period
 
 
-def network_of(paths, width, height, limit=12.0, abreast=1, beside=None):
+def network_of(paths, width, height, limit=12.0, abreast=1, beside=None, config=CONFIG):
     lanes = lay_lanes(paths, width, height, abreast)
     for array in vars(lanes).values():
         freeze(array)
-    return make_network(lanes, width, height, limit, CONFIG, beside)
+    return make_network(lanes, width, height, limit, config, beside)
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +130,10 @@ def _watch(network, drivers, constants, world, ego, steps, history):
     return overlaps
 
 
-def watch(network, world, seconds, ego=NOBODY):
+def watch(network, world, seconds, ego=NOBODY, config=CONFIG):
     """States [steps, cars, FIELDS] of a world after each step; no two cars overlap in any of them."""
     history = np.zeros((round(seconds / DT), *world.shape), dtype=F)
-    assert _watch(network, D, K, world.copy(), ego, len(history), history) == 0
+    assert _watch(network, drivers(config), constants(config), world.copy(), ego, len(history), history) == 0
     return history
 
 
@@ -289,6 +289,14 @@ def test_of_two_that_cross_one_waits(crossing, offset):
         assert not (inside & (lane[:, i] == 3 * i + 1)).any()
 
 
+@pytest.mark.parametrize("width", [2.0, 2.2, 3.0])
+def test_a_lane_is_blocked_until_a_crossing_car_of_any_width_is_past(width):
+    """Points are 1 m apart, and the lanes cross 8 m along the junction's."""
+    config = SimConfig(vehicle=VehicleConfig(width=width))
+    network = network_of(crossing_paths(), 256.0, 256.0, config=config)
+    assert (network.clear == 8.0 + math.floor(width + CONFIG.traffic.beside)).all()
+
+
 def test_a_car_waits_while_the_crossing_car_has_a_permit(crossing):
     """It has one and does not come: the ego car stands before it. When that goes, both get through."""
     world = cars_on(crossing, (0, 100.0, 5.0, 1.0), (3, 80.0, 5.0, 1.0))
@@ -384,22 +392,23 @@ def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
     assert world[1, LANE] == 0
 
 
-@pytest.mark.parametrize("scenario", REGISTRY)
-def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario):
+@pytest.mark.parametrize(("scenario", "width"), [*((name, 2.0) for name in REGISTRY), ("city", 2.2), ("seamless", 3.0)])
+def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario, width):
     """Six starts among 24 cars, two minutes each; on the highway cars behind it change lanes."""
+    config = SimConfig(vehicle=VehicleConfig(width=width))
     for seed in (3, 5, 6, 8, 10, 12):
-        here = build(scenario, HELD_OUT_SEED + seed)
+        here = build(scenario, HELD_OUT_SEED + seed, config)
         start = sample_starts(here, 1, np.random.default_rng(seed))
-        world = spawn(here.network, start, 24, np.array([seed], dtype=np.uint64), CONFIG)[0]
+        world = spawn(here.network, start, 24, np.array([seed], dtype=np.uint64), config)[0]
         stands = ego(start[0, 0] % here.network.width, start[0, 1] % here.network.height, start[0, 2])
-        history = watch(here.network, world, 120, stands)
+        history = watch(here.network, world, 120, stands, config)
         cars = history[history[..., LANE] >= 0]
         dx, dy = stands[X] - cars[:, X], stands[Y] - cars[:, Y]
         for near in cars[dx**2 + dy**2 < 36.0]:
             away = stands[[X, Y]] - near[[X, Y]]
-            assert not boxes_touch(K, *away, near[COS], near[SIN], stands[COS], stands[SIN])
+            assert not boxes_touch(constants(config), *away, near[COS], near[SIN], stands[COS], stands[SIN])
         poses = np.column_stack([cars[:, X], cars[:, Y], np.arctan2(cars[:, SIN], cars[:, COS])])
-        assert not crashes(here.road, poses).any()
+        assert not crashes(here.road, poses, config).any()
 
 
 def test_a_car_boxed_in_stays(abreast):

@@ -59,10 +59,10 @@ def _crashed(road, constants, starts, out):
         out[k] = collides(road, constants, x, y, np.float32(math.cos(heading)), np.float32(math.sin(heading)))
 
 
-def crashes(road, starts):
+def crashes(road, starts, config=None):
     """Whether a car would touch a wall at each of starts float32 [n, 5]."""
     out = np.empty(len(starts), dtype=np.bool_)
-    _crashed(road, constants(SimConfig()), freeze(starts), out)
+    _crashed(road, constants(config or SimConfig()), freeze(starts), out)
     return out
 
 
