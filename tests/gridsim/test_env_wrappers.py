@@ -27,8 +27,8 @@ from gridsim.sensing import grid
 from gridsim.view.render import NoDisplayError
 
 F = np.float32
-KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing._reward, grid._fill_grids]
-KERNELS += [grid._push_frames, episodes._draw, map._starts_at]
+KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing.rewards_of, grid._fill_grids]
+KERNELS += [episodes._draw, map._starts_at]
 
 
 # --- pictures
