@@ -222,7 +222,7 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
         raise UsageError("a recorded drive has its own driver and road; leave out all but --output and how it looks")
     recorded, config = read_drive(flags.source), SimConfig()
     scenario, _ = _map(recorded.scenario, recorded.map_seed, config)
-    _, cars, ranges, worlds = replay(recorded, scenario, config)
+    _, cars, ranges, worlds = replay(recorded, scenario)
     title = f"{Path(flags.source).name}    {label(scenario.name)}, map {scenario.seed:,}"
     episodes = int(recorded.episodes[-1]) + 1
     for episode in range(episodes):
@@ -332,7 +332,7 @@ def _drive() -> int:
             period = config.episode.control_period
             recorder = stack.enter_context(Recorder(flags.record, scenario, period, traffic))
             stack.callback(_print_recorded, recorder)  # also if the drive is interrupted
-        done = drive(scenario, start, window, Renderer(scenario, size), recorder, config, seconds, traffic)
+        done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
         print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
     return 0
 

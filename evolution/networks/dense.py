@@ -24,17 +24,11 @@ def plain_tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Ca
     def plain(
         x, x_at, x_step, planes, plane_step, rows, row_step, run, w, w_at, width, bias_at, y, y_at, y_step
     ):  # fmt: skip
+        planes_at = plane_step * np.arange(planes)[:, None, None]
+        at = (x_at + planes_at + row_step * np.arange(rows)[:, None] + np.arange(run)).ravel()  # of inputs
+        weights = w[w_at + width * np.arange(len(at))[:, None] + np.arange(lanes)]
         for p in range(positions):
-            totals = np.zeros((chains, lanes), dtype=np.float32)
-            totals[0] = w[bias_at : bias_at + lanes]
-            at = w_at
-            for plane in range(planes):
-                for row in range(rows):
-                    first = x_at + p * x_step + plane * plane_step + row * row_step
-                    for i in range(run):
-                        totals[i % chains] += x[first + i] * w[at : at + lanes]
-                        at += width
-            total = totals.sum(axis=0)
+            total = w[bias_at : bias_at + lanes] + x[at + p * x_step] @ weights
             y[y_at + p * y_step : y_at + p * y_step + lanes] = np.where(total < 0.0, 0.0, total) if rectify else total
 
     return plain

@@ -1,8 +1,8 @@
 """The ego car: its state, and its control step.
 
-`drive` is one control step of one car: apply the action, advance in sub-steps with collision checks, count new ground,
-check for the end. The batched `envs.simulator` and `evolution.episodes.rollout` both call it. The state is float32
-[FIELDS], with the fields below.
+`control` is one control step of one car: advance in sub-steps with collision checks, count new ground, check for the
+end. The batched `envs.simulator` and `evolution.episodes.rollout` both call it. The state is float32 [FIELDS], with the
+fields below.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from enum import IntEnum
 
 import numpy as np
 
-from gridsim.car.vehicle import act, advance, front_velocity, path_curvature
+from gridsim.car.vehicle import advance, front_velocity, path_curvature
 from gridsim.config import REENTRY, SUBSTEP
-from gridsim.jit import leaf
-from gridsim.maps.roads import VISIT_CELL, clearance
+from gridsim.jit import leaf, njit
+from gridsim.maps.roads import VISIT_CELL, Road, clearance
 from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
 from gridsim.sensing.rays import sense
 
@@ -78,6 +78,12 @@ def collides(road, constants, x, y, cosine, sine):
     return False
 
 
+@njit
+def visit_cells(road: Road) -> int:
+    """Number of visit cells of a map."""
+    return int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
+
+
 @leaf
 def visit_cell(road, x, y):
     """Index of the visit cell that contains a point of the torus."""
@@ -103,6 +109,14 @@ def place(road, start, car, visits):
 
 
 @leaf
+def start_from(car, start):
+    """The inverse of `place`: the start float32 [5] of an episode that begins where a car is."""
+    start[0], start[1] = car[X], car[Y]
+    start[2] = math.atan2(car[SIN], car[COS])
+    start[3], start[4] = car[SPEED], car[STEERING]
+
+
+@leaf
 def look(road, constants, fan, car, world, beams, ranges, closing):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
@@ -120,19 +134,13 @@ def look(road, constants, fan, car, world, beams, ranges, closing):
 
 
 @leaf
-def drive(road, constants, car, visits, world, action):
-    """One control step of one car with one of the eight actions. Returns RUNNING, COLLISION or IDLE.
+def control(road, constants, car, visits, world, acceleration, steering, target, max_steps):
+    """One control step of a car. The traffic in `world` must already have moved.
 
-    The traffic in `world` must already have moved.
+    Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits, m of new ground and control steps.
+    Returns: an End as a number.
     """
-    acceleration, steering = act(constants, action, car[SPEED], car[STEERING])
     car[STEERING] = steering
-    return move(road, constants, car, visits, world, acceleration)
-
-
-@leaf
-def move(road, constants, car, visits, world, acceleration):
-    """One control step with the car's current steering and an acceleration in m/s2."""
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
     curvature = path_curvature(constants, speed, car[STEERING])
     fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
@@ -199,16 +207,8 @@ def move(road, constants, car, visits, world, acceleration):
         return 1
     if car[IDLE] >= _F(constants.patience):
         return 2
+    if car[DISTANCE] >= target:
+        return 3
+    if car[STEPS] >= max_steps:
+        return 4
     return 0
-
-
-@leaf
-def control(road, constants, car, visits, world, acceleration, target, max_steps):
-    """`move`, then check the episode's limits: m of new ground, and control steps. Returns an End as a number."""
-    end = move(road, constants, car, visits, world, acceleration)
-    if end == 0:
-        if car[DISTANCE] >= target:
-            return 3
-        if car[STEPS] >= max_steps:
-            return 4
-    return end

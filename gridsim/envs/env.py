@@ -39,7 +39,7 @@ from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.episodes import Episodes
-from gridsim.envs.observing import Observer, row
+from gridsim.envs.observing import Observer, rewards_of, row
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
@@ -223,7 +223,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             ranges[which], speeds[which] = self._begin(which)
             ends[which] = End.RUNNING
         self.ranges = ranges
-        rewards = self._observer.rewards(ranges, speeds, progress, ends, begun, self._fastest)
+        reach, dt = _F(self.config.sensors.range), _F(self.config.episode.control_period)
+        rewards = rewards_of(ranges, speeds, progress, ends, self._fastest, begun, reach, dt)
         self._note(slice(None), begun)
         observations, info = self._observer.look(ranges, speeds), self._info()
         terminations, truncations = TERMINATES[ends], TRUNCATES[ends]
@@ -366,7 +367,6 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_modes": self.cars.metadata["render_modes"]}
-        self._seeded = False
         self._spec: EnvSpec | None = None
         self.observation_space = self.cars.single_observation_space
         self.action_space = self.cars.single_action_space
@@ -390,9 +390,6 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see `GridSimVectorEnv.reset`. Returns: (observation, info)."""
         super().reset(seed=seed)
-        if seed is None and not self._seeded:
-            seed = int(self.np_random.integers(1 << 63))
-        self._seeded = True
         observations, info = self.cars.reset(seed=seed, options=options)
         return row(observations, 0), self._own(info)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
@@ -11,7 +9,7 @@ from gridsim.car.ego import STEERING
 from gridsim.car.reward import reward
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
+from gridsim.sensing.grid import CELLS, GridTable, grid_table, grids, push_frames
 
 _F = np.float32
 _ALL = slice(None)
@@ -33,12 +31,13 @@ def _observe(ranges, closing, speeds, reach, slowest, limit, observations):
 
 
 @njit
-def _reward(ranges, speeds, progress, ends, fastest, begun, reach, dt, rewards):
+def rewards_of(ranges, speeds, progress, ends, fastest, begun, reach, dt):
+    """The rewards float32 [n] of a step, 0 where an episode has `begun`; the other arguments are `reward`'s, [n]."""
+    made = np.zeros(ranges.shape[0], dtype=np.float32)
     for i in range(ranges.shape[0]):
-        if begun[i]:
-            rewards[i] = _F(0.0)
-        else:
-            rewards[i] = reward(ranges[i], reach, speeds[i], progress[i], ends[i], fastest[i], dt)
+        if not begun[i]:
+            made[i] = reward(ranges[i], reach, speeds[i], progress[i], ends[i], fastest[i], dt)
+    return made
 
 
 def row(observations: Seen, i: int) -> Seen:
@@ -49,9 +48,7 @@ def row(observations: Seen, i: int) -> Seen:
 class Observer:
     """Turns what a simulator's cars sense into observations.
 
-    Attributes:
-        space: of what one car sees.
-        table: the grid's, or None where rays are seen.
+    Attributes: space, of what one car sees.
     """
 
     def __init__(
@@ -62,9 +59,9 @@ class Observer:
         rays, vehicle = self.config.sensors.rays, self.config.vehicle
         self._width = (2 if motion else 1) * rays + 1 + steering
         self._slowest = _F(-vehicle.reverse_limit / vehicle.speed_limit)
-        self._alone = observation == "image"
-        self.table = None if observation == "rays" else grid_table(self.config)
-        self._stack = np.zeros((len(simulator), frames, CELLS, CELLS) if self.table else 0, dtype=np.uint8)
+        self._observation = observation
+        shape = 0 if observation == "rays" else (len(simulator), frames, CELLS, CELLS)
+        self._stack = np.zeros(shape, dtype=np.uint8)
         image = Box(0, 255, (frames, CELLS, CELLS), dtype=np.uint8)
         low = np.zeros(self._width, dtype=np.float32)
         low[rays:] = -1.0
@@ -75,30 +72,30 @@ class Observer:
         elif observation == "grid":
             self.space = Dict({"grid": image, "speed": Box(self._slowest, 1.0, (1,), dtype=np.float32)})
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the table, whose copy could be written to: kernels would be compiled anew for it."""
-        return {**vars(self), "table": self.table is not None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self.table = grid_table(self.config) if state["table"] else None
+    @property
+    def table(self) -> GridTable | None:
+        """The grid's table, or None where rays are seen."""
+        # Not kept, because a copy of it could be written to: kernels would be compiled anew for it.
+        return None if self._observation == "rays" else grid_table(self.config)
 
     def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
         """Let cars `which` [k] sense `ranges` [k, rays]: their newest frame, or the first where they have `begun`."""
-        if self.table is None or self._stack.shape[1] == 1:
+        table = self.table
+        if table is None or self._stack.shape[1] == 1:
             return
         stack = self._stack[which]
-        push_frames(stack, grids(self.table, ranges), begun)
+        push_frames(stack, grids(table, ranges), begun)
         if not isinstance(which, slice):  # then it is a copy
             self._stack[which] = stack
 
     def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
         """What cars `which` [k] see with ranges [k, rays] and speeds [k], once they `take` these; the caller's own."""
-        if self.table is None:
+        table = self.table
+        if table is None:
             return self._rays(ranges, speeds, which)
         one = self._stack.shape[1] == 1
-        image = grids(self.table, ranges)[:, None] if one else self._stack[which].copy()
-        if self._alone:
+        image = grids(table, ranges)[:, None] if one else self._stack[which].copy()
+        if self._observation == "image":
             return image
         share = np.clip(speeds / _F(self.config.vehicle.speed_limit), self._slowest, _F(1.0))
         return {"grid": image, "speed": share[:, None]}
@@ -113,18 +110,3 @@ class Observer:
             angles = self._simulator.state.cars[which, STEERING]
             observations[:, -1] = np.clip(angles / np.radians(vehicle.steering_limit), -1.0, 1.0)
         return observations
-
-    def rewards(
-        self,
-        ranges: np.ndarray,
-        speeds: np.ndarray,
-        progress: np.ndarray,
-        ends: np.ndarray,
-        begun: np.ndarray,
-        fastest: np.ndarray,
-    ) -> np.ndarray:
-        """The rewards [n] of a step, 0 where an episode has `begun`; `fastest` m/s: upper speeds of the scenarios."""
-        rewards = np.empty(len(ranges), dtype=np.float32)
-        dt = _F(self.config.episode.control_period)
-        _reward(ranges, speeds, progress, ends, fastest, begun, _F(self.config.sensors.range), dt, rewards)
-        return rewards

@@ -10,17 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place
+from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place, visit_cells
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import leaf, njit
+from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.maps.roads import VISIT_CELL, Road
 from gridsim.sensing.rays import SIMD_RAYS, fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
-from gridsim.traffic.world import check_worlds, spawn
+from gridsim.traffic.world import spawn
 
 ACTIONS = len(Action)
 
@@ -42,15 +41,6 @@ class State(NamedTuple):
     maps: np.ndarray  # int32 [n], index of the car's map among the simulator's scenarios
     ends: np.ndarray  # uint8 [n], End
     worlds: np.ndarray  # float32 [n, traffic, world.FIELDS], the other cars around each
-
-
-@leaf
-def step_car(road, network, constants, drivers, car, visits, world, acceleration, steering, target, max_steps):
-    """One control step of a car, and before it of the traffic around it. Returns an End as a number."""
-    if world is not None:
-        flow(network, drivers, world, car)
-    car[STEERING] = steering
-    return control(road, constants, car, visits, world, acceleration, target, max_steps)
 
 
 @njit(nogil=True)
@@ -88,9 +78,9 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 else:
                     pedal, wheel = actions[i, 0], actions[i, 1]
                     acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
-                ends[i] = step_car(
-                    road, network, constants, drivers, car, visits[i], world, acceleration, steering, target, max_steps
-                )
+                if world is not None:
+                    flow(network, drivers, world, car)
+                ends[i] = control(road, constants, car, visits[i], world, acceleration, steering, target, max_steps)
             progress[i] = car[DISTANCE] - before
             look(road, constants, physics.fan, car, world, beams, ranges[i], closing[i])
             speeds[i] = car[SPEED]
@@ -173,11 +163,11 @@ class Simulator:
             maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
             keys: uint64 [k], or one for all, from which the traffic around each is spawned.
-            worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys.
+            worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys, not checked.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
-        Raises: ValueError with one line for a wrong shape, a number that is not finite, a map that is not there, or
-        traffic that is on no lane of its map (`world.check_worlds`). Nothing is changed then.
+        Raises: ValueError with one line for a wrong shape, a number that is not finite, or a map that is not there.
+        Nothing is changed then.
         """
         n = len(self)
         cars = np.arange(n) if cars is None else np.asarray(cars, dtype=np.intp)
@@ -194,7 +184,7 @@ class Simulator:
             return ranges, starts[:, 3]
         traffic = self._traffic(starts, maps, keys, worlds) if self.state.worlds.shape[1] else None
         rows = self._chart(maps, everyone=len(cars) == n)
-        cells = max(_visit_cells(self.scenarios[m].road) for m in np.unique(maps))
+        cells = max(visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
             more = ((0, 0), (0, cells - self.state.visits.shape[1]))
             self.state = self.state._replace(visits=np.pad(self.state.visits, more, constant_values=-1e6))
@@ -229,8 +219,6 @@ class Simulator:
             worlds = np.asarray(worlds, dtype=np.float32)
             if worlds.shape != shape:
                 raise ValueError(f"traffic must be {shape[0]} worlds of {shape[1]} cars, not {worlds.shape}")
-            for m in np.unique(maps):
-                check_worlds(worlds[maps == m], self.scenarios[m].network)
             return worlds
         keys = np.broadcast_to(np.asarray(keys, dtype=np.uint64), maps.shape)
         spawned = np.empty(shape, dtype=np.float32)
@@ -275,13 +263,6 @@ class Simulator:
         return ranges, speeds, progress, state.ends.copy()
 
 
-@njit(nogil=True)
-def _views(road, constants, fan, cars, worlds, ranges, closing):
-    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
-    for i in range(cars.shape[0]):
-        look(road, constants, fan, cars[i], worlds[i], beams, ranges[i], closing[i])
-
-
 def views(
     scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
@@ -290,16 +271,13 @@ def views(
     Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].
     """
     k = constants(config)
-    ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
+    ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     closing = np.zeros_like(ranges)
-    _views(scenario.road, k, rays, np.ascontiguousarray(cars), np.ascontiguousarray(worlds), ranges, closing)
+    for car, world, seen, speeds in zip(cars, worlds, ranges, closing, strict=True):
+        look(scenario.road, k, rays, car, world, beams, seen, speeds)
     return ranges, closing
-
-
-def _visit_cells(road: Road) -> int:
-    """Number of visit cells of a map."""
-    return int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
 
 
 def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:

@@ -39,6 +39,15 @@ class Map:
     # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
 
+    @property
+    def size(self) -> np.ndarray:
+        """Width and height (m): float64 [2]."""
+        return np.array([self.road.width, self.road.height], dtype=np.float64)
+
+    def shortest(self, offsets: np.ndarray) -> np.ndarray:
+        """Differences [..., 2] of points (m), on a torus the short way round."""
+        return offsets - np.round(offsets / self.size) * self.size if self.torus else offsets
+
     @cached_property
     def mileage(self) -> np.ndarray:
         """Cumulated length (m) at each point of `lanes`, with all lanes laid end to end: float64 [points]."""

@@ -105,15 +105,6 @@ class Lanes(_Arrays):
     def __len__(self) -> int:
         return len(self.offsets) - 1
 
-    @property
-    def lengths(self) -> np.ndarray:
-        """Float64 [lanes], m."""
-        return self.steps * (np.diff(self.offsets) - 1)
-
-    def lane(self, i: int) -> np.ndarray:
-        """Points [n, 2] of lane i."""
-        return self.points[self.offsets[i] : self.offsets[i + 1]]
-
 
 @njit(nogil=True)
 def _cut_blocks(field, blocks, widest):

@@ -98,9 +98,7 @@ def driven(poses: np.ndarray, road_map: Map) -> Driven:
     Raises: ValueError if the car never moved forward.
     """
     poses = np.asarray(poses, dtype=np.float64)
-    sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
-    steps = np.diff(poses[:, :2], axis=0)
-    steps -= np.round(steps / sides) * sides  # across the torus's edge
+    steps = road_map.shortest(np.diff(poses[:, :2], axis=0))
     points = np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(steps, axis=0)])
     way = np.hypot(*steps.T)
     forward = np.concatenate([[0.0], np.cumsum(np.where(poses[1:, 3] + poses[:-1, 3] < 0.0, -way, way))])
@@ -137,8 +135,7 @@ def error_series_beside(path: Driven, recorded: Driven, road_map: Map, row: int 
     recording's end.
     Returns: (the series, empty if nothing is left; m along the recording that the agent reached).
     """
-    sides = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
-    points = path.points - np.round((path.points[0] - recorded.points[row]) / sides) * sides
+    points = path.points - np.round((path.points[0] - recorded.points[row]) / road_map.size) * road_map.size
     steps = np.diff(recorded.points, axis=0)
     k, last = min(row, len(steps) - 1), len(steps) - 1
     at, parted = [], False

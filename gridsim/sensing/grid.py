@@ -15,6 +15,7 @@ A ray with its full range hit nothing: its cells are free up to there, and unkno
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ def centres() -> tuple[np.ndarray, np.ndarray]:
     return ahead, left
 
 
+@cache
 def grid_table(config: SimConfig) -> GridTable:
     """The table for a configuration's rays. Raises: ValueError as `config.constants`."""
     k, sensors = constants(config), config.sensors
@@ -102,25 +104,13 @@ def grids(table: GridTable, ranges: np.ndarray) -> np.ndarray:
     return made
 
 
-@njit(nogil=True)
-def _push_frames(stacked, grids, begun):
-    frames, area = stacked.shape[1], stacked.shape[2]
-    for n in range(stacked.shape[0]):
-        for k in range(frames):
-            if begun[n] or k == frames - 1:
-                for i in range(area):
-                    stacked[n, k, i] = grids[n, i]
-            else:
-                for i in range(area):
-                    stacked[n, k, i] = stacked[n, k + 1, i]
-
-
 def push_frames(stacked: np.ndarray, grids: np.ndarray, begun: np.ndarray) -> None:
     """Append each car's new grid to its stack and drop the oldest; the newest is last.
 
-    Args: stacked uint8 [n, frames, 80, 80], C-contiguous, changed in place; grids uint8 [n, 80, 80]; begun bool [n],
-    whether an episode has just begun; then all frames become the first grid.
+    Args: stacked uint8 [n, frames, 80, 80], changed in place; grids uint8 [n, 80, 80]; begun bool [n], whether an
+    episode has just begun; then all frames become the first grid.
     """
-    n, frames = stacked.shape[:2]
-    flat = stacked.reshape(n, frames, CELLS * CELLS)
-    _push_frames(flat, np.ascontiguousarray(grids).reshape(n, CELLS * CELLS), np.ascontiguousarray(begun))
+    for k in range(stacked.shape[1] - 1):
+        stacked[:, k] = stacked[:, k + 1]
+    stacked[:, -1] = grids
+    stacked[begun] = grids[begun, None]

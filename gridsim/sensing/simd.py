@@ -1,13 +1,12 @@
-"""Marching 32 rays to the edge of the road: a plain kernel, and vector code that all rays in lockstep run in.
+"""Marching 32 rays to the edge of the road, all in lockstep.
 
-The arithmetic of the two is the same; tests compare them. In the vector code a ray that has arrived is refined further
-while others march. It is emitted as LLVM vectors of 32, which LLVM maps to the machine's registers.
+The code is emitted as LLVM vectors of 32, which LLVM maps to the machine's registers. A ray that has arrived is refined
+further while others march. `NUMBA_DISABLE_JIT=1` runs a simpler march.
 """
 
 from __future__ import annotations
 
-import math
-from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,10 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
-from gridsim.jit import CONFIG, leaf
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
+from gridsim.jit import CONFIG
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, clearance
 
-_F, _I, _U = np.float32, np.int32, np.uint32
+_F = np.float32
 SIMD_RAYS = 32
 # Chosen for a small error with few steps of the slowest ray, over 4,000 poses: 99th percentile 0.06 m.
 _SCALE = _F(CELLS_PER_M)
@@ -28,6 +27,7 @@ _SLOPE = _F(CELLS_PER_M / FIELD_UNITS)
 _NEAR = _F(2.0)  # m of clearance below which Newton steps are taken
 _STRETCH = _F(1.5)  # length of a step above it, in clearances
 _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
+_ARRIVED = _F(0.002)  # ... in the plain march, which makes no last Newton step
 _SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance, and a leap longer than a stretched step
 _GAP = _F(0.95)  # m of a step that may be blind, among thin walls
 # How to march without and with thin walls: most steps, leap in m (not to jump over an island), whether steps are
@@ -36,54 +36,24 @@ PLAIN = (16, _F(2.0), False)
 AMONG_THIN_WALLS = (24, _F(0.9), True)
 
 
-@leaf
-def march(field, columns, rows, px0, py0, reach, beams, how):
-    """Move each of SIMD_RAYS rays from its start range to the edge of the road.
-
-    Args: packed field with its sides; origin in cells; reach m; beams float32 [3, SIMD_RAYS]: direction x, direction y
-    and range: on entry the start, on return the result, in [0, reach]; how: PLAIN or AMONG_THIN_WALLS.
-    """
-    steps, leap, look_back = how
-    mask_x, mask_y = _U(columns - _U(1)), _U(rows - _U(1))
-    for r in range(SIMD_RAYS):
-        dx, dy, t = beams[0, r], beams[1, r], beams[2, r]
-        safe = t  # m that are known to be free, but for blind parts of _GAP or less
-        for _ in range(steps):
-            px, py = px0 + t * (dx * _SCALE), py0 + t * (dy * _SCALE)
-            fx, fy = math.floor(px), math.floor(py)
-            ux, uy = px - fx, py - fy
-            word = field[_U(_U(_U(_I(fy)) & mask_y) * columns + (_U(_I(fx)) & mask_x))]
-            q00, q10 = _F(_I(word & _U(255))), _F(_I((word >> _U(8)) & _U(255)))
-            q01, q11 = _F(_I((word >> _U(16)) & _U(255))), _F(_I(word >> _U(24)))
-            rise_low, rise_high = q10 - q00, q11 - q01
-            low, high = q00 + ux * rise_low, q01 + ux * rise_high
-            clear = (low + uy * (high - low)) * _UNIT + _FLOOR
-            if look_back:
-                if t - abs(clear) > safe + _GAP:
-                    t = safe + _GAP
-                    continue
-                if clear > _F(0.0):
-                    safe = max(safe, t + clear)
-            if t >= reach:
-                break
-            if clear > _NEAR:
-                t += _STRETCH * clear
-            else:
-                slope = -(dx * (rise_low + uy * (rise_high - rise_low)) + dy * (high - low)) * _SLOPE
-                t += min(clear / min(max(slope, _SLOPE_MIN), _F(1.0)), max(_STRETCH * clear, _F(0.0)) + leap)
-                if look_back:
-                    t = max(t, safe)
-                if abs(clear) < _CLOSE:
-                    break
-        if look_back:
-            t = min(t, safe + _GAP)
-        beams[2, r] = min(max(t, _F(0.0)), reach)
+def plain_march(field, columns, rows, px0, py0, reach, beams):
+    """The march for `NUMBA_DISABLE_JIT=1`, where there is no vector code: each step is as long as the clearance."""
+    road = SimpleNamespace(field=field, columns=columns, rows=rows)
+    dx, dy, t = beams
+    clear = np.full(SIMD_RAYS, reach)
+    while (going := (t < reach) & (clear > _ARRIVED)).any():
+        clear = np.where(going, clearance(road, px0 / _SCALE + t * dx, py0 / _SCALE + t * dy), _F(0.0))
+        t += clear
+    np.clip(t, _F(0.0), reach, out=t)
 
 
 def vector_march(how: tuple[int, np.float32, bool]) -> Any:
-    """Build the intrinsic `march(field, columns, rows, px0, py0, reach, beams)`; see the plain `march`.
+    """Build the intrinsic that moves each of SIMD_RAYS rays from its start range to the edge of the road.
 
-    It runs until the last ray has arrived. Where steps are not checked for blind parts, no code for that is emitted.
+    Its arguments: packed field with its sides; origin in cells; reach m; beams float32 [3, SIMD_RAYS]: direction x,
+    direction y and range: on entry the start, on return the result, in [0, reach]. It runs until the last ray has
+    arrived. `how` is PLAIN or AMONG_THIN_WALLS. Where steps are not checked for blind parts, no code for that is
+    emitted.
     """
     steps, leap, look_back = how
 
@@ -211,5 +181,5 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
 
 
 def fast_march(how: tuple[int, np.float32, bool]) -> Any:
-    """The vector code; under `NUMBA_DISABLE_JIT=1` the plain kernel."""
-    return partial(march, how=how) if CONFIG.DISABLE_JIT else vector_march(how)
+    """The vector code; under `NUMBA_DISABLE_JIT=1` the plain march."""
+    return plain_march if CONFIG.DISABLE_JIT else vector_march(how)

@@ -39,9 +39,6 @@ LANE_TIMER = 19  # control steps until its next decision on a change of lanes
 SWAY = 20  # m to the left of its lane for each m of way, while SHIFT changes
 FIELDS = 21
 
-_MOST = 1 << 24  # float32 represents all whole numbers up to it
-_FASTEST = 40.0  # m/s, above any car's speed; slow enough that no car skips a lane in a control period
-
 
 @leaf
 def set_pose(network, car):
@@ -167,39 +164,3 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
     else:
         worlds[:, :, LANE] = -1.0
     return worlds
-
-
-def check_worlds(worlds: np.ndarray, network: Network | None = None) -> None:
-    """Check traffic [..., FIELDS], because kernels index by it without bounds checks.
-
-    Absent cars (LANE is -1) may have any finite numbers. Without a network, lanes and metres along them have no upper
-    bound.
-    Raises: ValueError with one line if it is invalid.
-    """
-    if not np.isfinite(worlds).all():
-        raise ValueError("traffic must be finite numbers")
-    cars = worlds[worlds[..., LANE] != -1.0].astype(np.float64)
-    if not len(cars):
-        return
-    lanes = _MOST if network is None else len(network.steps)
-    if not lanes:
-        raise ValueError("there are no lanes for traffic on this map")
-    lowest = np.array([0, 0, 0, -1, -1, 0, 0])
-    highest = np.array([*[lanes - 1] * 5, _MOST, _MOST])
-    whole = cars[:, [LANE, NEXT, SECOND_NEXT, JUNCTION_BEHIND, PERMIT, SEED, DRAWS]]
-    k, field = np.nonzero((whole < lowest) | (whole > highest) | (whole % 1.0 != 0.0))
-    if len(k):
-        name = ("LANE", "NEXT", "SECOND_NEXT", "JUNCTION_BEHIND", "PERMIT", "SEED", "DRAWS")[field[0]]
-        wanted = f"a whole number from {lowest[field[0]]} to {highest[field[0]]}"
-        raise ValueError(f"traffic's {name} must be {wanted}, not {whole[k[0], field[0]]:g}")
-    length = np.full(len(cars), np.inf)
-    if network is not None:
-        lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
-        length = lengths[whole[:, 0].astype(np.intp)]
-    for name, column, most in (
-        ("ALONG (m)", cars[:, ALONG], length + 1e-3),  # float32 may round up
-        ("SPEED (m/s)", cars[:, SPEED], np.full(len(cars), _FASTEST)),
-    ):
-        wrong = (column < 0.0) | (column > most)
-        if wrong.any():
-            raise ValueError(f"traffic's {name} must be from 0 to {most[wrong][0]:g}, not {column[wrong][0]:g}")

@@ -7,7 +7,6 @@ from. Replaying its actions gives the same poses, bit for bit.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import math
 import os
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import numpy as np
 
 from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.car.vehicle import Action
-from gridsim.config import SimConfig
+from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -70,15 +69,10 @@ class Drive:
         return len(self.actions)
 
 
-def without_idle_limit(config: SimConfig | None = None) -> SimConfig:
-    """The configuration for manual driving: standing still does not end an episode."""
-    config = config or SimConfig()
-    return dataclasses.replace(config, episode=dataclasses.replace(config.episode, patience=_ENDLESS))
-
-
-def _simulator(road_map: Map, config: SimConfig | None, traffic: int) -> Simulator:
+def manual(road_map: Map, traffic: int = 0) -> Simulator:
     """A simulator of one car in traffic, whose episode ends only with a collision."""
-    return Simulator([road_map], 1, without_idle_limit(config), target=math.inf, max_steps=_ENDLESS, traffic=traffic)
+    config = SimConfig(episode=EpisodeConfig(patience=_ENDLESS))
+    return Simulator([road_map], 1, config, target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
 def _key(road_map: Map, episode: int) -> int:
@@ -203,14 +197,14 @@ def _number(column: str, text: str) -> float:
     return value
 
 
-def replay(drive: Drive, road_map: Map, config: SimConfig | None = None) -> tuple[np.ndarray, ...]:
+def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     """Replay a recorded drive by its actions.
 
     Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
     traffic float32 [n, others, world.FIELDS]).
     Raises: DriveError with one line if an episode ends too early, which means that the map is another one.
     """
-    simulator = _simulator(road_map, config, drive.traffic)
+    simulator = manual(road_map, drive.traffic)
     n = len(drive)
     begins = np.diff(drive.episodes, prepend=-1) != 0
     rows = []
@@ -237,7 +231,6 @@ def drive(
     window: Window,
     renderer: Renderer,
     recorder: Recorder | None = None,
-    config: SimConfig | None = None,
     seconds: float = math.inf,
     traffic: int = 0,
 ) -> dict[str, float]:
@@ -247,7 +240,7 @@ def drive(
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
     Raises: DriveError with one line if the recording cannot be written.
     """
-    simulator = _simulator(road_map, config, traffic)
+    simulator = manual(road_map, traffic)
     period = simulator.config.episode.control_period
     pictures = max(1, round(period * FPS))
     start = np.asarray(start, dtype=np.float32)

@@ -2,8 +2,7 @@
 
 Each pixel of the ground is coloured by the road's clearance there, so that edges are smooth at any scale and rotation,
 and a torus has no seam. Everything else but text is rounded boxes (lane marks, cars, rays and their dots, the path),
-blended by the share of a pixel that they cover. None of this needs a display; pygame draws the text and opens the
-window.
+blended by the share of a pixel that they cover. None of this needs a display; pygame opens the window.
 """
 
 from __future__ import annotations
@@ -13,25 +12,23 @@ import os
 import sys
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from gridsim.car.ego import COS, SIN, STEERING, X, Y
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
+from gridsim.sensing.grid import CELL
 from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
 
-if TYPE_CHECKING:
-    import pygame
-
 METRES = 52.0  # m, height of a picture
 CAR_AT = 0.74  # height of the car in a picture, as a share from the top
-GRID_CELL = 0.5  # m, of the occupancy grid
 
 
 class NoDisplayError(GridSimError):
@@ -47,12 +44,10 @@ class Renderer:
         self.road_map, self.size = road_map, size
         self.config = config or SimConfig()
         self._constants = constants(self.config)
-        road = road_map.road
-        self._road = paint.smoothed(road)
-        self._world = np.array([road.width, road.height], dtype=np.float64)
+        self._road = paint.smoothed(road_map.road)
         self.pixels_per_m = height / METRES
         self._anchor = np.array([width / 2, height * CAR_AT])
-        self._centre, self._up = self._world / 2, np.array([0.0, 1.0])
+        self._centre, self._up = road_map.size / 2, np.array([0.0, 1.0])
         self._marks = lane_marks(road_map)
         self._parked = road_map.strips.blocks
         vehicle, k = self.config.vehicle, self._constants
@@ -64,9 +59,7 @@ class Renderer:
 
         On a torus, the copy of a point that is nearest to the view's centre.
         """
-        offset = np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre
-        if self.road_map.torus:
-            offset -= np.round(offset / self._world) * self._world
+        offset = self.road_map.shortest(np.asarray(points, dtype=np.float64).reshape(-1, 2) - self._centre)
         return self._anchor + self._turn(offset) * self.pixels_per_m
 
     def _turn(self, vectors: np.ndarray) -> np.ndarray:
@@ -207,8 +200,8 @@ class Renderer:
 
     def _grid_shapes(self, position: np.ndarray, heading: np.ndarray, grid: np.ndarray) -> np.ndarray:
         row, column = np.divmod(np.arange(grid.size), grid.shape[1])
-        ahead = (grid.shape[0] - row - 0.5) * GRID_CELL + float(self._constants.front_axle)
-        left = (grid.shape[1] / 2 - column - 0.5) * GRID_CELL
+        ahead = (grid.shape[0] - row - 0.5) * CELL + float(self._constants.front_axle)
+        left = (grid.shape[1] / 2 - column - 0.5) * CELL
         side = np.array([-heading[1], heading[0]])
         away = self._turn(ahead[:, None] * heading + left[:, None] * side)
         kind = np.searchsorted([0, 127, 255], grid.ravel())
@@ -222,43 +215,21 @@ class Renderer:
     def _write(self, image: np.ndarray, text: str, corner: str) -> None:
         """Write a line of text on a dark pill into a corner."""
         height = self.size[1]
-        glyphs = _glyphs(text, max(11, round(height / 28)))
-        glyphs = glyphs[:, : max(1, self.size[0] - height // 12)]
-        h, w = glyphs.shape
-        edge, inner = height // 40, h // 2
-        x = edge + inner
-        y = edge + inner // 2 if corner == "upper" else height - edge - h - inner // 2
-        pill = np.array(
-            [[x + w / 2 - 0.5, y + h / 2 - 0.5, 1, 0, w / 2 + inner, h / 2 + inner / 2, h / 2, *paint.HUD, 0.72]],
-            np.float32,
-        )
-        paint.draw_shapes(freeze(pill), image)
-        under = image[y : y + h, x : x + w]
-        cover = glyphs[: under.shape[0], : under.shape[1], None].astype(np.uint16)
-        under[:] = (under * (255 - cover) + 245 * cover) // 255
-
-
-def _pygame() -> Any:
-    """pygame, imported without its banner."""
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    import pygame
-
-    return pygame
+        edge, inner = height // 40, height // 56
+        at = (edge + inner, edge + inner // 2 if corner == "upper" else height - edge - inner // 2)
+        anchor, font = "la" if corner == "upper" else "ld", _font(max(11, round(height / 28)))
+        picture = Image.fromarray(image)
+        pen = ImageDraw.Draw(picture, "RGBA")
+        left, top, right, bottom = pen.textbbox(at, text, font, anchor)
+        pill = (left - inner, top - inner / 2, right + inner, bottom + inner / 2)
+        pen.rounded_rectangle(pill, inner, (*paint.HUD, 184))
+        pen.text(at, text, (245, 245, 245), font, anchor)
+        image[:] = picture
 
 
 @cache
-def _font(pixels: int) -> pygame.font.Font:
-    pygame = _pygame()
-    pygame.font.init()
-    return pygame.font.Font(None, round(pixels * 1.5))
-
-
-def _glyphs(text: str, pixels: int) -> np.ndarray:
-    """Coverage uint8 [h, w] of a line of text."""
-    pygame = _pygame()
-    surface = _font(pixels).render(text, True, (255, 255, 255))
-    rgba = np.frombuffer(pygame.image.tobytes(surface, "RGBA"), dtype=np.uint8)
-    return rgba.reshape(surface.get_height(), surface.get_width(), 4)[:, :, 3]
+def _font(pixels: int) -> Any:
+    return ImageFont.load_default(pixels)
 
 
 def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Map) -> np.ndarray:
@@ -266,13 +237,11 @@ def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Ma
 
     Args: part in [0, 1] of the way from `before` to `after`, across the torus's edge if that is shorter.
     """
-    size = np.array([road_map.road.width, road_map.road.height], dtype=np.float64)
     gap = np.asarray(after, dtype=np.float64) - before
-    if road_map.torus:
-        gap[..., :2] -= np.round(gap[..., :2] / size) * size
+    gap[..., :2] = road_map.shortest(gap[..., :2])
     state = before + part * gap
     if road_map.torus:
-        state[..., :2] = np.mod(state[..., :2], size)
+        state[..., :2] = np.mod(state[..., :2], road_map.size)
     state[..., COS : SIN + 1] /= np.maximum(np.hypot(state[..., COS], state[..., SIN]), 1e-9)[..., None]
     return state.astype(np.float32)
 
@@ -282,7 +251,10 @@ class Window:
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
         """Open it. Raises: NoDisplayError with one line that says what to do."""
-        pygame = self._pygame = _pygame()
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame
+
+        self._pygame: Any = pygame
         chosen, wayland = os.environ.get("SDL_VIDEODRIVER"), os.environ.get("WAYLAND_DISPLAY")
         try:
             # SDL would also try drivers that need no display: they show nothing, and some print errors to stderr.

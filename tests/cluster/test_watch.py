@@ -22,10 +22,9 @@ from cluster.runs.settings import EvolveSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import Recorder, poses_of, without_idle_limit
+from gridsim.view.drive import Recorder, manual, poses_of
 from gridsim.view.render import Renderer
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
@@ -128,7 +127,7 @@ def test_watch_writes_films(tmp_path, monkeypatch, capsys):
 def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     scenario = build("seamless", 3)
-    simulator = Simulator([scenario], 1, without_idle_limit())
+    simulator = manual(scenario)
     start = sample_starts(scenario, 1, np.random.default_rng(1))[0]
     with Recorder(tmp_path / "drive.csv", scenario, 0.1) as recorder:
         for episode, steps in enumerate((16, 11)):

@@ -16,7 +16,6 @@ from commands import call
 from cluster.commands.watch import drive_main
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.view.drive import (
@@ -24,10 +23,10 @@ from gridsim.view.drive import (
     DriveError,
     Recorder,
     action_for,
+    manual,
     poses_of,
     read_drive,
     replay,
-    without_idle_limit,
 )
 
 COMMAND = [sys.executable, "-c", "from cluster.commands.entry import drive_main; drive_main()"]
@@ -44,7 +43,7 @@ def recorded(scenario, tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "drive.csv"
     rng = np.random.default_rng(0)
     start = sample_starts(scenario, 1, rng)[0]
-    simulator = Simulator([scenario], 1, without_idle_limit())
+    simulator = manual(scenario)
     poses = []
     with Recorder(path, scenario, 0.1) as recorder:
         for episode in range(2):

@@ -24,8 +24,9 @@ from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.sensing import grid
 
-KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing._reward, grid._fill_grids]
-KERNELS += [grid._push_frames, episodes._draw, map._starts_at]
+F = np.float32
+KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing.rewards_of, grid._fill_grids]
+KERNELS += [episodes._draw, map._starts_at]
 
 
 # --- pictures

@@ -31,6 +31,16 @@ ROUND = 215.0  # m, of the shortest loop: more than the 200 m within which groun
 MEMORY = 8 * 2**20  # bytes of a map
 
 
+def lane(lanes, i):
+    """Points [n, 2] of lane i."""
+    return lanes.points[lanes.offsets[i] : lanes.offsets[i + 1]]
+
+
+def lengths(lanes):
+    """Of each lane, m."""
+    return lanes.steps * (np.diff(lanes.offsets) - 1)
+
+
 def lay(name, seed):
     strips, lanes, width, height = REGISTRY[name].layout(np.random.default_rng(seed))
     return SimpleNamespace(strips=strips, lanes=lanes, sides=np.array([width, height]))
@@ -72,7 +82,7 @@ def test_every_lane_goes_on_where_it_ends(laid):
     for m in laid:
         lanes = m.lanes
         assert (lanes.successors[:, 0] >= 0).all()
-        points = [lanes.lane(i).astype(float) for i in range(len(lanes))]
+        points = [lane(lanes, i).astype(float) for i in range(len(lanes))]
         angles = [headings(p) for p in points]
         for i in range(len(lanes)):
             following = lanes.successors[i][lanes.successors[i] >= 0].tolist()
@@ -97,7 +107,7 @@ def test_points_are_equally_spaced(laid):
         lanes = m.lanes
         assert lanes.steps.max() <= LANE_STEP * (1 + 1e-6)
         for i in range(len(lanes)):
-            chord = np.linalg.norm(np.diff(lanes.lane(i).astype(float), axis=0), axis=1)
+            chord = np.linalg.norm(np.diff(lane(lanes, i).astype(float), axis=0), axis=1)
             assert chord.max() <= lanes.steps[i] + 2e-4  # points are float32, up to 1 km from the origin
             # A chord of an arc of 6 m or more falls short of it by 1 / (24 * 36) at most.
             assert chord.min() >= lanes.steps[i] * (1 - 1.2e-3) - 2e-4
@@ -112,7 +122,7 @@ def test_neighbours_are_each_others(name, laid):
         beside_another = (lanes.left >= 0) | (lanes.right >= 0)
         assert beside_another.all() if name == "highway" else not beside_another.any()
         for i in np.flatnonzero(lanes.left >= 0):
-            mine, its = lanes.lane(i).astype(float), lanes.lane(lanes.left[i]).astype(float)
+            mine, its = lane(lanes, i).astype(float), lane(lanes, lanes.left[i]).astype(float)
             assert mine.shape == its.shape
             angle = headings(mine)
             to_left = 3.75 * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
@@ -132,7 +142,7 @@ def test_crossings_are_the_lanes_that_come_close(name, laid):
     for m in laid[:2]:
         lanes = m.lanes
         crossings = np.split(lanes.crossings, lanes.crossing_offsets[1:-1])
-        points = [lanes.lane(i).astype(float) for i in range(len(lanes))]
+        points = [lane(lanes, i).astype(float) for i in range(len(lanes))]
         middle = np.array([p[len(p) // 2] for p in points])
         size = np.array([np.linalg.norm(p - c, axis=1).max() for p, c in zip(points, middle, strict=True)])
         for i in range(len(lanes)):
@@ -156,7 +166,7 @@ def test_crossings_are_the_lanes_that_come_close(name, laid):
 def lane_graph(lanes):
     one, k = np.nonzero(lanes.successors >= 0)
     other = lanes.successors[one, k]
-    return csr_array((lanes.lengths[one], (one, other)), shape=(len(lanes), len(lanes)))
+    return csr_array((lengths(lanes)[one], (one, other)), shape=(len(lanes), len(lanes)))
 
 
 def test_no_loop_is_so_short_that_driving_it_counts_nothing(laid):
@@ -164,7 +174,7 @@ def test_no_loop_is_so_short_that_driving_it_counts_nothing(laid):
         graph = lane_graph(m.lanes)
         reach = dijkstra(graph, limit=1.5 * ROUND)  # from a lane's beginning to another's
         one, other = graph.nonzero()
-        loops = m.lanes.lengths[one] + reach[other, one]
+        loops = lengths(m.lanes)[one] + reach[other, one]
         assert loops.min() >= ROUND
 
 
@@ -175,7 +185,7 @@ def test_a_car_on_rails_touches_nothing(laid):
     """A car of 4 m x 2 m, its middle on the centre line, heading along it: its outline stays on the exact road."""
     for m in laid[:4]:
         exact = oracle.ExactRoad(m.strips, *m.sides)
-        poses = [np.column_stack([p, headings(p)]) for p in map(m.lanes.lane, range(len(m.lanes)))]
+        poses = [np.column_stack([p, headings(p)]) for p in (lane(m.lanes, i) for i in range(len(m.lanes)))]
         assert exact.outline_on_road(np.concatenate(poses), 2.0, 1.0).all()
 
 
@@ -285,7 +295,7 @@ def test_the_highway_goes_round_and_bends_easily():
         assert len(set(np.sign(m.strips.arcs[:, 4]))) == 2
         assert set(m.strips.lines[:, 4]) | set(m.strips.arcs[:, 5]) == {8.0}
         # Round the torus once, each of the lanes: a little more than its width.
-        of = m.lanes.lengths.astype(float).reshape(-1, highway.LANE_COUNT).sum(axis=0)
+        of = lengths(m.lanes).astype(float).reshape(-1, highway.LANE_COUNT).sum(axis=0)
         assert of.min() > highway.WIDTH
         assert of.max() < 1.06 * highway.WIDTH
 
@@ -294,7 +304,7 @@ def test_curved_loops_wind_both_ways_and_keep_apart():
     for seed in range(40):
         m = lay("curved", seed)
         n = len(m.lanes) // 2
-        assert m.lanes.lengths[:n].sum() >= 450.0 - 2 * math.pi * 1.75
+        assert lengths(m.lanes)[:n].sum() >= 450.0 - 2 * math.pi * 1.75
         sweeps = m.strips.arcs[:, 4]
         assert min((sweeps > 0.3).sum(), (sweeps < -0.3).sum()) >= 2
         assert abs(sweeps.sum()) == pytest.approx(2 * math.pi)  # a simple closed curve
@@ -316,7 +326,7 @@ def test_roundabouts_are_many_and_nothing_else_is_a_junction():
         assert len(rings) >= FEWEST_ROUNDABOUTS
         for i in np.flatnonzero((m.lanes.successors >= 0).sum(axis=1) > 1):
             for j in m.lanes.successors[i][m.lanes.successors[i] >= 0]:
-                away = wrapped(m.lanes.lane(j).mean(axis=0) - rings[:, :2], m.sides)
+                away = wrapped(lane(m.lanes, j).mean(axis=0) - rings[:, :2], m.sides)
                 assert np.linalg.norm(away, axis=1).min() < 16.0
 
 

@@ -32,7 +32,7 @@ def test_lanes_keep_to_the_right(laid):
     """On a tile's edge a lane enters and leaves half a lane's width to the right of the road's centre line."""
     for _, lanes, _, _ in laid[:10]:
         for i in range(len(lanes)):
-            points = lanes.lane(i).astype(float)
+            points = lanes.points[lanes.offsets[i] : lanes.offsets[i + 1]].astype(float)
             for point, (dx, dy) in ((points[0], points[1] - points[0]), (points[-1], points[-1] - points[-2])):
                 angle = round(math.atan2(dy, dx) / (math.pi / 2)) * math.pi / 2
                 middle = (np.floor(point / TILE + 1e-6) + 0.5) * TILE

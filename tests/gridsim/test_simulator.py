@@ -22,11 +22,11 @@ from gridsim.car.ego import (
     End,
     X,
     Y,
-    drive,
+    control,
     look,
     place,
 )
-from gridsim.car.vehicle import Action
+from gridsim.car.vehicle import Action, act
 from gridsim.config import EpisodeConfig, SimConfig, constants
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
@@ -67,12 +67,9 @@ def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
     while end == 0:
         look(road, k, RAYS, car, None, beams, ranges, None)
         actions.append(int(choose(len(actions), ranges, car)))
-        end = drive(road, k, car, visits, None, actions[-1])
+        pedal, wheel = map(F, act(k, actions[-1], car[SPEED], car[STEERING]))
+        end = control(road, k, car, visits, None, pedal, wheel, F(target), max_steps)
         states.append(car.copy())
-        if end == 0 and car[DISTANCE] >= target:
-            end = End.SUCCESS
-        elif end == 0 and len(actions) >= max_steps:
-            end = End.TIME
     return Run(start, np.array(actions), np.array(states), End(end).name)
 
 
