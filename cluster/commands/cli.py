@@ -187,7 +187,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     if run.saved and is_finished(run):
         sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
         sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
-        console.print(f"{run.path} is finished: {run.saved[1][step]} {step}s; {sent}.", soft_wrap=True)
+        more = "" if run.saved[1]["solved"] else " To go on beyond its end, resume it with a greater --car-steps."
+        console.print(f"{run.path} is finished: {run.saved[1][step]} {step}s; {sent}.{more}", soft_wrap=True)
         if unsent:
             print(f"{prog}: warning: {unsent}", file=sys.stderr)
         return 0
@@ -238,12 +239,13 @@ def _print_end(console: Console, session: Session) -> None:
     """The closing words of a finished run."""
     summary, name, path = session.summary, session.learning.step_name, session.run.path
     console.print(held_out_table("The champion on held-out drives", summary["held_out"]))
-    steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "the best so far"
+    steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "not solved yet"
     console.print(
-        f"{how} ({summary['validation_success_rate']:.0%} of validation) "
+        f"{how}: the champion succeeds in {summary['validation_success_rate']:.0%} of the validation drives, "
         f"after {steps}, {summary['car_steps'] / 1e6:,.1f} million car-steps, {summary['wall_s']:.0f} s\n"
         f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"
-        f"watch it: {command_path('gridsim-watch')} {short_path(path)}\n"
+        f"watch it: open {short_path(path / 'drive.html')} in a browser, or "
+        f"{command_path('gridsim-watch')} {short_path(path)}\n"
         f"compare: {session.tracker.where()}",
         soft_wrap=True,
     )

@@ -29,6 +29,13 @@ from gridsim.maps.scenarios import HELD_OUT_SEED
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
 MANY_WORKERS = 4  # a core; more give a warning
+# What tyro says of wrong flags, as patterns, and what the user reads.
+PLAIN = {
+    r"Error parsing (?=--)": "",
+    r"invalid literal for int\(\) with base 10: ('[^']*')": r"\1 is no whole number",
+    r"could not convert string to float: ('[^']*')": r"\1 is no number",
+    r"Missing from \S+: (\S+) ([^()]*) \(required\)": r"\1 is missing: \2",
+}
 
 # tyro wraps a field's docstring as a whole only where its lines are not indented.
 _constant = attrdoc.ast_get_constant_value
@@ -84,7 +91,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     printed = io.StringIO()
     # Without a terminal tyro draws no box and uses no colours: its error is read below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
-    with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
+    with _reader_may_leave(), contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
             return tyro.cli(kind, prog=prog, description=_about(kind), args=arguments, config=config, **given)
         except SystemExit as stop:
@@ -92,9 +99,23 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
                 raise
     # A title, what is wrong, and where to read more, with rules in between.
     parts = re.split(r"-{9,}", printed.getvalue())
-    reason = parts[1] if len(parts) > 1 else "cannot read these flags"
-    reason = re.sub(r"invalid literal for int\(\) with base 10: ('[^']*')", r"\1 is no whole number", reason)
+    reason = " ".join(parts[1].split()) if len(parts) > 1 else "cannot read these flags"
+    for words, plain in PLAIN.items():
+        reason = re.sub(words, plain, reason)
     fail(prog, reason, f"see {command_path(prog)} --help")
+
+
+@contextlib.contextmanager
+def _reader_may_leave() -> Iterator[None]:
+    """End quietly where the output's reader leaves first, as in `--help | head`."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
+        raise SystemExit(0) from None
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:

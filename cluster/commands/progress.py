@@ -96,7 +96,9 @@ class Progress(Line):
 
     def row(self, step: int, row: dict[str, float]) -> None:
         self._advance()
-        self.facts = f"success {row['validation/success_rate']:.0%}  ETA {self._eta(row['car_steps'])}"
+        self.facts = f"success {row['validation/success_rate']:.0%}"
+        if not self._learning.done():  # the champion is measured after the last step
+            self.facts += f"  ETA {self._eta(row['car_steps'])}"
         self.rest = self._text = f"{self._learning.describe(row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
         now = time.perf_counter()
         if not self.console.is_terminal and (now - self._printed > LINE_S or self._learning.done()):

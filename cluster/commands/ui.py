@@ -16,6 +16,7 @@ def main(port: str) -> None:
     address = f"http://127.0.0.1:{port}"
     try:
         socket.create_server(("127.0.0.1", int(port))).close()
+        print("starting MLflow's UI, which takes some seconds ...", flush=True)
         tables = run_tables(check_uri(DEFAULT_URI), address)
     except TrackingError as error:
         sys.exit(f"make ui: {error}")

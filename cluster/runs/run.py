@@ -139,6 +139,8 @@ def lock(path: Path) -> None:
 
 def open_run(folder: Path) -> RunFolder:
     """A run's folder to be resumed, locked, its checkpoint read and checked. Raises RunError, CheckpointError."""
+    if not folder.is_dir():
+        raise RunError(f"{folder}: no such folder")
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
     lock(folder.resolve())

@@ -174,6 +174,7 @@ WRONG = [
     ("--output /proc/nowhere", "--output"),
     ("--name ../up", "--name"),
     ("--resume .", "no run's folder"),
+    ("--resume nowhere", "nowhere: no such folder"),
     ("--config /etc/hostname", "config.json"),
     ("--init nothing.npz", "nothing.npz: no such file"),
     ("--traffic 100000", "--traffic must be 0 to 100"),

@@ -2,10 +2,12 @@
 
 import os
 import shlex
+import subprocess
 import sys
 from importlib.metadata import entry_points, version
 
 import pytest
+from commands import BIN
 
 from cluster.commands import common as command
 from cluster.commands import entry, watch
@@ -55,6 +57,9 @@ def refused(prog, line, capsys):
         ("gridsim-watch", "--folow runs/x", "unrecognized --folow; did you mean --follow?"),
         ("gridsim-dqn", "--frobnicate", "unrecognized --frobnicate"),
         ("gridsim-evolve", "stray", "Unrecognized options: stray"),
+        ("gridsim-evolve", "--population 2.5", "--population: '2.5' is no whole number"),
+        ("gridsim-evolve", "--until soon", "--until: 'soon' is no number"),
+        ("gridsim-evaluate", "--json", "CHAMPION is missing: A champion.npz, or a run's folder."),
         (
             "gridsim-evolve",
             "--observation radar",
@@ -68,6 +73,15 @@ def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, te
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
     assert refused(prog, line, capsys) == [f"{prog}: error: {said}", f"see {prog} --help"]
+
+
+@pytest.mark.parametrize("prog", ["gridsim-evolve", "gridsim-drive"])  # more and less than a pipe's buffer holds
+def test_help_into_head_ends_quietly(prog):
+    with subprocess.Popen([BIN / prog, "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as shown:
+        assert shown.stdout
+        assert shown.stderr
+        shown.stdout.close()
+        assert (shown.stderr.read(), shown.wait()) == ("", 0)
 
 
 def test_the_other_form_of_a_switch_is_known(capsys):

@@ -81,6 +81,15 @@ def test_there_is_no_eta_before_it_means_something(monkeypatch):
     assert "\n12.3/30 M car-steps  success 37%  ETA -:--  240 generations" in console.file.getvalue()
 
 
+def test_there_is_no_eta_after_the_last_step(monkeypatch):
+    learner = learning((30.0, 30.0, "M car-steps"))
+    shown, _ = begun(learner, 80)
+    learner.done = lambda: True
+    shown.row(1, ROW)
+    shown.members("held out", 3, 64)
+    assert drawn(shown, 80).startswith("30.0/30 M car-steps  success 37%  ━")
+
+
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_comparison_shows_the_same(width):
     plan = Plan(("roundabout",), ("two-parents",), 3, budget="3700s")

@@ -167,7 +167,8 @@ def test_a_server_that_is_away_is_no_reason_to_fail(served):
     uri = f"http://127.0.0.1:{free_port()}"
     done = finish(COMMAND, "--resume", "runs/during", "--tracking-uri", uri, cwd=served.cwd)
     assert done.returncode == 0
-    assert f"is finished: {GENERATIONS} generations; nothing to do." in done.stdout
+    finished = f"is finished: {GENERATIONS} generations; nothing to do."
+    assert f"{finished} To go on beyond its end, resume it with a greater --car-steps." in done.stdout
     assert re.fullmatch(
         rf"{COMMAND}: warning: what MLflow lacks is not sent: no MLflow server at {uri}: [^\n]*\n", done.stderr
     )

@@ -1,0 +1,66 @@
+"""Every command of README.md's code blocks is run by a test: here with small arguments, or where `ELSEWHERE` says."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from commands import BIN
+
+SMALL = "--scenario curved --traffic 0 --workers 0 --population 16 --car-steps 3000"
+COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --workers 0 --output"
+
+# What is run here, in this order, and what is added to make it small; the last of equal flags counts.
+HERE = {
+    "make evolve": f"{SMALL} --name first",
+    'make dqn ARGS="--workers 2 --seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --workers 0 --name other",
+    ".venv/bin/gridsim-evolve --resume runs/<name>": "",
+    ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 60000000": "--car-steps 100000",
+    ".venv/bin/gridsim-evolve --config runs/<name>/config.json": "--name again",
+    ".venv/bin/gridsim-evolve --init runs/<name>": f"{SMALL} --name next",
+    ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",
+    "make compare ARGS=--quick": f"{COMPARISON} quick",
+    "make compare": f"{COMPARISON} whole",
+    ".venv/bin/gridsim-compare runs/<name> runs/<other>": "",
+    ".venv/bin/gridsim-watch runs/<name> --output drive.gif": "--size 160x90",
+    ".venv/bin/gridsim-watch runs/<name> runs/<other> --output drive.html": "",
+    ".venv/bin/gridsim-watch runs/<name> --generation 12": "--generation 0 --output elite.html",
+}
+ELSEWHERE = {
+    "make test": "tests/test_packaging.py::test_make_installs_the_test_tools_for_tests_alone",  # a dry run
+    "make ui": "tests/cluster/test_tracking_ui.py::test_the_link_leads_to_the_run_table_and_its_curves",
+    ".venv/bin/gridsim-watch runs/<name>": "tests/cluster/test_watch.py::test_window_is_shown_on_a_chosen_driver",
+    ".venv/bin/gridsim-watch runs/<name> --follow": "tests/cluster/test_watch.py::test_follow_takes_the_newest_elite",
+    ".venv/bin/gridsim-drive --scenario city --record drive.csv": "tests/gridsim/test_drive.py::test_real_keys_drive",
+    ".venv/bin/gridsim-watch drive.csv": "tests/cluster/test_watch.py::test_watch_shows_a_recorded_drive",
+    "ray start --head": "tests/conftest.py::node",
+    "ray start --address <first>:6379": "tests/conftest.py::node",
+    "gridsim-evolve --address auto": "tests/cluster/test_cluster.py::test_a_cable_out_for_20_s",
+}
+
+
+def commands(readme: str) -> set[str]:
+    """The lines of its shell blocks, without comments."""
+    lines = "\n".join(re.findall(r"```sh\n(.*?)```", readme, flags=re.DOTALL)).splitlines()
+    return {line.partition("#")[0].strip() for line in lines} - {""}
+
+
+def test_every_command_of_the_readme_is_run_by_a_test(root: Path) -> None:
+    assert commands((root / "README.md").read_text(encoding="utf-8")) == {*HERE, *ELSEWHERE}
+    for test in ELSEWHERE.values():
+        file, name = test.split("::")
+        assert re.search(rf"def {name}", (root / file).read_text(encoding="utf-8")), test
+
+
+@pytest.mark.e2e
+def test_the_commands_of_the_readme_run(root: Path, tmp_path: Path) -> None:
+    make = f"make -f {root}/Makefile -o {sys.prefix}/.installed VENV={sys.prefix} "
+    for command, small in HERE.items():
+        line = command.replace("<name>", "first").replace("<other>", "other").replace(".venv/bin", str(BIN))
+        if target := re.fullmatch(r'make (\w+)(?: ARGS="?(.*?)"?)?', line):
+            line = f'{make} {target[1]} ARGS="{target[2] or ""} {small}"'
+        else:
+            line = f"{line} {small}"
+        done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
