@@ -36,7 +36,7 @@ ELSEWHERE = {
     ".venv/bin/gridsim-watch drive.csv": "tests/cluster/test_watch.py::test_watch_shows_a_recorded_drive",
     "ray start --head": "tests/conftest.py::node",
     "ray start --address <first>:6379": "tests/conftest.py::node",
-    "gridsim-evolve --address auto": "tests/cluster/test_cluster.py::test_a_cable_out_for_20_s",
+    "gridsim-evolve --address auto": "tests/cluster/test_cluster.py::test_a_cable_out_for_10_s",
 }
 
 

@@ -22,6 +22,7 @@ from cluster.commands.common import (
     RoadFlags,
     UsageError,
     WorkFlags,
+    as_flag,
     check_unchanged,
     command_path,
     fail,
@@ -187,7 +188,9 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     if run.saved and is_finished(run):
         sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
         sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
-        more = "" if run.saved[1]["solved"] else " To go on beyond its end, resume it with a greater --car-steps."
+        bounds = [as_flag(name) for name in run.settings.unbound if getattr(run.settings, name)]
+        more = f" To go on beyond its end, resume it with a greater {' or '.join(bounds)}."
+        more = more if bounds and not run.saved[1]["solved"] else ""
         console.print(f"{run.path} is finished: {run.saved[1][step]} {step}s; {sent}.{more}", soft_wrap=True)
         if unsent:
             print(f"{prog}: warning: {unsent}", file=sys.stderr)
