@@ -1,7 +1,7 @@
 """The generation loop of the searches: ask, evaluate, tell, in one call of the pool a generation.
 
-Beside the members, the leader (the best genome known before the generation) drives longer episodes of its own, and the
-candidate for champion drives the validation episodes.
+Beside the members, the leader (the best genome known before the generation) drives longer episodes of its own, and
+where it does well, as a candidate for champion, the validation episodes.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ class Evolution(Learning):
         """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
         self.outcomes.clear()
         curriculum, limits, period = self.curriculum, self.curriculum.limits(), self.sim.episode.control_period
-        leader, candidate = self.search.leader(), self.candidate() if self._promising() else None
+        leader = self.search.leader()
+        candidate = leader if self._promising() else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.generation)
         n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
         goals = targets(episodes.rows, limits)[:e]  # of any group
@@ -127,7 +128,7 @@ class Evolution(Learning):
         return row
 
     def candidate(self) -> np.ndarray | None:
-        return self.search.candidate()
+        return self.search.leader()
 
     def _promising(self) -> bool:
         """Whether to validate the candidate: the leader does well, and validation has not had more than its share."""

@@ -70,11 +70,9 @@ class Search(ABC):
 
     @abstractmethod
     def leader(self) -> np.ndarray | None:
-        """The best genome known before a generation, float32 [genes]; None before the first."""
-
-    @abstractmethod
-    def candidate(self) -> np.ndarray | None:
-        """The candidate for champion after a generation, float32 [genes]; None before the first."""
+        """The best genome known before a generation, float32 [genes], also the candidate for champion; None before the
+        first generation.
+        """
 
     @abstractmethod
     def state(self) -> tuple[Arrays, dict[str, float]]:

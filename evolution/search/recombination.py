@@ -68,9 +68,7 @@ class Recombination(Search):
         self.champion = champion
 
     def leader(self) -> np.ndarray | None:
-        return self.centre.astype(np.float32) if len(self.centre) else None
-
-    def candidate(self) -> np.ndarray | None:
+        """The average of centres, which drives better than any one of them."""
         return self.average.astype(np.float32) if len(self.average) else None
 
     def steps(self) -> np.ndarray:

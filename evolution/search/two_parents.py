@@ -30,9 +30,6 @@ class TwoParents(Search):
     def leader(self) -> np.ndarray | None:
         return self.parents[0] if len(self.parents) else None
 
-    def candidate(self) -> np.ndarray | None:
-        return self.leader()
-
     def _ask(self, key: int) -> Generation:
         config, rng = self.config, self._rng(1)
         n, pool = config.population, np.arange(self.elites, len(self.parents))
