@@ -1,16 +1,11 @@
-"""How a process that held a RayPool ends, and the addresses of clusters that it is given."""
+"""The addresses of clusters that a RayPool is given."""
 
 import http.server
-import os
 import socket
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
-from commands import importable
 from test_pool import never_built
 
 from cluster.workers.pool import PoolError
@@ -18,26 +13,6 @@ from cluster.workers.ray_pool import RayPool
 from cluster.workers.ray_session import check_address
 
 pytestmark = pytest.mark.e2e
-
-# What C++ does as the process ends aborts it, as destructors may whose objects Ray's threads still use.
-ABORTING = """
-import ctypes
-from cluster.workers.ray_pool import RayPool
-from test_pool import Answering, make_recipes, make_task, never_built
-libc = ctypes.CDLL(None)
-libc.__cxa_atexit(ctypes.cast(libc.abort, ctypes.c_void_p), None, None)
-pool = RayPool(1, never_built, worker_factory=Answering)
-pool.evaluate(make_task(), make_recipes(8))
-pool.close()
-"""
-
-
-def test_a_process_that_held_a_pool_ends_well_and_says_nothing(root: Path) -> None:
-    path = os.pathsep.join([str(root), importable(__file__)])
-    done = subprocess.run(
-        [sys.executable, "-c", ABORTING], env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @pytest.mark.parametrize("address", ["nowhere", "host:0", "host:99999", ":6379", "ray://127.0.0.1:10001", "a/b:1"])
