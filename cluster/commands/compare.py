@@ -35,6 +35,7 @@ from cluster.commands.common import (
 )
 from cluster.commands.progress import Line, clock, progress_of
 from cluster.comparison import tables
+from cluster.comparison.page import page
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run, series_of
 from cluster.report import pictures
@@ -50,6 +51,7 @@ from gridsim.view.drive import read_drive
 
 PROG = "gridsim-compare"
 TABLE, ROWS, PICTURE, ROUTE = "table.md", "table.csv", "comparison.png", "route.png"
+REPORT = "comparison.html"
 ROUTE_M = 400.0  # m of the seamless route that are drawn
 
 
@@ -57,8 +59,9 @@ ROUTE_M = 400.0  # m of the seamless route that are drawn
 class CompareFlags(WorkFlags, Plan):
     """Compare learners: the same car on the same roads, each learner with the same budget, over several seeds.
 
-    Trains every learner on every scenario with every seed, then writes table.md, table.csv and two pictures. A run's
-    folder is kept for each, and what is finished is never done again. With RUNS, folders of runs (or of comparisons)
+    Trains every learner on every scenario with every seed, then writes comparison.html, which shows tables and
+    pictures and plays each champion's drive; also table.md and table.csv. A run's folder is kept for each, and what is
+    finished is never done again. With RUNS, folders of runs (or of comparisons)
     that are there, it trains nothing and compares these.
     """
 
@@ -202,7 +205,7 @@ class Results:
         checkpoint.write_atomic(self.path / ROWS, tables.table_csv(groups, self.path), durable=False)
 
     def write(self) -> None:
-        """Write tables and pictures."""
+        """Write tables, pictures and the page."""
         self.write_tables()
         groups = self.groups
         pictures.comparison(groups, self.path / PICTURE)
@@ -216,10 +219,12 @@ class Results:
         if drives:
             missing = [name for learner, name in tables.NAMES.items() if learner in on_seamless.keys() - drives]
             pictures.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, missing)
+        shown = [path for path in (self.path / PICTURE, self.path / ROUTE) if path.is_file()]
+        checkpoint.write_atomic(self.path / REPORT, page(self.path, groups, self.plan, shown))
 
     def files(self) -> list[Path]:
         """Those that exist."""
-        names = (COMPARISON, TABLE, ROWS, PICTURE, ROUTE)
+        names = (COMPARISON, REPORT, TABLE, ROWS, PICTURE, ROUTE)
         return [self.path / name for name in names if (self.path / name).is_file()]
 
     def medians(self) -> dict[str, float]:
@@ -245,7 +250,7 @@ class Results:
                 table.add_row(*(cell.partition(" (")[0] for cell in row))
             console.print(table, "")
         console.print(tables.NOTES.replace(", quartiles in brackets", ""), highlight=False)
-        console.print(f"tables and pictures: {short_path(self.path)}/", soft_wrap=True)
+        console.print(f"tables, pictures and drives: {short_path(self.path / REPORT)}", soft_wrap=True)
 
 
 def _compare_finished(console: Console, flags: CompareFlags) -> int:

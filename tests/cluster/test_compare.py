@@ -95,7 +95,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     assert trained[4:] == ["seamless-evolution-s0", *names[4:]]
     assert run(monkeypatch, "--resume", "runs/c", "--workers", 0) == 0
     assert len(trained) == 9
-    assert {"table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
+    assert {"comparison.html", "table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
     assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
     assert run(monkeypatch, "runs/c", "--name", "again") == 0
     rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))

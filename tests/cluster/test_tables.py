@@ -1,6 +1,7 @@
 """Tables of a comparison: medians, what is missing; its pictures."""
 
 import csv
+import dataclasses
 import io
 import math
 from pathlib import Path
@@ -15,6 +16,7 @@ from rich.console import Console
 
 from cluster.commands.compare import Results
 from cluster.comparison import tables
+from cluster.comparison.page import page
 from cluster.comparison.plan import Plan
 from cluster.comparison.tables import spread
 from cluster.report import pictures
@@ -54,6 +56,21 @@ def test_tables_show_what_is_missing():
     rows = list(csv.DictReader(io.StringIO(tables.table_csv(groups, Path()).decode())))
     assert [row["velocity_error_percent"] for row in rows] == ["10.0", "20.0", "", "", "", "", "5.0", ""]
     assert [(row["learner"], row["seed"]) for row in rows[2:4]] == [("random", "0"), ("random", "1")]
+
+
+def test_the_page_links_to_the_drives_of_its_runs(tmp_path):
+    there, gone = (
+        dataclasses.replace(run("evolution", "curved", seed, 10.0), folder=tmp_path / f"a b<{seed}>") for seed in (0, 1)
+    )
+    there.folder.mkdir()
+    (there.folder / "drive.html").touch()
+    Image.new("RGB", (2, 2)).save(tmp_path / "shown.png")
+    folder = tmp_path / "<c>"
+    text = page(folder, tables.group([there, gone]), None, [tmp_path / "shown.png"]).decode()
+    assert '<td><a href="../a%20b%3C0%3E/drive.html">seed 0: 90%</a>, seed 1: 90%' in text
+    assert "<td>10.0 (10.0 to 10.0)" in text
+    assert 'src="data:image/png;base64,' in text
+    assert "<title>GridSim: &lt;c&gt;</title>" in text
 
 
 def test_runs_of_different_traffic_and_views_are_not_mixed():

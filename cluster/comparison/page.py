@@ -1,0 +1,57 @@
+"""A comparison's page: its tables and pictures in one HTML file, with a link to each run's drive."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from urllib.parse import quote
+
+from cluster.comparison.plan import Plan
+from cluster.comparison.results import Run
+from cluster.comparison.tables import DRIVING, ERRORS, NOTES, Group, introduction, table
+from cluster.runs.run import PAGE
+
+STYLE = """\
+body { font: 16px system-ui, sans-serif; margin: 2em auto; max-width: 75em; padding: 0 1em; color: #222 }
+table { border-collapse: collapse; margin: 1.5em 0 }
+th, td { border-bottom: 1px solid #ddd; padding: 0.3em 0.8em; text-align: right }
+th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
+img { max-width: 100% }"""
+
+
+def page(folder: Path, groups: Sequence[Group], plan: Plan | None, pictures: Sequence[Path]) -> bytes:
+    """The page, to be written into `folder`, to which its links are relative; pictures are part of it."""
+    title = f"GridSim: {escape(folder.name)}"
+    parts = [f"<h1>{title}</h1>", f"<p>{escape(introduction(plan))}</p>"]
+    for columns in (DRIVING, ERRORS):
+        head, *rows = [[escape(cell) for cell in row] for row in table(groups, columns)]
+        parts.append(_table(head, rows))
+    parts.append("<ul>" + "".join(f"<li>{escape(note[2:])}" for note in NOTES.splitlines()) + "</ul>")
+    drives = [
+        [escape(group.road), escape(group.name), ", ".join(_link(folder, run) for run in group.runs)]
+        for group in groups
+    ]
+    parts += ["<h2>Drives on a held-out map, by seed with their success</h2>", _table(["road", "learner", "runs"], drives)]
+    for picture in pictures:
+        data = base64.b64encode(picture.read_bytes()).decode()
+        parts.append(f'<p><img alt="{escape(picture.stem)}" src="data:image/png;base64,{data}"></p>')
+    head = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
+    return "\n".join([head, *parts, ""]).encode()
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells that are HTML."""
+    lines = ["".join(f"<th>{cell}" for cell in head), *("".join(f"<td>{cell}" for cell in row) for row in rows)]
+    return "<table>\n" + "\n".join(f"<tr>{line}" for line in lines) + "\n</table>"
+
+
+def _link(folder: Path, run: Run) -> str:
+    """A run's seed and success; a link to its drive where there is one."""
+    text = f"seed {run.settings.seed}: {run.figures['success_rate']:.0%}"
+    drive = run.folder / PAGE
+    if not drive.is_file():
+        return text
+    return f'<a href="{escape(quote(os.path.relpath(drive, folder)))}">{text}</a>'
