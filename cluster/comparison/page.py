@@ -34,7 +34,7 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, pictures: Seq
         [escape(group.road), escape(group.name), ", ".join(_link(folder, run) for run in group.runs)]
         for group in groups
     ]
-    parts += ["<h2>Drives on a held-out map, by seed with their success</h2>", _table(["road", "learner", "runs"], drives)]
+    parts += ["<h2>Drives on a held-out map</h2>", _table(["road", "learner", "runs"], drives)]
     for picture in pictures:
         data = base64.b64encode(picture.read_bytes()).decode()
         parts.append(f'<p><img alt="{escape(picture.stem)}" src="data:image/png;base64,{data}"></p>')
