@@ -38,8 +38,8 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, pictures: Seq
     for picture in pictures:
         data = base64.b64encode(picture.read_bytes()).decode()
         parts.append(f'<p><img alt="{escape(picture.stem)}" src="data:image/png;base64,{data}"></p>')
-    head = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
-    return "\n".join([head, *parts, ""]).encode()
+    top = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
+    return "\n".join([top, *parts, ""]).encode()
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
