@@ -37,7 +37,7 @@ from cluster.commands.common import (
 from cluster.commands.progress import Line, clock, progress_of
 from cluster.comparison import tables
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run, series_of
+from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run
 from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
@@ -49,15 +49,14 @@ from cluster.tracking.tracker import Tracker
 from gridsim.errors import GridSimError
 
 PROG = "gridsim-compare"
-TABLE, ROWS, PICTURE, ROUTE = "table.md", "table.csv", "comparison.png", "route.png"
-ROUTE_M = 400.0  # m of the seamless route that are drawn
+TABLE, ROWS, PICTURE = "table.md", "table.csv", "comparison.png"
 
 
 @dataclass(frozen=True)
 class CompareFlags(WorkFlags, Plan):
     """Compare learners: the same car on the same roads, each learner with the same budget, over several seeds.
 
-    Trains every learner on every scenario with every seed, then writes table.md, table.csv and two pictures. A run's
+    Trains every learner on every scenario with every seed, then writes table.md, table.csv and comparison.png. A run's
     folder is kept for each, and what is finished is never done again. With RUNS, folders of runs (or of comparisons)
     that are there, it trains nothing and compares these.
     """
@@ -122,7 +121,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 def _train_and_compare(
     console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str
 ) -> int:
-    """Train what is not finished, one run after the other on one pool of workers; write tables and pictures of all."""
+    """Train what is not finished, one run after the other on one pool of workers; write tables and a picture of all."""
     folder.write()
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
     tags = {"algorithm": "comparison"}
@@ -162,7 +161,7 @@ def _train_and_compare(
         workers.close()
     if results.runs:
         if not problem:
-            with console.status("writing tables and pictures"):
+            with console.status("writing tables and the picture"):
                 results.write()
         tracker.log_row(len(results.runs), {"runs_done": len(results.runs), **results.medians()})
         tracker.log_files(results.files())
@@ -203,24 +202,13 @@ class Results:
         checkpoint.write_atomic(self.path / ROWS, tables.table_csv(groups, self.path), durable=False)
 
     def write(self) -> None:
-        """Write tables and pictures."""
+        """Write tables and the picture."""
         self.write_tables()
-        groups = self.groups
-        pictures.comparison(groups, self.path / PICTURE)
-        on_seamless = {group.learner: group for group in groups if group.scenario == "seamless"}
-        drives = {}
-        for learner in ("evolution", "dqn"):
-            runs = on_seamless[learner].runs if learner in on_seamless else ()
-            found = [series[0] for run in runs if (series := series_of(run, 1))]
-            if found:
-                drives[learner] = found
-        if drives:
-            missing = [name for learner, name in tables.NAMES.items() if learner in on_seamless.keys() - drives]
-            pictures.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, missing)
+        pictures.comparison(self.groups, self.path / PICTURE)
 
     def files(self) -> list[Path]:
         """Those that exist."""
-        names = (COMPARISON, TABLE, ROWS, PICTURE, ROUTE)
+        names = (COMPARISON, TABLE, ROWS, PICTURE)
         return [self.path / name for name in names if (self.path / name).is_file()]
 
     def medians(self) -> dict[str, float]:
@@ -246,7 +234,7 @@ class Results:
                 table.add_row(*(cell.partition(" (")[0] for cell in row))
             console.print(table, "")
         console.print(tables.NOTES.replace(", quartiles in brackets", ""), highlight=False)
-        console.print(f"tables and pictures: {short_path(self.path)}/", soft_wrap=True)
+        console.print(f"tables and picture: {short_path(self.path)}/", soft_wrap=True)
 
 
 def _compare_finished(console: Console, flags: CompareFlags) -> int:
@@ -261,7 +249,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
         for k, run in enumerate(runs):
             shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
             results.add(run)
-        shown.update("writing tables and pictures")
+        shown.update("writing tables and the picture")
         results.path.mkdir(parents=True)
         results.write()
     results.show(console)
