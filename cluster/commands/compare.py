@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import tyro
 from rich.box import SIMPLE
@@ -37,7 +38,7 @@ from cluster.commands.progress import Line, clock, progress_of
 from cluster.comparison import tables
 from cluster.comparison.page import page
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run, series_of
+from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run
 from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
@@ -47,22 +48,19 @@ from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
 from gridsim.errors import GridSimError
-from gridsim.view.drive import read_drive
 
 PROG = "gridsim-compare"
-TABLE, ROWS, PICTURE, ROUTE = "table.md", "table.csv", "comparison.png", "route.png"
-REPORT = "comparison.html"
-ROUTE_M = 400.0  # m of the seamless route that are drawn
+REPORT, TABLE, ROWS, PICTURE = "comparison.html", "table.md", "table.csv", "comparison.png"
 
 
 @dataclass(frozen=True)
 class CompareFlags(WorkFlags, Plan):
     """Compare learners: the same car on the same roads, each learner with the same budget, over several seeds.
 
-    Trains every learner on every scenario with every seed, then writes comparison.html, which shows tables and
-    pictures and plays each champion's drive; also table.md and table.csv. A run's folder is kept for each, and what is
-    finished is never done again. With RUNS, folders of runs (or of comparisons)
-    that are there, it trains nothing and compares these.
+    Trains every learner on every scenario with every seed, then writes comparison.html: tables, a picture, and a link
+    to each champion's drive; also table.md, table.csv and comparison.png. A run's folder is kept for each, and what is
+    finished is never done again. With RUNS, folders of runs (or of comparisons) that are there, it trains nothing and
+    compares these.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]] = ()
@@ -74,10 +72,12 @@ class CompareFlags(WorkFlags, Plan):
     resume: str = ""
     """Folder of a comparison to continue; a larger --seeds adds to it."""
 
+    removed: ClassVar[dict[str, str]] = {"--reference": "errors are those against the reference driver; leave it out"}
+
 
 QUICK = CompareFlags(seeds=1, budget="10s")
 MAY_DIFFER = ("resume", "workers", "address", "patience", "tracking_uri", "experiment")  # in a resumed comparison
-WITH_RUNS = ("runs", "output", "name", "reference")  # flags for a comparison of finished runs
+WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
 
 
 def compare_main() -> None:
@@ -123,7 +123,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 def _train_and_compare(
     console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str
 ) -> int:
-    """Train what is not finished, one run after the other on one pool of workers; write tables and pictures of all."""
+    """Train what is not finished, one run after the other on one pool of workers; write tables and a picture of all."""
     folder.write()
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
     tags = {"algorithm": "comparison"}
@@ -163,7 +163,7 @@ def _train_and_compare(
         workers.close()
     if results.runs:
         if not problem:
-            with console.status("writing tables and pictures"):
+            with console.status("writing tables and the picture"):
                 results.write()
         tracker.log_row(len(results.runs), {"runs_done": len(results.runs), **results.medians()})
         tracker.log_files(results.files())
@@ -185,14 +185,13 @@ def _train_and_compare(
 class Results:
     """Finished runs with their errors, and the files that are made of them."""
 
-    def __init__(self, path: Path, plan: Plan | None = None, reference: str = ""):
+    def __init__(self, path: Path, plan: Plan | None = None):
         self.path, self.plan = path, plan
-        self.reference = plan.reference if plan else reference
         self.runs: list[Run] = []
 
     def add(self, run: Run) -> Run:
         """Add a run. Returns it with its errors. Raises GridSimError."""
-        self.runs.append(dataclasses.replace(run, figures={**run.figures, **errors_of(run, self.reference)}))
+        self.runs.append(dataclasses.replace(run, figures={**run.figures, **errors_of(run)}))
         return self.runs[-1]
 
     @property
@@ -205,26 +204,15 @@ class Results:
         checkpoint.write_atomic(self.path / ROWS, tables.table_csv(groups, self.path), durable=False)
 
     def write(self) -> None:
-        """Write tables, pictures and the page."""
+        """Write tables, the picture and the page."""
         self.write_tables()
         groups = self.groups
         pictures.comparison(groups, self.path / PICTURE)
-        on_seamless = {group.learner: group for group in groups if group.scenario == "seamless"}
-        drives = {}
-        for learner in ("evolution", "dqn"):
-            runs = on_seamless[learner].runs if learner in on_seamless else ()
-            found = [series[0] for run in runs if (series := series_of(run, self.reference, 1))]
-            if found:
-                drives[learner] = found
-        if drives:
-            missing = [name for learner, name in tables.NAMES.items() if learner in on_seamless.keys() - drives]
-            pictures.along_route(drives, tables.NAMES, ROUTE_M, self.path / ROUTE, missing)
-        shown = [path for path in (self.path / PICTURE, self.path / ROUTE) if path.is_file()]
-        checkpoint.write_atomic(self.path / REPORT, page(self.path, groups, self.plan, shown))
+        checkpoint.write_atomic(self.path / REPORT, page(self.path, groups, self.plan, self.path / PICTURE))
 
     def files(self) -> list[Path]:
         """Those that exist."""
-        names = (COMPARISON, REPORT, TABLE, ROWS, PICTURE, ROUTE)
+        names = (COMPARISON, REPORT, TABLE, ROWS, PICTURE)
         return [self.path / name for name in names if (self.path / name).is_file()]
 
     def medians(self) -> dict[str, float]:
@@ -250,7 +238,7 @@ class Results:
                 table.add_row(*(cell.partition(" (")[0] for cell in row))
             console.print(table, "")
         console.print(tables.NOTES.replace(", quartiles in brackets", ""), highlight=False)
-        console.print(f"tables, pictures and drives: {short_path(self.path / REPORT)}", soft_wrap=True)
+        console.print(f"tables, picture and drives: {short_path(self.path / REPORT)}", soft_wrap=True)
 
 
 def _compare_finished(console: Console, flags: CompareFlags) -> int:
@@ -259,15 +247,13 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     for f in dataclasses.fields(CompareFlags):
         if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(default, f.name):
             raise UsageError(f"{as_flag(f.name)}: runs that are there are compared as they are; leave it out")
-    if flags.reference:
-        read_drive(flags.reference)
     runs = read_runs([Path(name) for name in flags.runs])
-    results = Results(new_folder(Path(flags.output), flags.name, "comparison"), reference=flags.reference)
+    results = Results(new_folder(Path(flags.output), flags.name, "comparison"))
     with console.status("measuring errors") as shown:
         for k, run in enumerate(runs):
             shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
             results.add(run)
-        shown.update("writing tables and pictures")
+        shown.update("writing tables and the picture")
         results.path.mkdir(parents=True)
         results.write()
     results.show(console)

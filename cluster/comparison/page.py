@@ -1,4 +1,4 @@
-"""A comparison's page: its tables and pictures in one HTML file, with a link to each run's drive."""
+"""A comparison's page: its tables and picture in one HTML file, with a link to each run's drive."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
 img { max-width: 100% }"""
 
 
-def page(folder: Path, groups: Sequence[Group], plan: Plan | None, pictures: Sequence[Path]) -> bytes:
-    """The page, to be written into `folder`, to which its links are relative; pictures are part of it."""
+def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path) -> bytes:
+    """The page, to be written into `folder`, to which its links are relative; the picture is part of it."""
     title = f"GridSim: {escape(folder.name)}"
     parts = [f"<h1>{title}</h1>", f"<p>{escape(introduction(plan))}</p>"]
     for columns in (DRIVING, ERRORS):
@@ -35,9 +35,8 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, pictures: Seq
         for group in groups
     ]
     parts += ["<h2>Drives on a held-out map</h2>", _table(["road", "learner", "runs"], drives)]
-    for picture in pictures:
-        data = base64.b64encode(picture.read_bytes()).decode()
-        parts.append(f'<p><img alt="{escape(picture.stem)}" src="data:image/png;base64,{data}"></p>')
+    data = base64.b64encode(picture.read_bytes()).decode()
+    parts.append(f'<p><img alt="errors and training times" src="data:image/png;base64,{data}"></p>')
     top = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
     return "\n".join([top, *parts, ""]).encode()
 

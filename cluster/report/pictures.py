@@ -16,21 +16,20 @@ from gridsim.maps.roads import node_clearance
 
 if TYPE_CHECKING:
     from cluster.comparison.tables import Group
-    from gridsim.reference.errors import Series
 
 _BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL = "#4a4e57", "#e9efe6"
 _LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00", "random": "#868e96"}
 
 
-def _figure(width: float, height: float, columns: int = 1, rows: int = 1) -> tuple[Any, Any]:
-    """A figure that needs no display and no global state, and the axes of its columns, or of its rows."""
+def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
+    """A figure that needs no display and no global state, and the axes of its columns."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False, sharex=rows > 1).ravel()
+    return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
 def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
@@ -144,47 +143,6 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
         bars.values(), bars, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
         title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
     )  # fmt: skip
-    figure.savefig(Path(path), dpi=100)
-
-
-def along_route(
-    drives: Mapping[str, Sequence[Series]], names: Mapping[str, str], metres: float, path: str | os.PathLike[str],
-    missing: Sequence[str] = (),
-) -> None:  # fmt: skip
-    """Draw velocity and steering error along the seamless road to a PNG.
-
-    Args: for each learner its seeds' drives from the same start, the first one to be drawn as a line, all of them as a
-    band from the smallest to the largest error; what learners are called; how far along the route; the names of
-    learners that were compared there and have no drive.
-    """
-    title = "Errors along the seamless road, from the same start on a held-out map"
-    if max(len(found) for found in drives.values()) > 1:
-        title += "\nlines: the first seed; bands: all seeds; crosses: crashed"
-    if missing:
-        title += f"\nnot drawn: {', '.join(missing)}"
-    figure, axes = _figure(12.0, 6.2, rows=2)
-    for axis, name, unit in zip(axes, ("velocity_error", "steering_error"), ("m/s", "degrees"), strict=True):
-        axis.axhline(0.0, color="#212529", linewidth=1.2, label="reference", zorder=3)
-        for learner, found in drives.items():
-            colour = _LEARNERS[learner]
-            arc = np.arange(0.0, min(metres, max(float(series.arc[-1]) for series in found)), 0.5)
-            errors = np.array([np.interp(arc, each.arc, getattr(each, name), right=np.nan) for each in found])
-            there = np.isfinite(errors).any(axis=0)
-            if len(found) > 1:
-                low, high = np.nanmin(errors[:, there], axis=0), np.nanmax(errors[:, there], axis=0)
-                axis.fill_between(arc[there], low, high, color=colour, alpha=0.16, linewidth=0, zorder=1)
-            axis.plot(arc, errors[0], color=colour, linewidth=1.4, label=names[learner], zorder=4)
-            if found[0].arc[-1] < metres:
-                axis.plot(found[0].arc[-1], getattr(found[0], name)[-1], marker="X", color=colour, markersize=9,
-                          markeredgecolor="white", linestyle="", zorder=5)  # fmt: skip
-        axis.set_ylabel(f"{name.replace('_', ' ')}, {unit}")
-        axis.grid(alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0].set_title(title)
-    axes[0].set_xlim(0.0, metres)
-    axes[-1].set_xlabel("distance along the route, m")
-    lines, words = axes[0].get_legend_handles_labels()
-    figure.legend(lines, words, loc="outside lower center", ncols=len(words), frameon=False)
     figure.savefig(Path(path), dpi=100)
 
 

@@ -15,8 +15,8 @@ import pytest
 import tracked
 from commands import all_in_mlflow, call, descendants, duration_s, finish, rows, same_run, start, summary, wait_until
 
-from cluster.commands.cli import DqnFlags, EvolveFlags, dqn_main, evolve_main
-from cluster.commands.compare import compare_main
+from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, dqn_main, evaluate_main, evolve_main
+from cluster.commands.compare import CompareFlags, compare_main
 from cluster.comparison.plan import ComparisonFolder, Plan
 from cluster.runs.champion import Champion
 from cluster.runs.checkpoint import save
@@ -203,13 +203,18 @@ def test_wrong_use_is_one_clear_line(arguments, expected, monkeypatch, capsys, t
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
-@pytest.mark.parametrize(("flags", "main"), [(EvolveFlags, evolve_main), (DqnFlags, dqn_main)])
-@pytest.mark.parametrize("form", ["{} 3", "{}=3", "{} 3 --help", "--seed 1 {}=a=b"])
+@pytest.mark.parametrize(
+    ("flags", "main"),
+    [
+        (EvolveFlags, evolve_main), (DqnFlags, dqn_main), (EvaluateFlags, evaluate_main), (CompareFlags, compare_main),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("form", ["{} 3", "{}=3", "{} 3 --help", "--traffic 1 {}=a=b"])
 def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(
     form, flags, main, monkeypatch, capsys, tmp_path
 ):
     monkeypatch.chdir(tmp_path)
-    prog = "gridsim-evolve" if main is evolve_main else "gridsim-dqn"
+    prog = f"gridsim-{main.__name__.removesuffix('_main')}"
     for flag, instead in flags.removed.items():
         for spelling in (flag, "--" + flag[2:].replace("-", "_")):
             (line,) = said_by(monkeypatch, capsys, *form.format(spelling).split(), main=main, prog=prog)
