@@ -66,12 +66,10 @@ def train_dqn(
     return _train(settings or DqnSettings(**flags), workers, on_evaluation)
 
 
-def compare(*runs: str | os.PathLike[str], reference: str = "") -> list[dict[str, Any]]:
+def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
     """Compare finished runs, as `gridsim-compare RUNS` does: figures of each, and its errors against the reference.
 
-    Args:
-        runs: their folders; a comparison's folder stands for all of its finished runs.
-        reference: a drive that gridsim-drive recorded; "" is the reference driver.
+    Args: their folders; a comparison's folder stands for all of its finished runs.
 
     Returns: a row for each run: folder, scenario, learner, seed, traffic, and the figures as table.csv names them; nan
     where an error is not known.
@@ -83,7 +81,7 @@ def compare(*runs: str | os.PathLike[str], reference: str = "") -> list[dict[str
     names = ("scenario", "learner", "seed", "traffic")
     return [
         {"run": str(run.folder), **{name: getattr(run.settings, name) for name in names}}
-        | {**run.figures, **errors_of(run, reference)}
+        | {**run.figures, **errors_of(run)}
         for run in read_runs(map(Path, runs))
     ]
 

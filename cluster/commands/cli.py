@@ -113,8 +113,6 @@ class EvaluateFlags(RoadFlags):
     """How many; the default 64 are the held-out episodes of every run."""
     errors: bool = False
     """Also its velocity and steering errors against the reference driver."""
-    reference: str = ""
-    """A drive.csv of gridsim-drive: errors against that drive, on its map and in its traffic, in place of --errors."""
     json: bool = False
     """Print one JSON object and nothing else."""
 
@@ -266,9 +264,8 @@ def _evaluate() -> int:
     chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
     missed = None
     with wrong_use():
-        if flags.errors or flags.reference:  # first, as a wrong --reference is found at once
-            parts = series(champion, *chosen, flags.reference or None)
-            missed = errors(parts, champion.sim.vehicle)
+        if flags.errors:
+            missed = errors(series(champion, *chosen), champion.sim.vehicle)
         figures = evaluate(champion, *chosen)
     if flags.json:
         print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
@@ -280,5 +277,5 @@ def _evaluate() -> int:
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     Console().print(held_out_table(title, figures))
     if missed is not None:
-        Console().print(errors_table(f"Errors against {flags.reference or 'the reference driver'}", missed))
+        Console().print(errors_table("Errors against the reference driver", missed))
     return 0

@@ -46,7 +46,6 @@ from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
 from gridsim.errors import GridSimError
-from gridsim.view.drive import read_drive
 
 PROG = "gridsim-compare"
 TABLE, ROWS, PICTURE, ROUTE = "table.md", "table.csv", "comparison.png", "route.png"
@@ -74,7 +73,7 @@ class CompareFlags(WorkFlags, Plan):
 
 QUICK = CompareFlags(seeds=1, budget="10s")
 MAY_DIFFER = ("resume", "workers", "address", "patience", "tracking_uri", "experiment")  # in a resumed comparison
-WITH_RUNS = ("runs", "output", "name", "reference")  # flags for a comparison of finished runs
+WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
 
 
 def compare_main() -> None:
@@ -182,14 +181,13 @@ def _train_and_compare(
 class Results:
     """Finished runs with their errors, and the files that are made of them."""
 
-    def __init__(self, path: Path, plan: Plan | None = None, reference: str = ""):
+    def __init__(self, path: Path, plan: Plan | None = None):
         self.path, self.plan = path, plan
-        self.reference = plan.reference if plan else reference
         self.runs: list[Run] = []
 
     def add(self, run: Run) -> Run:
         """Add a run. Returns it with its errors. Raises GridSimError."""
-        self.runs.append(dataclasses.replace(run, figures={**run.figures, **errors_of(run, self.reference)}))
+        self.runs.append(dataclasses.replace(run, figures={**run.figures, **errors_of(run)}))
         return self.runs[-1]
 
     @property
@@ -210,7 +208,7 @@ class Results:
         drives = {}
         for learner in ("evolution", "dqn"):
             runs = on_seamless[learner].runs if learner in on_seamless else ()
-            found = [series[0] for run in runs if (series := series_of(run, self.reference, 1))]
+            found = [series[0] for run in runs if (series := series_of(run, 1))]
             if found:
                 drives[learner] = found
         if drives:
@@ -254,10 +252,8 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     for f in dataclasses.fields(CompareFlags):
         if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(default, f.name):
             raise UsageError(f"{as_flag(f.name)}: runs that are there are compared as they are; leave it out")
-    if flags.reference:
-        read_drive(flags.reference)
     runs = read_runs([Path(name) for name in flags.runs])
-    results = Results(new_folder(Path(flags.output), flags.name, "comparison"), reference=flags.reference)
+    results = Results(new_folder(Path(flags.output), flags.name, "comparison"))
     with console.status("measuring errors") as shown:
         for k, run in enumerate(runs):
             shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")

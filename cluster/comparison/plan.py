@@ -26,7 +26,6 @@ from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY, is_map_file
-from gridsim.view.drive import read_drive
 
 COMPARISON = "comparison.json"
 FORMAT = 1
@@ -84,8 +83,6 @@ class Plan:
     the same networks on any machine. A run also ends by its learner's own rule."""
     traffic: int = -1
     """Other cars on the road; -1: as many as each scenario has by default."""
-    reference: str = ""
-    """A drive that gridsim-drive recorded, to measure errors against in place of the reference driver."""
     population: int = 0
     """Members of a generation, of evolution and random search; 0: as gridsim-evolve has it."""
     generations: int = 0
@@ -94,8 +91,6 @@ class Plan:
     def __post_init__(self) -> None:
         absolute = tuple(os.path.abspath(name) if is_map_file(name) else name for name in self.scenarios)
         object.__setattr__(self, "scenarios", absolute)
-        if self.reference:
-            object.__setattr__(self, "reference", os.path.abspath(self.reference))
 
     def check(self) -> None:
         """Raises GridSimError, one line that says what to change."""
@@ -113,10 +108,6 @@ class Plan:
             raise ExperimentError("--scenarios: two maps have the same name; rename one")
         for cell in dataclasses.replace(self, seeds=1).cells(Path()):
             cell.settings.check()
-        if self.reference:
-            driven = read_drive(self.reference).scenario
-            if self.scenarios != (driven,):
-                raise ExperimentError(f"--reference was driven on {driven}; compare there alone: --scenarios {driven}")
 
     def cells(self, folder: Path) -> list[Cell]:
         """All runs of a comparison in that folder, in the order in which they are made."""

@@ -83,29 +83,27 @@ def read_run(folder: Path) -> Run:
     return Run(folder, settings, champion.sha256, figures)
 
 
-def series_of(run: Run, reference: str, episodes: int) -> list[Series]:
-    """A run's champion and the reference along its held-out drives, or beside a recorded one.
+def series_of(run: Run, episodes: int) -> list[Series]:
+    """A run's champion and the reference along its held-out drives.
 
     Raises: ExperimentError.
     """
     try:
         champion = load_champion(run.folder / CHAMPION)
-        if reference:  # it brings its own map and traffic
-            return series(champion, run.settings.scenario, reference=reference)
         return series(champion, run.settings.scenario, episodes, traffic=run.settings.traffic)
     except ValueError as error:
         raise ExperimentError(f"{run.folder}: no errors can be measured: {error}") from error
 
 
-def errors_of(run: Run, reference: str) -> dict[str, float]:
-    """ERROR_FIGURES of a run's champion against a drive.csv, or "" for the reference driver.
+def errors_of(run: Run) -> dict[str, float]:
+    """ERROR_FIGURES of a run's champion against the reference driver.
 
     They are not a number for a champion without a metre forward. Raises ExperimentError.
     """
-    found = series_of(run, reference, HELD_OUT_EPISODES)
+    found = series_of(run, HELD_OUT_EPISODES)
     figures = errors(found, VehicleConfig()) if found else {}
     driven, expected = figures.get("metres", 0.0) / HELD_OUT_EPISODES + LEFT_OUT_M, run.figures["distance_m"]
-    if not reference and driven < LEAST_SHARE * expected:
+    if driven < LEAST_SHARE * expected:
         raise ExperimentError(
             f"{run.folder}: its champion drives {driven:,.0f} m where {SUMMARY} says {expected:,.0f} m: another "
             "version of GridSim made it; make it again, or leave it out"

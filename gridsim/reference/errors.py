@@ -2,12 +2,11 @@
 
 e_v = v - v_ref in m/s and e_delta = delta - delta_ref in degrees (Trasnea et al. 2019), compared at the same place of
 the route, not at the same time: a delay of a second is not an error for the rest of the drive. Means are over metres,
-so that time at standstill has no weight. The reference is `profile.profile` along the driven path, or a recorded drive.
+so that time at standstill has no weight. The reference is `profile.profile` along the driven path.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,9 +16,6 @@ from gridsim.config import VehicleConfig
 from gridsim.maps.map import Map
 from gridsim.reference.profile import BRAKING, WINDOW, arc_length, profile
 
-APART = 3.5  # m beside the recorded path, a lane's width, beyond which a drive has left it
-TURNED = math.radians(45.0)  # difference of headings beyond which it has
-TURN = 12.0  # m left out before that, since the bend in which they part begins earlier
 _STANDING = 1e-6  # m
 
 
@@ -28,10 +24,8 @@ class Driven(NamedTuple):
 
     arc: np.ndarray  # float64 [n], m driven, increasing
     points: np.ndarray  # float64 [n, 2], m, not wrapped over the torus
-    heading: np.ndarray  # float64 [n], rad
     speed: np.ndarray  # float64 [n], m/s
     steering: np.ndarray  # float64 [n], rad, left positive
-    rows: np.ndarray  # int64 [n], indices of these states in the drive
 
 
 class Series(NamedTuple):
@@ -107,7 +101,7 @@ def driven(poses: np.ndarray, road_map: Map) -> Driven:
     if len(rows) < 2:
         raise ValueError("nothing was driven that could be compared with a reference")
     points = points[rows]
-    return Driven(arc_length(points), points, poses[rows, 2], poses[rows, 3], poses[rows, 4], rows)
+    return Driven(arc_length(points), points, poses[rows, 3], poses[rows, 4])
 
 
 def error_series(path: Driven, road_map: Map, vehicle: VehicleConfig) -> Series:
@@ -125,42 +119,3 @@ def error_series(path: Driven, road_map: Map, vehicle: VehicleConfig) -> Series:
     unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * BRAKING) > path.arc[-1])
     part = slice(int(np.searchsorted(path.arc, WINDOW / 2)), int(unknown[0]))
     return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
-
-
-def error_series_beside(path: Driven, recorded: Driven, road_map: Map, row: int = 0) -> tuple[Series, float]:
-    """A drive beside a recorded one, from the recording's point `row`, until it leaves the recorded path.
-
-    Each of the agent's places is compared with the nearest place further along the recording. The drive leaves it when
-    it is more than APART beside it or TURNED from it; the last TURN before that is left out, and all after the
-    recording's end.
-    Returns: (the series, empty if nothing is left; m along the recording that the agent reached).
-    """
-    points = path.points - np.round((path.points[0] - recorded.points[row]) / road_map.size) * road_map.size
-    steps = np.diff(recorded.points, axis=0)
-    k, last = min(row, len(steps) - 1), len(steps) - 1
-    at, parted = [], False
-    reached = float(recorded.arc[row])
-    for point, heading in zip(points, path.heading, strict=True):
-        while True:
-            length = recorded.arc[k + 1] - recorded.arc[k]
-            away = point - recorded.points[k]
-            along = float(away @ steps[k]) / length
-            if along <= length or k == last:
-                break
-            k += 1
-        if along > length + _STANDING:
-            break
-        turn = heading - recorded.heading[k + 1]
-        if (
-            abs(steps[k, 0] * away[1] - steps[k, 1] * away[0]) > APART * length
-            or abs((turn + math.pi) % (2.0 * math.pi) - math.pi) > TURNED
-        ):
-            parted = True
-            break
-        reached = max(reached, float(recorded.arc[k]) + along)
-        at.append(reached)
-    count = len(at)
-    if parted and count:
-        count = int(np.searchsorted(path.arc[:count], path.arc[count - 1] - TURN, side="right"))
-    speed, steering = (np.interp(at[:count], recorded.arc, each) for each in (recorded.speed, recorded.steering))
-    return Series(path.arc[:count], path.speed[:count], speed, path.steering[:count], steering), reached

@@ -79,7 +79,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(compare, "train", train)
-    monkeypatch.setattr(compare, "errors_of", lambda run, reference: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
     assert run(monkeypatch, *asked, "--name", "c", "--seeds", 1) == 1

@@ -1,4 +1,4 @@
-"""Velocity and steering errors: closed forms on a straight and a circle, zero for the reference, recorded drives."""
+"""Velocity and steering errors: closed forms on a straight and a circle, the shipped champion's."""
 
 import json
 import math
@@ -11,15 +11,11 @@ from commands import call
 from cluster.commands.cli import evaluate_main
 from cluster.comparison.errors import series
 from cluster.runs.champion import load_champion
-from evolution.episodes.rollout import Limits, trajectory
-from evolution.networks.policy import PolicySpec
 from gridsim.config import VehicleConfig
-from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.reference.errors import APART, TURN, Series, driven, error_series, error_series_beside
+from gridsim.reference.errors import Series, driven, error_series
 from gridsim.reference.errors import errors as errors_of
 from gridsim.reference.profile import BRAKING, LATERAL, top_speed
-from gridsim.view.drive import DriveError, Recorder, poses_of
 
 INTERVAL = REGISTRY["seamless"].speed_interval
 TOP = top_speed(INTERVAL)
@@ -112,7 +108,7 @@ def test_what_was_reversed_and_driven_again_is_left_out(road):
     path = driven(poses, road)
     assert path.arc[-1] == pytest.approx(100.0)
     assert np.all(path.speed == 6.0)
-    assert np.array_equal(poses[path.rows, 0], ahead[:, 0])
+    assert np.array_equal(path.points, ahead[:, :2])
 
 
 def test_over_the_edge_of_the_torus(road):
@@ -152,89 +148,6 @@ def test_episodes_are_weighted_by_metres():
         errors_of([], CAR)
 
 
-def test_recorded_drive_is_compared_at_the_same_place(road):
-    """Beside the recording, in steps of another size: what counts is how far along it the agent is."""
-    recorded = driven(along(straight(200.0), 4.0 + straight(200.0)[:, 0] / 50.0, 0.02), road)
-    points = straight(230.0, 0.7) + np.array([0.0, 1.0])
-    path = driven(along(points, 3.0 + points[:, 0] / 50.0, 0.02), road)
-    found, reached = error_series_beside(path, recorded, road)
-    assert reached == pytest.approx(200.0, abs=0.7)
-    assert found.velocity_error == pytest.approx(-1.0, abs=1e-9)
-    assert found.steering_error == pytest.approx(0.0, abs=1e-9)
-
-
-def test_who_leaves_the_recorded_path_is_compared_up_to_there(road):
-    recorded = driven(along(straight(200.0), 8.0), road)
-    turn = np.arange(0.25, 20.0, 0.25) / 12.0
-    bend = [60.0, 20.0] + 12.0 * np.stack([np.sin(turn), 1.0 - np.cos(turn)], axis=1)
-    path = driven(along(np.concatenate([straight(50.0), bend]), 6.0, 0.3), road)
-    found, reached = error_series_beside(path, recorded, road)
-    lateral = 50.0 + 12.0 * math.sin(math.acos(1.0 - APART / 12.0))
-    assert reached == pytest.approx(min(lateral, 50.0 + 12.0 * math.sin(math.radians(45.0))), abs=0.3)
-    assert found.arc[-1] == pytest.approx(50.0, abs=TURN / 4)
-    assert errors_of([found], CAR)["velocity_mean_mps"] == pytest.approx(2.0)
-    other, reached = error_series_beside(
-        driven(along(straight(50.0) + np.array([0.0, 5.0]), 6.0), road), recorded, road
-    )
-    assert (len(other.arc), reached) == (0, 0.0)
-
-
-def record(path, champion, road, start, target):
-    """A champion's own drive, written as a person's: bit for bit what its rollout does."""
-    spec = PolicySpec.parse(champion.policy)
-    _, states, _ = trajectory(spec, champion.genome, road, start, Limits(target, 4000), champion.sim)
-    poses = poses_of(states)
-    poses[0] = start
-    env = champion.make_env(traffic=0)
-    observation, _ = env.reset(seed=1, options={"map_seed": road.seed, "start": start})
-    with Recorder(path, road, 0.1) as recorder:
-        for step, pose in enumerate(poses[:-1]):
-            action = int(champion.act(observation))
-            recorder.write(step, pose, action, 0)
-            observation, *_ = env.step(action)
-    env.close()
-
-
-@pytest.fixture(scope="module")
-def recorded(champion, tmp_path_factory):
-    """A drive of the champion's own, and one of another champion."""
-    folder, road = tmp_path_factory.mktemp("drives"), build("seamless", 11)
-    start = sample_starts(road, 1, np.random.default_rng(0))[0]
-    record(folder / "own.csv", champion, road, start, 300.0)
-    record(folder / "drive.csv", load_champion(BENCHMARKS / "champion_traffic.npz"), road, start, 500.0)
-    return folder
-
-
-def test_champion_against_its_own_recording_is_zero(champion, recorded):
-    found = errors(champion, reference=recorded / "own.csv")
-    assert found["metres"] > 290.0
-    assert (found["velocity_max_mps"], found["steering_max_deg"]) == pytest.approx((0.0, 0.0), abs=1e-3)
-
-
-def test_champion_begins_anew_where_it_leaves_the_recording(champion, recorded):
-    parts = series(champion, reference=recorded / "drive.csv")
-    found = errors_of(parts, CAR)
-    assert 250.0 < found["metres"] < 510.0
-    assert len(parts) > 1
-    assert all(abs(part.velocity_error[0]) < 0.5 for part in parts)
-    assert 0.1 < found["velocity_mean_mps"] < 2.0  # of another driver
-
-
-def test_recording_of_elsewhere_is_refused(champion, recorded, tmp_path):
-    with pytest.raises(DriveError, match="driven on seamless, not on city"):
-        errors(champion, "city", reference=recorded / "own.csv")
-    with pytest.raises(DriveError, match="among 0 cars, not 3"):
-        errors(champion, traffic=3, reference=recorded / "own.csv")
-    text = (recorded / "own.csv").read_text().replace(",11\n", ",12\n")
-    (tmp_path / "moved.csv").write_text(text)
-    with pytest.raises(DriveError, match="another map"):
-        errors(champion, reference=tmp_path / "moved.csv")
-    lines = (recorded / "own.csv").read_text().splitlines(keepends=True)
-    (tmp_path / "still.csv").write_text("".join(lines[:2]))
-    with pytest.raises(ValueError, match="nothing was driven"):
-        errors(champion, reference=tmp_path / "still.csv")
-
-
 def test_champion_against_the_reference_driver(champion):
     found = errors(champion, episodes=4)
     assert found["metres"] > 4 * 1900.0
@@ -246,18 +159,14 @@ def test_champion_against_the_reference_driver(champion):
             errors(champion, **wrong)
 
 
-def test_command_prints_them(champion, recorded, monkeypatch, capsys):
+def test_command_prints_them(champion, monkeypatch, capsys):
     def run(*arguments):
         return call(evaluate_main, monkeypatch, capsys, CHAMPION, "--episodes", 2, *arguments)
 
     said = json.loads(run("--json", "--errors")[1])
     assert said.pop("errors") == errors(champion, episodes=2)
     assert said["episodes"] == 2
-    code, shown, _ = run("--reference", recorded / "own.csv")
+    code, shown, _ = run("--errors")
     assert code == 0
     for words in ("success (2,000 m without a collision)", "velocity error, m/s", "steering error, degrees"):
         assert words in shown
-    code, _, said = run("--scenario", "city", "--reference", recorded / "own.csv")
-    assert code == 2
-    assert said.startswith("gridsim-evaluate: error: ")
-    assert "driven on seamless, not on city" in said

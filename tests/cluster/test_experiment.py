@@ -46,7 +46,6 @@ def test_budget_that_makes_no_sense(text):
         ({"seeds": 0}, "--seeds"),
         ({"traffic": -2}, "--traffic"),
         ({"population": -1}, "population"),
-        ({"reference": "/nowhere.csv"}, "/nowhere.csv"),
     ],
 )
 def test_plan_that_makes_no_sense(change, said):
@@ -108,7 +107,7 @@ PLANNED = json.loads(json.dumps(dataclasses.asdict(PLAN)))
 EDITED = [
     ("seeds", "3"), ("seeds", -1), ("seeds", 10**9), ("scenarios", "curved"), ("scenarios", [["curved"]]),
     ("scenarios", ["../../etc"]), ("learners", ["evolution", "shell"]), ("budget", "a lot"), ("budget", 5),
-    ("observation", "camera"), ("traffic", 1e9), ("reference", "/x"), ("population", -5), ("extra", 1),
+    ("observation", "camera"), ("traffic", 1e9), ("population", -5), ("extra", 1),
 ]  # fmt: skip
 
 

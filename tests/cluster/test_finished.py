@@ -14,10 +14,10 @@ from gridsim.errors import GridSimError
 def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path):
     make_run(tmp_path / "r")
     made = read_run(tmp_path / "r")
-    assert set(errors_of(made, "")) == set(ERROR_FIGURES)  # however short: it is no other version's
+    assert set(errors_of(made)) == set(ERROR_FIGURES)  # however short: it is no other version's
     other = dataclasses.replace(made, figures={**made.figures, "distance_m": 2000.0})
     with pytest.raises(ExperimentError, match="another version of GridSim made it"):
-        errors_of(other, "")
+        errors_of(other)
 
 
 def test_runs_are_compared_from_python(tmp_path):
