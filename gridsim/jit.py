@@ -1,8 +1,7 @@
 """Numba's options, and the cache of compiled kernels.
 
 Numba's own on-disk cache does not notice when a function in *another* file changes. So the cache folder is named after
-a digest of all sources and library versions: any edit leads to a new folder. `NUMBA_DISABLE_JIT=1` runs every kernel as
-plain Python.
+a digest of all sources and library versions: any edit leads to a new folder.
 """
 
 from __future__ import annotations

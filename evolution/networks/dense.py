@@ -1,41 +1,27 @@
 """Vector code for network layers, with sums held in registers.
 
 `tile` computes some positions times some units of a layer: the inputs of a position are `planes` x `rows` runs of `run`
-consecutive numbers, in a dense layer one run. `vector_tile` emits LLVM vectors; `plain_tile` does the same arithmetic
-in plain Python, for `NUMBA_DISABLE_JIT=1` and for tests.
+consecutive numbers, in a dense layer one run. It is emitted as LLVM vectors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
-from gridsim.jit import CONFIG
 
+def tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
+    """A function for kernels: biases plus weights times inputs for `positions` x `lanes` outputs, then maybe ReLU.
 
-def plain_tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Callable[..., None]:
-    """A tile in plain Python; see `tile`."""
-
-    def plain(
-        x, x_at, x_step, planes, plane_step, rows, row_step, run, w, w_at, width, bias_at, y, y_at, y_step
-    ):  # fmt: skip
-        planes_at = plane_step * np.arange(planes)[:, None, None]
-        at = (x_at + planes_at + row_step * np.arange(rows)[:, None] + np.arange(run)).ravel()  # of inputs
-        weights = w[w_at + width * np.arange(len(at))[:, None] + np.arange(lanes)]
-        for p in range(positions):
-            total = w[bias_at : bias_at + lanes] + x[at + p * x_step] @ weights
-            y[y_at + p * y_step : y_at + p * y_step + lanes] = np.where(total < 0.0, 0.0, total) if rectify else total
-
-    return plain
-
-
-def vector_tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
-    """A tile as an intrinsic for kernels; see `tile`."""
+    Its arguments: inputs x float32 [any], with the offset of the first position and the stride of positions, number and
+    stride of planes, number and stride of rows, and length of a run; weights w, their offset, the units of the whole
+    layer, and the offset of the biases; outputs y, their offset and the stride of positions. The inputs of each run are
+    summed in `chains` independent parts, which hides the latency of additions where there are few lanes and positions;
+    the order of sums is the same on any machine.
+    """
 
     @intrinsic
     def vector(
@@ -110,16 +96,3 @@ def vector_tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> A
         return signature, codegen
 
     return vector
-
-
-def tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
-    """A function for kernels: biases plus weights times inputs for `positions` x `lanes` outputs, then maybe ReLU.
-
-    Its arguments: inputs x float32 [any], with the offset of the first position and the stride of positions, number and
-    stride of planes, number and stride of rows, and length of a run; weights w, their offset, the units of the whole
-    layer, and the offset of the biases; outputs y, their offset and the stride of positions. The inputs of each run are
-    summed in `chains` independent parts, which hides the latency of additions where there are few lanes and positions;
-    the order of sums is the same on any machine.
-    """
-    make = plain_tile if CONFIG.DISABLE_JIT else vector_tile
-    return make(positions, lanes, rectify, chains)

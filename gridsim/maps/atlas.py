@@ -29,12 +29,8 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
     """Concatenate maps. A single map is not copied."""
     lanes = networks[0]
     if len(networks) > 1:
-        most = max(network.successors.shape[1] for network in networks)
         names = [name for name in Network._fields if name not in ("width", "height")]
         columns = {name: [getattr(network, name) for network in networks] for name in names}
-        columns["successors"] = [
-            np.pad(array, ((0, 0), (0, most - array.shape[1])), constant_values=-1) for array in columns["successors"]
-        ]
         together = {name: freeze(np.concatenate(arrays)) for name, arrays in columns.items()}
         lanes = Network(**together, width=lanes.width, height=lanes.height)
     parts = [(road.field, road.start_row, road.start) for road in roads]

@@ -32,7 +32,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.raster import OUTSIDE, complete_starts, find_starts, road_length, signed_clearance
+from gridsim.maps.raster import OUTSIDE, check_starts, find_starts, road_length, signed_clearance
 from gridsim.maps.roads import (
     CELLS_PER_M,
     HEADING_BINS,
@@ -75,7 +75,7 @@ class MapFile:
     origin: tuple[float, float] = (0.0, 0.0)  # m, the picture's lower left corner in the file's own coordinates
     negate: bool = False  # whether dark pixels are road
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
-    # x, y (m, the file's coordinates), heading (rad, NaN: along the road); without any, starts are chosen by us.
+    # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: tuple[tuple[float, float, float], ...] = ()
     torus: bool = False  # whether leaving on one side means entering on the other
     speed: tuple[float, float] = FILE_SPEEDS  # m/s, the speed interval
@@ -167,10 +167,9 @@ def _flag(value: Any, what: str) -> bool:
     return bool(value)
 
 
-def _list(value: Any, what: str, lengths: tuple[int, ...]) -> list[Any]:
-    if not isinstance(value, list) or len(value) not in lengths:
-        wanted = " or ".join(map(str, lengths))
-        raise ValueError(f"{what} must be a list of {wanted} numbers, not {_shown(value)}")
+def _list(value: Any, what: str, length: int) -> list[Any]:
+    if not isinstance(value, list) or len(value) != length:
+        raise ValueError(f"{what} must be a list of {length} numbers, not {_shown(value)}")
     return value
 
 
@@ -191,7 +190,7 @@ def _checked(path: Path, values: Any) -> MapFile:
     mode = values.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
         raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
-    origin = _list(values.get("origin", [0.0, 0.0, 0.0]), "origin", (3,))
+    origin = _list(values.get("origin", [0.0, 0.0, 0.0]), "origin", 3)
     x, y, yaw = (_number(value, "origin's x, y (m) and yaw (rad)", -1e7, 1e7) for value in origin)
     if abs(yaw) > 1e-6:
         raise ValueError(f"origin's yaw must be 0, not {yaw:g}; turn the picture instead")
@@ -199,13 +198,13 @@ def _checked(path: Path, values: Any) -> MapFile:
     occupied = _number(values.get("occupied_thresh", 0.65), "occupied_thresh", 0.0, 1.0)
     if not 0.0 < free <= occupied:
         raise ValueError(f"free_thresh must be above 0 and not above occupied_thresh, not {free:g} with {occupied:g}")
-    speed = _list(values.get("speed", list(FILE_SPEEDS)), "speed", (2,))
+    speed = _list(values.get("speed", list(FILE_SPEEDS)), "speed", 2)
     low, high = (_number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit) for value in speed)
     if not low < high:
         raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
     starts = values.get("starts", [])
     if not isinstance(starts, list):
-        raise ValueError(f"starts must be a list of [x, y] or [x, y, heading], not {_shown(starts)}")
+        raise ValueError(f"starts must be a list of [x, y, heading], not {_shown(starts)}")
     return MapFile(
         image=_image_path(path, values["image"]),
         resolution=resolution,
@@ -219,11 +218,11 @@ def _checked(path: Path, values: Any) -> MapFile:
 
 
 def _start(value: Any) -> tuple[float, float, float]:
-    x, y, *heading = _list(value, "a start", (2, 3))
+    x, y, heading = _list(value, "a start", 3)
     return (
         _number(x, "a start's x (m)", -1e8, 1e8),
         _number(y, "a start's y (m)", -1e8, 1e8),
-        _number(heading[0], "a start's heading (rad)", -2 * math.pi, 2 * math.pi) if heading else math.nan,
+        _number(heading, "a start's heading (rad)", -2 * math.pi, 2 * math.pi),
     )
 
 
@@ -347,7 +346,8 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
         if area * START_CELLS_PER_M**2 * (HEADING_BINS + HEADING_WRAP) > MAX_TABLE:
             raise ValueError(f"{area:,.0f} square metres of road are too much; check the resolution, or crop it")
         if file.starts:
-            poses = complete_starts(nodes, np.array(file.starts) - [*file.origin, 0.0], config.vehicle)
+            poses = np.array(file.starts) - [*file.origin, 0.0]
+            check_starts(nodes, poses, config.vehicle)
         else:
             poses = find_starts(nodes, config.vehicle)
     except ValueError as error:

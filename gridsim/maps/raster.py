@@ -25,7 +25,7 @@ _TOUCH = 0.05  # m free around a car at a start given in the file
 _AHEAD = 6.0  # m free straight ahead of a car at a start
 _EXTENT = 30.0  # m, least extent of a road with starts
 _SMOOTH = 3.0  # m, standard deviation of the window over which a road's direction is averaged
-_COHERENCE = 0.5  # least agreement of directions there, from 0 (a plaza, a crossing) to 1 (a straight road)
+_COHERENCE = 0.5  # least agreement of directions there, from 0 (an open place, a crossing) to 1 (a straight road)
 _STARTS = 512
 _NODE = 1.0 / CELLS_PER_M  # m
 _APART = 24  # nodes of wall around a window, so that averages on one side do not see the road on the other
@@ -115,12 +115,12 @@ def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: 
     return np.all(_clearance_at(nodes, x + u * c - v * s, y + u * s + v * c) >= 0.0, axis=1)
 
 
-def _way_ahead(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, reach: float) -> np.ndarray:
-    """How far (m, `reach` at most) a car can drive straight ahead from poses [n, 3]: float64 [n]."""
-    steps = np.arange(1, round(reach / _NODE) + 1) * _NODE
+def _free_ahead(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
+    """Whether a car can drive _AHEAD m straight on from poses [n, 3]: bool [n]."""
+    steps = np.arange(1, round(_AHEAD / _NODE) + 1) * _NODE
     x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
-    free = _clearance_at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading)) >= vehicle.width / 2
-    return np.where(free.all(axis=1), reach, np.argmin(free, axis=1) * _NODE)
+    ahead = _clearance_at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading))
+    return np.all(ahead >= vehicle.width / 2, axis=1)
 
 
 def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -137,15 +137,6 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     xx, yy, xy = smooth(gx * gx), smooth(gy * gy), smooth(gx * gy)
     across = 0.5 * np.arctan2(2.0 * xy, xx - yy)
     return across + math.pi / 2, np.hypot(xx - yy, 2.0 * xy) / np.maximum(xx + yy, 1e-6)
-
-
-def _widest_headings(nodes: np.ndarray, points: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """For points [n, 2], the middle (rad) of the sector of headings with the longest free way."""
-    headings = [np.column_stack([points, np.full(len(points), k * math.pi / 36)]) for k in range(72)]
-    ways = np.column_stack([_way_ahead(nodes, poses, vehicle, 50.0) for poses in headings])
-    best, turns = ways.argmax(axis=1, keepdims=True), np.arange(-6, 7)
-    open_ways = np.take_along_axis(ways, (best + turns) % 72, axis=1) >= 0.9 * ways.max(axis=1, keepdims=True)
-    return (best[:, 0] + np.average(np.broadcast_to(turns, open_ways.shape), axis=1, weights=open_ways)) * math.pi / 36
 
 
 def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +192,7 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
 def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
 
-    Raises: ValueError with one line if a car fits nowhere.
+    Raises: ValueError with one line if a car fits nowhere, or nowhere along a road: an open place has no direction.
     """
     nodes, corner = _window(nodes)
     wide = nodes >= vehicle.width / 2 + _MARGIN
@@ -214,45 +205,23 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     ridge = large & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.25)
     angle, coherence = _directions(nodes)
     row, column = np.nonzero(ridge)
-    points = np.column_stack([column, row]) * _NODE
-    along = np.column_stack([points, angle[row, column]])[coherence[row, column] >= _COHERENCE]
-
-    def drivable(ahead: np.ndarray) -> np.ndarray:
-        poses = np.concatenate([ahead, ahead + _BACK])
-        return poses[_fits(nodes, poses, vehicle, _MARGIN) & (_way_ahead(nodes, poses, vehicle, _AHEAD) >= _AHEAD)]
-
-    poses = drivable(_spread_sample(along, 4 * _STARTS))
-    if not len(poses):  # a plaza
-        points = _spread_sample(points, _STARTS)
-        poses = drivable(np.column_stack([points, _widest_headings(nodes, points, vehicle)]))
+    along = np.column_stack([column * _NODE, row * _NODE, angle[row, column]])[coherence[row, column] >= _COHERENCE]
+    along = _spread_sample(along, 4 * _STARTS)
+    poses = np.concatenate([along, along + _BACK])
+    poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & _free_ahead(nodes, poses, vehicle)]
     if not len(poses):
         raise ValueError(
             f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
-            f"check the resolution and what is bright"
+            f"check the resolution and what is bright, or name starts in a YAML"
         )
     poses[:, :2] += corner
     return _spread_sample(poses, _STARTS)
 
 
-def complete_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Poses [n, 3] (x, y, heading) float64, in which a heading of NaN is replaced by the road's direction.
-
-    Raises: ValueError with one line if a car would be off the road.
-    """
-    complete = np.array(poses, dtype=np.float64)
-    size = np.array(nodes.shape[::-1]) * _NODE
-    window, corner = _window(nodes)
-    angle, coherence = _directions(window)
-    for pose in complete:
-        inside = bool((pose[:2] >= 0.0).all() and (pose[:2] < size).all())
-        if inside and math.isnan(pose[2]):
-            column, row = ((pose[:2] - corner) * CELLS_PER_M).round().astype(int) % window.shape[::-1]
-            clear = coherence[row, column] >= _COHERENCE
-            pose[2] = angle[row, column] if clear else _widest_headings(nodes, pose[None, :2], vehicle)[0]
-            ways = np.array([pose, pose + _BACK])
-            pose[:] = ways[np.argmax(_way_ahead(nodes, ways, vehicle, 50.0))]
-        if not inside or not _fits(nodes, pose[None], vehicle, _TOUCH)[0]:
-            raise ValueError(
-                f"starts: at {pose[0]:g} m, {pose[1]:g} m from the lower left corner a car is not all on the road"
-            )
-    return complete
+def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> None:
+    """Raises: ValueError with one line if at one of the poses [n, 3] (x, y, heading) a car would be off the road."""
+    inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * _NODE)).all(axis=1)
+    wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
+    if len(wrong):
+        x, y, _ = wrong[0]
+        raise ValueError(f"starts: at {x:g} m, {y:g} m from the lower left corner a car is not all on the road")

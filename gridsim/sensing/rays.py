@@ -17,14 +17,14 @@ import numpy as np
 
 from gridsim.jit import leaf
 from gridsim.maps.roads import CELLS_PER_M, HEADING_BINS, HEADING_WRAP, START_CELLS_PER_M, START_UNITS
-from gridsim.sensing.simd import AMONG_THIN_WALLS, PLAIN, SIMD_RAYS, fast_march
+from gridsim.sensing.simd import AMONG_THIN_WALLS, PLAIN, SIMD_RAYS, vector_march
 
 _F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
 _SCALE = _F(CELLS_PER_M)
 _BINS_PER_RADIAN = _F(HEADING_BINS / (2.0 * math.pi))
 _PER_START = _U(CELLS_PER_M // START_CELLS_PER_M)
 _STRIDE = _I(HEADING_BINS + HEADING_WRAP)
-_march, _march_among_thin_walls = fast_march(PLAIN), fast_march(AMONG_THIN_WALLS)
+_march, _march_among_thin_walls = vector_march(PLAIN), vector_march(AMONG_THIN_WALLS)
 
 
 def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.ndarray:

@@ -1,12 +1,11 @@
 """Marching 32 rays to the edge of the road, all in lockstep.
 
 The code is emitted as LLVM vectors of 32, which LLVM maps to the machine's registers. A ray that has arrived is refined
-further while others march. `NUMBA_DISABLE_JIT=1` runs a simpler march.
+further while others march.
 """
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.extending import intrinsic
 
-from gridsim.jit import CONFIG
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, clearance
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
 
 _F = np.float32
 SIMD_RAYS = 32
@@ -27,24 +25,12 @@ _SLOPE = _F(CELLS_PER_M / FIELD_UNITS)
 _NEAR = _F(2.0)  # m of clearance below which Newton steps are taken
 _STRETCH = _F(1.5)  # length of a step above it, in clearances
 _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
-_ARRIVED = _F(0.002)  # ... in the plain march, which makes no last Newton step
 _SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance, and a leap longer than a stretched step
 _GAP = _F(0.95)  # m of a step that may be blind, among thin walls
 # How to march without and with thin walls: most steps, leap in m (not to jump over an island), whether steps are
 # checked for blind parts. PLAIN may pass walls of less than 3 m.
 PLAIN = (16, _F(2.0), False)
 AMONG_THIN_WALLS = (24, _F(0.9), True)
-
-
-def plain_march(field, columns, rows, px0, py0, reach, beams):
-    """The march for `NUMBA_DISABLE_JIT=1`, where there is no vector code: each step is as long as the clearance."""
-    road = SimpleNamespace(field=field, columns=columns, rows=rows)
-    dx, dy, t = beams
-    clear = np.full(SIMD_RAYS, reach)
-    while (going := (t < reach) & (clear > _ARRIVED)).any():
-        clear = np.where(going, clearance(road, px0 / _SCALE + t * dx, py0 / _SCALE + t * dy), _F(0.0))
-        t += clear
-    np.clip(t, _F(0.0), reach, out=t)
 
 
 def vector_march(how: tuple[int, np.float32, bool]) -> Any:
@@ -178,8 +164,3 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
         return signature, codegen
 
     return march
-
-
-def fast_march(how: tuple[int, np.float32, bool]) -> Any:
-    """The vector code; under `NUMBA_DISABLE_JIT=1` the plain march."""
-    return plain_march if CONFIG.DISABLE_JIT else vector_march(how)

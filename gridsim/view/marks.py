@@ -1,7 +1,6 @@
 """Lane marks: dashes between neighbouring lanes, computed from the lanes; none in junctions.
 
-A lane's neighbour is a lane, in either direction, about a lane's width to its left. Where a lane that is not parallel
-passes close by, there is a junction.
+A lane's neighbour is a parallel lane, in either direction, about a lane's width to its left.
 """
 
 from __future__ import annotations
@@ -13,11 +12,8 @@ from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
 
 BESIDE, SLACK = 3.4, 1.2  # m between the centre lines of neighbours, and the greatest difference from it
-LEAST = 1.2  # m from a mark to any centre line
 PARALLEL = 0.985  # cosine of the angle within which neighbours are parallel: 10 degrees
-JUNCTION, CROSSING = 4.0, 0.925  # m from a mark within which a lane 22 degrees (cosine) aslant makes a junction
 PERIOD, DASH = 6.0, 2.5  # m from dash to dash, and length of a dash
-APART = 3.1  # m within which there is no second dash: lanes overlap, and opposite lanes have the same line
 
 
 def lane_marks(road_map: Map) -> np.ndarray:
@@ -29,25 +25,22 @@ def lane_marks(road_map: Map) -> np.ndarray:
     step = np.diff(points, axis=0, append=points[-1:])
     step[lanes.offsets[1:] - 1] = step[lanes.offsets[1:] - 2]
     direction = step / np.hypot(*step.T)[:, None]
+    lane = np.repeat(np.arange(len(lanes)), np.diff(lanes.offsets))
+    road = (np.diff(lanes.crossing_offsets) == 0)[lane]  # no junction
     tree = cKDTree(_within(points, size), boxsize=size)
     at = np.arange(PERIOD / 2, mileage[-1], PERIOD)
     k = np.searchsorted(mileage, at, side="right") - 1
     here, ahead = points[k] + direction[k] * (at - mileage[k])[:, None], direction[k]
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     away, other = tree.query(_within(here + BESIDE * left, size), distance_upper_bound=SLACK)
-    beside = np.isfinite(away)
-    here, ahead, left, other = here[beside], ahead[beside], left[beside], other[beside]
+    beside = np.isfinite(away) & road[k]
+    k, other, here, ahead, left = k[beside], other[beside], here[beside], ahead[beside], left[beside]
     cosine = (ahead * direction[other]).sum(axis=1)
     across = (road_map.shortest(points[other] - here) * left).sum(axis=1)
     centre = _within(here + 0.5 * across[:, None] * left, size)
-    near = tree.query_ball_point(centre, JUNCTION)
-    free = [(abs(direction[found] @ along) > CROSSING).all() for found, along in zip(near, ahead, strict=True)]
     dashes = np.column_stack([centre, ahead, np.full(len(centre), DASH / 2), cosine < 0.0])
-    dashes = dashes[free & (abs(cosine) > PARALLEL) & (tree.query(centre)[0] > LEAST)]
-    single = np.ones(len(dashes), dtype=np.bool_)
-    for first, second in sorted(cKDTree(dashes[:, :2], boxsize=size).query_pairs(APART)):
-        single[second] &= not single[first]
-    return freeze(dashes[single].astype(np.float32))
+    once = (cosine > 0.0) | (lane[k] < lane[other])  # opposite lanes are each other's neighbours
+    return freeze(dashes[once & road[other] & (abs(cosine) > PARALLEL)].astype(np.float32))
 
 
 def _within(points: np.ndarray, size: np.ndarray) -> np.ndarray:

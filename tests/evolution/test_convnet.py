@@ -8,7 +8,6 @@ import pytest
 from searching import new_genomes
 
 from evolution.networks import convnet
-from evolution.networks.dense import plain_tile, vector_tile
 from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.config import SimConfig
 from gridsim.sensing.grid import grid_table, grids
@@ -82,31 +81,6 @@ def test_forward_is_pytorchs(text):
         assert np.abs(expected).max() > 1e-3
         assert seen == pytest.approx(expected, abs=2e-5 * max(1.0, np.abs(expected).max()))
         assert decide(genome, spec.layers, F(speed), room) == int(seen.argmax())
-
-
-@pytest.mark.parametrize(
-    ("positions", "lanes", "chains"),
-    [(10, 8, 1), (8, 16, 1), (1, 8, 1), (1, 32, 1), (1, 64, 1), (1, 16, 2), (1, 8, 4), (3, 8, 3)],
-)
-@pytest.mark.parametrize("rectify", [False, True])
-def test_vector_code_is_the_plain_tile(positions, lanes, chains, rectify):
-    plain, vector = (make(positions, lanes, rectify, chains) for make in (plain_tile, vector_tile))
-
-    @numba.njit
-    def compiled(x, run, w, y):
-        vector(x, 3, 2, 2, 50, 3, 11, run, w, 1, lanes + 4, 2, y, 6, lanes + 1)
-
-    rng = np.random.default_rng(3)
-    x, w = rng.normal(size=300).astype(F), rng.normal(size=2 + 55 * (lanes + 4)).astype(F)
-    for run in (0, 1, 3, 4, 9):
-        wanted, seen = (np.full(20 + positions * (lanes + 1), 7.0, dtype=F) for _ in range(2))
-        plain(x, 3, 2, 2, 50, 3, 11, run, w, 1, lanes + 4, 2, wanted, 6, lanes + 1)
-        compiled(x, run, w, seen)
-        assert seen == pytest.approx(wanted, abs=1e-4)
-        assert (seen == 0).any() == rectify
-    x[4] = math.nan
-    compiled(x, 9, w, seen)
-    assert np.isnan(seen).any()
 
 
 def test_a_gene_that_is_not_a_number_is_no_action():

@@ -65,6 +65,7 @@ def test_pictures_that_are_no_maps(tmp_path):
     assert "all wall" in refused(save(tmp_path / "wall.png", np.zeros((99, 99), np.uint8)))
     assert "no room" in refused(save(tmp_path / "path.png", picture(strip(50, 20, 0.0, 1.0), 100.0, 40.0)))
     assert "no room" in refused(save(tmp_path / "yard.png", picture(strip(50, 20, 0.0, 5.0, 6.0), 100.0, 40.0)))
+    assert "name starts" in refused(save(tmp_path / "plaza.png", picture(strip(30, 30, 0.0, 24.0, 24.0), 60.0, 60.0)))
     noise = np.random.default_rng(0).integers(0, 256, (800, 800), dtype=np.uint8)
     assert "no room" in refused(save(tmp_path / "noise.png", noise))
 
@@ -183,7 +184,7 @@ scalars = st.one_of(
 values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(scalars, inner, max_size=3))
 GOOD = {
     "image": "good.png", "scale": 4, "origin": [0, 0, 0], "negate": 0, "free_thresh": 0.5, "occupied_thresh": 0.65,
-    "mode": "scale", "starts": [[20, 8]], "torus": False, "speed": [5, 12],
+    "mode": "scale", "starts": [[20, 8, 0]], "torus": False, "speed": [5, 12],
 }  # fmt: skip
 
 
