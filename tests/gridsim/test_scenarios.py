@@ -20,7 +20,7 @@ from gridsim.config import CROSSING_GAP
 from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
-from gridsim.maps.lanes import LANE_STEP, Path, beside, lay_lanes
+from gridsim.maps.lanes import Path, beside, lay_lanes
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, TRAINING_SEED, VALIDATION_SEED, build
@@ -100,17 +100,6 @@ def test_every_lane_is_found_by_a_predecessor_and_leads_back_to_itself(name, lai
         parts, _ = connected_components(graph, connection="strong")
         assert parts == {"highway": highway.LANE_COUNT, "curved": 2}.get(name, 1)
         assert set(m.lanes.successors[m.lanes.successors >= 0].tolist()) == set(range(len(m.lanes)))
-
-
-def test_points_are_equally_spaced(laid):
-    for m in laid:
-        lanes = m.lanes
-        assert lanes.steps.max() <= LANE_STEP * (1 + 1e-6)
-        for i in range(len(lanes)):
-            chord = np.linalg.norm(np.diff(lane(lanes, i).astype(float), axis=0), axis=1)
-            assert chord.max() <= lanes.steps[i] + 2e-4  # points are float32, up to 1 km from the origin
-            # A chord of an arc of 6 m or more falls short of it by 1 / (24 * 36) at most.
-            assert chord.min() >= lanes.steps[i] * (1 - 1.2e-3) - 2e-4
 
 
 def test_neighbours_are_each_others(name, laid):
