@@ -192,7 +192,7 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
 def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
 
-    Raises: ValueError with one line if a car fits nowhere, or nowhere along a road: an open place has no direction.
+    Raises: ValueError with one line if a car fits nowhere along a road.
     """
     nodes, corner = _window(nodes)
     wide = nodes >= vehicle.width / 2 + _MARGIN
