@@ -1,9 +1,8 @@
 """Maps from files: a picture in which bright is road, or the YAML form of ROS's map_server with a picture.
 
 A picture is thresholded at its own resolution. The signed distance to the edge between road and wall is sampled at the
-nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture, unless the map is a
-torus. World coordinates have their origin at the picture's lower left corner; a file's own coordinates are shifted by
-its `origin`.
+nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture. World coordinates have
+their origin at the picture's lower left corner; a file's own coordinates are shifted by its `origin`.
 
 A file gives the same map for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
 in the file, or poses on the ridge of the free space, heading along it in both directions.
@@ -48,8 +47,7 @@ PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
 KEYS = (
-    "image", "resolution", "scale", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "torus",
-    "speed",
+    "image", "resolution", "scale", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed",
 )  # fmt: skip
 
 MAX_YAML = 1 << 16  # bytes
@@ -77,7 +75,6 @@ class MapFile:
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: tuple[tuple[float, float, float], ...] = ()
-    torus: bool = False  # whether leaving on one side means entering on the other
     speed: tuple[float, float] = FILE_SPEEDS  # m/s, the speed interval
 
 
@@ -212,7 +209,6 @@ def _checked(path: Path, values: Any) -> MapFile:
         negate=_flag(values.get("negate", 0), "negate"),
         free_thresh=free,
         starts=tuple(_start(value) for value in starts),
-        torus=_flag(values.get("torus", False), "torus"),
         speed=(low, high),
     )
 
@@ -288,20 +284,10 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
     """Columns and rows of the field, in nodes: powers of two."""
     sides = []
     for axis in (0, 1):
-        pixels = free.shape[1 - axis]
-        if file.torus:
-            nodes = pixels * file.resolution * CELLS_PER_M
-            side = 1 << max(round(math.log2(nodes)), 0)
-            if abs(nodes / side - 1.0) > 1e-3 or side < SHORTEST_SIDE * CELLS_PER_M:
-                raise ValueError(
-                    f"a torus' sides must be {SHORTEST_SIDE}, 32, 64 ... m, not {pixels} pixels of "
-                    f"{file.resolution:g} m; scale the picture, or set its resolution"
-                )
-        else:
-            used = np.flatnonzero(free.any(axis=axis))
-            first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
-            side = power_of_two(max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE) * CELLS_PER_M)
-        sides.append(side)
+        used = np.flatnonzero(free.any(axis=axis))
+        first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
+        side = max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE)
+        sides.append(power_of_two(side * CELLS_PER_M))
     columns, rows = sides
     width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
     if columns * rows > MAX_NODES:
@@ -323,7 +309,7 @@ def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit
             stacklevel=1,
         )
     border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
-    if border >= MOST_BORDER and not file.torus:
+    if border >= MOST_BORDER:
         warnings.warn(
             f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
             f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
@@ -341,7 +327,7 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
     free = read_free(file)
     try:
         columns, rows = _sides(free, file)
-        nodes = signed_clearance(free, file.resolution, columns, rows, file.torus)
+        nodes = signed_clearance(free, file.resolution, columns, rows)
         area = np.count_nonzero(nodes > 0.0) / CELLS_PER_M**2
         if area * START_CELLS_PER_M**2 * (HEADING_BINS + HEADING_WRAP) > MAX_TABLE:
             raise ValueError(f"{area:,.0f} square metres of road are too much; check the resolution, or crop it")
@@ -364,6 +350,6 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
         lanes=lanes,
         strips=Strips.of(),
         network=make_network(lanes, width, height, 0.0, config),
-        torus=file.torus,
+        torus=False,
         starts=freeze(starts),
     )

@@ -15,7 +15,6 @@ SPEC, CNN = PolicySpec.parse("mlp:6,7"), PolicySpec.parse("cnn:8,8,16@1")
 FREE = symmetry(SPEC).free  # genes with noise of their own
 STILL = Mutation(rate=0.0, sigma=0.0)
 NOBODY = np.zeros((0, SPEC.size), dtype=F)
-KEYS = [0, 1, 2**31, 2**32, 2**53, 2**53 + 1, 2**63 - 1]
 
 
 def recipes(*rows):
@@ -141,13 +140,6 @@ def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data)
     whole = breed(parents, made, key, SPEC, Mutation(rate=0.1))
     chosen = data.draw(st.lists(st.integers(0, len(made) - 1), min_size=1, max_size=20))
     assert breed(parents, made[chosen], key, SPEC, Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()
-
-
-@pytest.mark.parametrize("kind", [Kind.NEW, Kind.STEP, Kind.CROSS])
-def test_keys_of_63_bits_are_told_apart(parents, kind):
-    children = [breed(parents, many(kind, 0, 1, 1), key, SPEC, Mutation(rate=1.0)).tobytes() for key in KEYS]
-    assert len(set(children)) == len(KEYS)
-    assert len({moments(np.zeros(1), np.ones(1), np.ones(1), key, SPEC)[0].tobytes() for key in KEYS}) == len(KEYS)
 
 
 @pytest.mark.parametrize("row", [(4, 5, 0, 1), (2, 0, 5, 1), (0, 5, 5, 0), (3, 65_534, 0, 1), (1, 5, 0, 1)])

@@ -173,7 +173,7 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
     assert (np.abs(error) > 0.3).mean() < 0.05
 
 
-def test_the_outside_is_wall_unless_it_is_a_torus(tmp_path):
+def test_the_outside_is_wall(tmp_path):
     def road(x, y):  # runs out of the picture to the left and to the right
         return 4.0 - np.abs(y - 16.0)
 
@@ -181,13 +181,6 @@ def test_the_outside_is_wall_unless_it_is_a_torus(tmp_path):
     assert not bounded.torus
     assert read(bounded.road, [[-0.3, 16.0], [64.3, 16.0], [-1.5, 16.0], [66.0, 16.0]]).max() < 0.0
     assert read(bounded.road, [[1.0, 16.0]])[0] == pytest.approx(1.0, abs=0.05)
-    torus = load_map(write_yaml(tmp_path, torus=True))
-    assert torus.torus
-    assert (float(torus.road.width), float(torus.road.height)) == (64.0, 32.0)
-    assert read(torus.road, [[-0.3, 16.0], [64.3, 16.0], [0.0, 16.0]]).min() > 3.9
-    assert np.quantile(np.abs(np.sin(torus.starts[:, 2])), 1.0) < 0.1
-    with pytest.raises(ValueError, match="torus"):
-        load_map(write_yaml(tmp_path, torus=True, resolution=0.05))
 
 
 # --- What a YAML's keys mean -----------------------------------------------------------------------------------------
@@ -249,9 +242,9 @@ def test_tiles_do_not_show():
     """A picture cut up gives what it gives whole."""
     free = np.random.default_rng(3).random((40, 1300)) < 0.97  # 0.25 m: 325 m, three tiles
     free = free.repeat(4, axis=0)
-    nodes = signed_clearance(free, 0.25, 1024, 128, False)
+    nodes = signed_clearance(free, 0.25, 1024, 128)
     for shift in (100, 333):
-        moved = signed_clearance(np.pad(free[:, 400:700], [(0, 0), (shift * 2, 0)]), 0.25, 1024, 128, False)
+        moved = signed_clearance(np.pad(free[:, 400:700], [(0, 0), (shift * 2, 0)]), 0.25, 1024, 128)
         inner = slice(shift + 20, shift + 130)
         np.testing.assert_allclose(moved[:80, inner], nodes[:80, 200 + 20 : 200 + 130], atol=1e-5)
 

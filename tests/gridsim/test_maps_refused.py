@@ -107,7 +107,6 @@ WRONG = {
     "{image: map.png, resolution: 0.1, starts: {x: 1}}": "starts",
     "{image: map.png, resolution: 0.1, starts: [[1, 2, 90]]}": "heading",
     "{image: map.png, resolution: 0.1, starts: &a [*a, *a]}": "start",
-    "{image: map.png, resolution: 0.1, torus: yes please}": "torus",
 }
 
 
@@ -167,7 +166,7 @@ scalars = st.one_of(
 values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(scalars, inner, max_size=3))
 GOOD = {
     "image": "good.png", "scale": 4, "origin": [0, 0, 0], "negate": 0, "free_thresh": 0.5, "occupied_thresh": 0.65,
-    "mode": "scale", "starts": [[20, 8, 0]], "torus": False, "speed": [5, 12],
+    "mode": "scale", "starts": [[20, 8, 0]], "speed": [5, 12],
 }  # fmt: skip
 
 
@@ -181,11 +180,11 @@ def test_any_values(small, changes, drop):
 
 
 @settings(max_examples=25)
-@given(st.integers(0, 2**32), st.floats(0.02, 0.98), st.integers(1, 32), st.sampled_from([1, 4, 10]), st.booleans())
-def test_any_pixels(small, seed, share, grain, ppm, torus):
+@given(st.integers(0, 2**32), st.floats(0.02, 0.98), st.integers(1, 32), st.sampled_from([1, 4, 10]))
+def test_any_pixels(small, seed, share, grain, ppm):
     """Blobs of any size."""
     coarse = (np.random.default_rng(seed).random((64 // grain + 1,) * 2) < share).astype(np.uint8) * 255
     save(small[0] / "blobs.png", coarse.repeat(grain, axis=0).repeat(grain, axis=1)[:64, :64])
     path = small[0] / "blobs.yaml"
-    path.write_text(f"{{image: blobs.png, scale: {ppm}, torus: {str(torus).lower()}}}")
+    path.write_text(f"{{image: blobs.png, scale: {ppm}}}")
     loads_or_is_refused(path)
