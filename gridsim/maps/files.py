@@ -47,7 +47,7 @@ PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
 KEYS = (
-    "image", "resolution", "scale", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed",
+    "image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed",
 )  # fmt: skip
 
 MAX_YAML = 1 << 16  # bytes
@@ -158,12 +158,6 @@ def _number(value: Any, what: str, low: float, high: float) -> float:
     return float(number)
 
 
-def _flag(value: Any, what: str) -> bool:
-    if not isinstance(value, bool | int) or value not in (0, 1):
-        raise ValueError(f"{what} must be true or false, not {_shown(value)}")
-    return bool(value)
-
-
 def _list(value: Any, what: str, length: int) -> list[Any]:
     if not isinstance(value, list) or len(value) != length:
         raise ValueError(f"{what} must be a list of {length} numbers, not {_shown(value)}")
@@ -177,13 +171,9 @@ def _checked(path: Path, values: Any) -> MapFile:
     unknown = [key for key in values if key not in KEYS]
     if unknown:
         raise ValueError(f"unknown key {_shown(unknown[0])}; there are: {', '.join(KEYS)}")
-    if "image" not in values or ("resolution" in values) == ("scale" in values):
-        raise ValueError("it needs an image, and either its resolution (m a pixel) or its scale (pixels a metre)")
-    finest, coarsest = RESOLUTION
-    if "scale" in values:
-        resolution = 1.0 / _number(values["scale"], "scale (pixels a metre)", 1.0 / coarsest, 1.0 / finest)
-    else:
-        resolution = _number(values["resolution"], "resolution (m a pixel)", finest, coarsest)
+    if "image" not in values or "resolution" not in values:
+        raise ValueError("it needs an image, and its resolution (m a pixel)")
+    resolution = _number(values["resolution"], "resolution (m a pixel)", *RESOLUTION)
     mode = values.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
         raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
@@ -199,6 +189,9 @@ def _checked(path: Path, values: Any) -> MapFile:
     low, high = (_number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit) for value in speed)
     if not low < high:
         raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
+    negate = values.get("negate", 0)
+    if negate not in (0, 1):
+        raise ValueError(f"negate must be true or false, not {_shown(negate)}")
     starts = values.get("starts", [])
     if not isinstance(starts, list):
         raise ValueError(f"starts must be a list of [x, y, heading], not {_shown(starts)}")
@@ -206,7 +199,7 @@ def _checked(path: Path, values: Any) -> MapFile:
         image=_image_path(path, values["image"]),
         resolution=resolution,
         origin=(x, y),
-        negate=_flag(values.get("negate", 0), "negate"),
+        negate=bool(negate),
         free_thresh=free,
         starts=tuple(_start(value) for value in starts),
         speed=(low, high),
