@@ -43,7 +43,7 @@ from gridsim.envs.observing import Observer, rewards_of, row
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
-from gridsim.sensing.grid import MAX_FRAMES, grids
+from gridsim.sensing.grid import MAX_FRAMES
 from gridsim.traffic.world import LANE
 from gridsim.view.display import has_display
 
@@ -306,7 +306,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """What car i's world looks like: uint8 [height, width, 3]."""
         from gridsim.view.render import Renderer  # here, because nothing else needs pygame
 
-        state, table = self.simulator.state, self._observer.table
+        state = self.simulator.state
         m = int(state.maps[i])
         view = self._views.get(m)
         if view is None or view.road_map is not self.simulator.scenarios[m]:
@@ -316,8 +316,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return view.draw(
             state.cars[i],
             boxes=others,
-            ranges=self.ranges[i] if table is None else None,
-            grid=None if table is None else grids(table, self.ranges[i : i + 1])[0],
+            ranges=self.ranges[i],
             path=np.array(self._paths[i]),
             text=f"{speed:.1f} m/s    {distance:,.0f} m",
         )

@@ -1,9 +1,8 @@
 """Maps from files: a picture in which bright is road, or the YAML form of ROS's map_server with a picture.
 
 A picture is thresholded at its own resolution. The signed distance to the edge between road and wall is sampled at the
-nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture, unless the map is a
-torus. World coordinates have their origin at the picture's lower left corner; a file's own coordinates are shifted by
-its `origin`.
+nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture. World coordinates have
+their origin at the picture's lower left corner; a file's own coordinates are shifted by its `origin`.
 
 A file gives the same map for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
 in the file, or poses on the ridge of the free space, heading along it in both directions.
@@ -48,8 +47,7 @@ PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
 KEYS = (
-    "image", "resolution", "scale", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "torus",
-    "speed",
+    "image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed",
 )  # fmt: skip
 
 MAX_YAML = 1 << 16  # bytes
@@ -77,7 +75,6 @@ class MapFile:
     free_thresh: float = 0.5  # darkness, 0 to 1, below which a pixel is road
     # x, y (m, the file's coordinates), heading (rad); without any, starts are found along the road.
     starts: tuple[tuple[float, float, float], ...] = ()
-    torus: bool = False  # whether leaving on one side means entering on the other
     speed: tuple[float, float] = FILE_SPEEDS  # m/s, the speed interval
 
 
@@ -161,12 +158,6 @@ def _number(value: Any, what: str, low: float, high: float) -> float:
     return float(number)
 
 
-def _flag(value: Any, what: str) -> bool:
-    if not isinstance(value, bool | int) or value not in (0, 1):
-        raise ValueError(f"{what} must be true or false, not {_shown(value)}")
-    return bool(value)
-
-
 def _list(value: Any, what: str, length: int) -> list[Any]:
     if not isinstance(value, list) or len(value) != length:
         raise ValueError(f"{what} must be a list of {length} numbers, not {_shown(value)}")
@@ -180,13 +171,9 @@ def _checked(path: Path, values: Any) -> MapFile:
     unknown = [key for key in values if key not in KEYS]
     if unknown:
         raise ValueError(f"unknown key {_shown(unknown[0])}; there are: {', '.join(KEYS)}")
-    if "image" not in values or ("resolution" in values) == ("scale" in values):
-        raise ValueError("it needs an image, and either its resolution (m a pixel) or its scale (pixels a metre)")
-    finest, coarsest = RESOLUTION
-    if "scale" in values:
-        resolution = 1.0 / _number(values["scale"], "scale (pixels a metre)", 1.0 / coarsest, 1.0 / finest)
-    else:
-        resolution = _number(values["resolution"], "resolution (m a pixel)", finest, coarsest)
+    if "image" not in values or "resolution" not in values:
+        raise ValueError("it needs an image, and its resolution (m a pixel)")
+    resolution = _number(values["resolution"], "resolution (m a pixel)", *RESOLUTION)
     mode = values.get("mode", "trinary")
     if mode not in ("trinary", "scale"):
         raise ValueError(f"mode must be trinary or scale (both have the same effect), not {_shown(mode)}")
@@ -202,6 +189,9 @@ def _checked(path: Path, values: Any) -> MapFile:
     low, high = (_number(value, "speed (m/s)", 0.0, VehicleConfig().speed_limit) for value in speed)
     if not low < high:
         raise ValueError(f"speed must be [low, high] with low below high, not [{low:g}, {high:g}]")
+    negate = values.get("negate", 0)
+    if negate not in (0, 1):
+        raise ValueError(f"negate must be true or false, not {_shown(negate)}")
     starts = values.get("starts", [])
     if not isinstance(starts, list):
         raise ValueError(f"starts must be a list of [x, y, heading], not {_shown(starts)}")
@@ -209,10 +199,9 @@ def _checked(path: Path, values: Any) -> MapFile:
         image=_image_path(path, values["image"]),
         resolution=resolution,
         origin=(x, y),
-        negate=_flag(values.get("negate", 0), "negate"),
+        negate=bool(negate),
         free_thresh=free,
         starts=tuple(_start(value) for value in starts),
-        torus=_flag(values.get("torus", False), "torus"),
         speed=(low, high),
     )
 
@@ -288,20 +277,10 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
     """Columns and rows of the field, in nodes: powers of two."""
     sides = []
     for axis in (0, 1):
-        pixels = free.shape[1 - axis]
-        if file.torus:
-            nodes = pixels * file.resolution * CELLS_PER_M
-            side = 1 << max(round(math.log2(nodes)), 0)
-            if abs(nodes / side - 1.0) > 1e-3 or side < SHORTEST_SIDE * CELLS_PER_M:
-                raise ValueError(
-                    f"a torus' sides must be {SHORTEST_SIDE}, 32, 64 ... m, not {pixels} pixels of "
-                    f"{file.resolution:g} m; scale the picture, or set its resolution"
-                )
-        else:
-            used = np.flatnonzero(free.any(axis=axis))
-            first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
-            side = power_of_two(max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE) * CELLS_PER_M)
-        sides.append(side)
+        used = np.flatnonzero(free.any(axis=axis))
+        first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
+        side = max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE)
+        sides.append(power_of_two(side * CELLS_PER_M))
     columns, rows = sides
     width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
     if columns * rows > MAX_NODES:
@@ -323,7 +302,7 @@ def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit
             stacklevel=1,
         )
     border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
-    if border >= MOST_BORDER and not file.torus:
+    if border >= MOST_BORDER:
         warnings.warn(
             f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
             f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
@@ -341,7 +320,7 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
     free = read_free(file)
     try:
         columns, rows = _sides(free, file)
-        nodes = signed_clearance(free, file.resolution, columns, rows, file.torus)
+        nodes = signed_clearance(free, file.resolution, columns, rows)
         area = np.count_nonzero(nodes > 0.0) / CELLS_PER_M**2
         if area * START_CELLS_PER_M**2 * (HEADING_BINS + HEADING_WRAP) > MAX_TABLE:
             raise ValueError(f"{area:,.0f} square metres of road are too much; check the resolution, or crop it")
@@ -364,6 +343,6 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
         lanes=lanes,
         strips=Strips.of(),
         network=make_network(lanes, width, height, 0.0, config),
-        torus=file.torus,
+        torus=False,
         starts=freeze(starts),
     )

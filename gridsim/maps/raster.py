@@ -64,25 +64,24 @@ def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
     return np.where(free, inside, -depth).astype(np.float32)
 
 
-def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: int, torus: bool) -> np.ndarray:
+def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: int) -> np.ndarray:
     """Signed clearance (m) float32 [rows, columns] at the nodes of the field, of road bool [pixels y, pixels x].
 
     Exact to a fifth of a pixel, up to the largest clearance of the field. It works tile by tile, to bound the memory.
     """
     halo = math.ceil(_HALO / resolution) + 1
     cut = max(math.ceil(resolution / _FINE - 1e-9), 1)
-    padded = np.pad(free, halo, mode="wrap") if torus else np.pad(free, halo)
+    padded = np.pad(free, halo)
     # Road that begins at the picture's edge needs wall before it: nodes with negative indices wrap to the far end.
     used = [np.flatnonzero(free.any(axis=axis))[0] * resolution for axis in (1, 0)]
-    first = [0 if torus else min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
-    per_node = [n / side if torus else _NODE / resolution for n, side in zip(free.shape, (rows, columns), strict=True)]
+    first = [min(math.floor((edge - OUTSIDE) * CELLS_PER_M), 0) for edge in used]
     nodes = np.full((rows, columns), FIELD_FLOOR, dtype=np.float32)
     for j in range(0, rows, _TILE):
         for i in range(0, columns, _TILE):
             index, window, at = [], [], []
             for k, (start, side) in enumerate(((j, rows), (i, columns))):
                 node = first[k] + np.arange(start, min(start + _TILE, side))
-                pixel = node * per_node[k]  # from the picture's lower left corner
+                pixel = node * (_NODE / resolution)  # from the picture's lower left corner
                 low = min(max(math.floor(pixel[0]), 0), padded.shape[k])
                 high = min(max(math.ceil(pixel[-1]) + 2 * halo, 0), padded.shape[k])
                 index.append(node % side)
@@ -192,7 +191,7 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
 def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
 
-    Raises: ValueError with one line if a car fits nowhere, or nowhere along a road: an open place has no direction.
+    Raises: ValueError with one line if a car fits nowhere along a road.
     """
     nodes, corner = _window(nodes)
     wide = nodes >= vehicle.width / 2 + _MARGIN

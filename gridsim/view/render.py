@@ -22,7 +22,6 @@ from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.roads import freeze
-from gridsim.sensing.grid import CELL
 from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
@@ -76,7 +75,6 @@ class Renderer:
         car: np.ndarray,
         boxes: np.ndarray | None = None,
         ranges: np.ndarray | None = None,
-        grid: np.ndarray | None = None,
         path: np.ndarray | None = None,
         text: str | Sequence[str] = (),
     ) -> np.ndarray:
@@ -86,8 +84,6 @@ class Renderer:
             car: the car's state float32 [FIELDS] (`gridsim.car.ego`).
             boxes: other cars [n, 4 or more]: x, y (m), heading (cosine, sine).
             ranges: ranges of the car's rays [rays], m.
-            grid: occupancy grid uint8 [cells, cells]: row 0 farthest ahead, column 0 leftmost; 0 unknown, 127 free, 255
-                occupied.
             path: the car's past positions [n, 2], m.
             text: a line at the lower left, or a pair of lines at the lower left and the upper left.
         """
@@ -101,8 +97,6 @@ class Renderer:
         steps = right * metre, -self._up * metre
         paint.draw_ground(self._road, self.road_map.torus, origin, *steps, self.pixels_per_m, image)
         shapes = [self._mark_shapes(), self._block_shapes()]
-        if grid is not None:
-            shapes.append(self._grid_shapes(position, heading, np.asarray(grid)))
         if path is not None:
             shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64)))
         if ranges is not None:
@@ -197,20 +191,6 @@ class Renderer:
         hit = ranges < float(k.ray_range) - 1e-3
         dots = self._shapes((origin + reach)[hit], along[hit], 0.22, 0.22, 0.22, paint.RAY, 1.0, 1.5)
         return np.concatenate([rays, dots])
-
-    def _grid_shapes(self, position: np.ndarray, heading: np.ndarray, grid: np.ndarray) -> np.ndarray:
-        row, column = np.divmod(np.arange(grid.size), grid.shape[1])
-        ahead = (grid.shape[0] - row - 0.5) * CELL + float(self._constants.front_axle)
-        left = (grid.shape[1] / 2 - column - 0.5) * CELL
-        side = np.array([-heading[1], heading[0]])
-        away = self._turn(ahead[:, None] * heading + left[:, None] * side)
-        kind = np.searchsorted([0, 127, 255], grid.ravel())
-        colour = np.array([paint.UNKNOWN, paint.FREE, paint.OCCUPIED])[kind]
-        shapes = self._shapes(
-            self.pixel(position) + away * self.pixels_per_m, self._turn(heading[None]), 0.23, 0.23, 0.0, colour, 1.0
-        )
-        shapes[:, 10] = np.array([0.16, 0.34, 0.75])[kind]
-        return shapes[self._near(shapes[:, :2], self.pixels_per_m)]
 
     def _write(self, image: np.ndarray, text: str, corner: str) -> None:
         """Write a line of text on a dark pill into a corner."""

@@ -1,4 +1,4 @@
-"""Collecting: the fused loop against a slow one around `Simulator`, step by step; nothing lost, nothing mixed up."""
+"""Collecting: the fused loop against `Simulator`, step by step; nothing lost, nothing mixed up."""
 
 import math
 from collections.abc import Iterator
@@ -14,15 +14,14 @@ from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.collecting import collect
 from evolution.episodes.rollout import Limits, evaluate, no_traffic
 from evolution.episodes.starts import lane_starts
-from evolution.networks import convnet
-from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
+from evolution.networks.policy import PolicySpec, encode
 from gridsim.car.ego import STEERING, End
-from gridsim.config import SimConfig
+from gridsim.car.reward import reward
+from gridsim.config import SimConfig, constants
 from gridsim.envs.simulator import Simulator
-from gridsim.jit import njit
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
-from gridsim.sensing.grid import CELLS, grid_table, grids, push_frames
+from gridsim.sensing.grid import grid_table, grids
 
 F = np.float32
 CONFIG = SimConfig()
@@ -86,109 +85,33 @@ def cut_up(experience: Experience) -> Iterator[Experience]:
     assert first == len(experience.actions)
 
 
-# --- An independent slow loop ----------------------------------------------------------------------------------------
-
-MASK = (1 << 64) - 1
-
-
-def draw(key: int, place: int) -> int:
-    """SplitMix64 in whole numbers."""
-    x = (key + place * 0x9E3779B97F4A7C15) & MASK
-    x = ((x ^ x >> 30) * 0xBF58476D1CE4E5B9) & MASK
-    x = ((x ^ x >> 27) * 0x94D049BB133111EB) & MASK
-    return x ^ x >> 31
-
-
-@njit
-def _greedy(packed, layers, ranges, closing, speed, steering, scratch):
-    encode(ranges, closing, speed, steering, scratch)
-    return decide(packed, layers, scratch)
-
-
-class Slow:
-    """One episode by `Simulator.step`, the network called from outside, all the rest in plain Python."""
-
-    def __init__(self, of: Asked):
-        """Drive the one episode that is asked for."""
-        ((episode,), (world,)), spec = (of.episodes, of.worlds), of.spec
-        self.scenario = of.scenarios[episode["map"]]
-        simulator = Simulator([self.scenario], 1, CONFIG, of.limits.target, of.limits.steps, traffic=len(world))
-        ranges, speeds = simulator.reset(episode["start"][None], worlds=world[None] if len(world) else None)
-        stack = np.zeros((1, spec.frames if isinstance(spec, CnnSpec) else 1, CELLS, CELLS), dtype=np.uint8)
-        packed = pack(of.weights, spec.layers) if isinstance(spec, MlpSpec) else of.weights
-        scratch, base = np.zeros(scratch_size(spec.layers), dtype=F), draw(int(of.keys[0]), 0)
-        motion = isinstance(spec, MlpSpec) and spec.motion
-        self.inputs: list[np.ndarray] = []
-        self.actions: list[int] = []
-        self.rewards: list[float] = []
-        self.greedy = 0
-        end = 0
-        while True:
-            if isinstance(spec, CnnSpec):
-                push_frames(stack, grids(grid_table(CONFIG), ranges), np.array([not self.inputs]))
-                self.inputs.append(np.append(stack.reshape(-1) / 255.0, speeds[0] / 10.0 - 1.0))
-                seen = stack[0] if spec.frames > 1 else stack[0, 0]
-                action = convnet.act_on(spec, of.weights, seen, speeds[0])
-            else:
-                near = 2.0 * ranges[0].astype(float) / (ranges[0] + 8.0) - 1.0
-                closing = simulator.closing[0].copy() if motion else None
-                fast = closing.astype(float) / 10.0 if closing is not None else []
-                wheels = simulator.state.cars[0, STEERING]
-                turned = [wheels / 0.5] if isinstance(spec, MlpSpec) and spec.steering else []
-                self.inputs.append(np.concatenate([near, fast, speeds / 10.0 - 1.0, turned]))
-                action = _greedy(packed, spec.layers, ranges[0], closing, speeds[0], wheels, scratch)
-            if end:
-                break
-            bits = draw(base, len(self.actions))
-            if (bits >> 40) / 2**24 < of.epsilons[0]:
-                action = (bits & 0xFFFFFFFF) * 8 >> 32
-            else:
-                self.greedy += 1
-            ranges, speeds, progress, ends = simulator.step(np.array([action]))
-            end = int(ends[0])
-            self.actions.append(int(action))
-            self.rewards.append(self.reward(ranges[0], speeds[0], progress[0], end))
-        self.end = end
-
-    def reward(self, ranges: np.ndarray, speed: float, progress: float, end: int) -> float:
-        """As the paper has it, in float64."""
-        if end == End.COLLISION:
-            return -1.0
-        fastest = float(self.scenario.road.speed_high)
-        return (
-            0.15 * min(float(progress) / (fastest * 0.1), 1.0)
-            + 0.15 * min(max(float(speed) / fastest, 0.0), 1.0)
-            + 0.7 * float(ranges.min()) / 50.0
-        )
-
-
 @pytest.mark.parametrize("cars", [0, CARS])
-@pytest.mark.parametrize("policy", POLICIES)
-def test_every_row_is_what_a_slow_loop_sees_does_and_gains(
+@pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "cnn:8,8,16@3"])
+def test_every_row_is_what_the_simulator_shows_for_these_actions(
     scenarios: list[Map], driver: np.ndarray, policy: str, cars: int
 ) -> None:
     of = asked(policy, scenarios, driver, 8, 0.3, cars)
     experience, results = collect(*of)
-    episodes = list(cut_up(experience))
-    assert len(episodes) == 8
-    rows, greedy = np.arange(len(experience.actions)), 0
-    inputs = unpack(of.spec, experience.observations, rows, ages(experience))
-    first = 0
-    for k, (episode, result) in enumerate(zip(episodes, results, strict=True)):
-        slow = Slow(of.only([k]))
-        steps = len(slow.actions)
-        assert (int(result["steps"]), int(result["end"])) == (steps, slow.end)
-        assert episode.actions.tolist() == [*slow.actions, NO_ACTION]
-        assert episode.rewards == pytest.approx([*slow.rewards, 0.0], abs=2e-6)
-        assert episode.ends.tolist() == [0] * (steps - 1) + [slow.end, 0]
-        seen = inputs[first : first + steps + 1]
-        assert np.abs(seen - np.array(slow.inputs)).max() < 0.6 / 4096
-        first += steps + 1
-        greedy += slow.greedy
-    assert results["steps"].sum() > 150
-    assert 0.6 < greedy / results["steps"].sum() < 0.8
-    if cars and policy == "mlp:9+motion":
-        assert np.abs(inputs[:, 31:62]).max() > 0.1, "nobody was met"
+    inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
+    row, table, k, seen = 0, grid_table(CONFIG), constants(CONFIG), np.zeros(64, dtype=F)
+    for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
+        road = scenarios[episode["map"]]
+        simulator = Simulator([road], 1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
+        ranges, speeds = simulator.reset(episode["start"][None], worlds=world[None] if cars else None)
+        for step in range(int(result["steps"]) + 1):
+            encode(ranges[0], simulator.closing[0], speeds[0], simulator.state.cars[0, STEERING], seen)
+            shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
+            assert np.abs(inputs[row, -len(shown) :] - shown).max() < 0.6 / 4096
+            row += 1
+            if step == result["steps"]:
+                assert (experience.actions[row - 1], experience.rewards[row - 1]) == (NO_ACTION, 0.0)
+                break
+            ranges, speeds, progress, ends = simulator.step(experience.actions[row - 1 : row].astype(int))
+            gained = reward(ranges[0], k.ray_range, speeds[0], progress[0], ends[0], road.road.speed_high, k.dt)
+            assert experience.rewards[row - 1] == pytest.approx(gained, abs=2e-6)
+            assert experience.ends[row - 1] == ends[0]
+        assert ends[0] == result["end"]
+    assert row == len(experience.actions) > 150
 
 
 @pytest.mark.parametrize("cars", [0, CARS])

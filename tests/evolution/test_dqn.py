@@ -1,9 +1,8 @@
-"""The learner: its targets by hand, its gradients, the networks against the policies', and exact resume."""
+"""The learner: its targets by hand, its gradients, and exact resume."""
 
 import copy
 import math
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -14,7 +13,6 @@ from evolution.dqn.replay import Batch, Replay
 from evolution.networks import policy
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
-from gridsim.maps.roads import freeze
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:5")
@@ -54,29 +52,6 @@ def replay_of_random_episodes():
 
 
 # --- Networks --------------------------------------------------------------------------------------------------------
-
-
-@numba.njit
-def mlp_outputs(genome, layers, inputs, outputs):
-    packed = policy.pack(genome, layers)
-    scratch = np.zeros(policy.scratch_size(layers), dtype=np.float32)
-    for n in range(inputs.shape[0]):
-        scratch[: inputs.shape[1]] = inputs[n]
-        at = policy.forward(packed, layers, scratch)
-        outputs[n] = scratch[at : at + outputs.shape[1]]
-
-
-@pytest.mark.parametrize("text", ["mlp:64,64", "mlp:3+motion+steering", "mlp:9,8,7"])
-def test_a_network_gives_what_the_policy_gives(text):
-    """Networks on grids are compared in test_export."""
-    spec = PolicySpec.parse(text)
-    genome, outputs = random_genome(spec), np.empty((50, 8), dtype=F)
-    inputs = np.random.default_rng(2).uniform(-3, 3, (50, spec.inputs)).astype(F)
-    mlp_outputs(freeze(genome.copy()), spec.layers, inputs, outputs)
-    assert np.ptp(outputs) > 1
-    learner = learner_of(genome, spec)
-    assert learner.q_values(inputs) == pytest.approx(outputs, abs=1e-5)
-    assert np.array_equal(learner.weights, genome)
 
 
 def test_squash_has_the_gradient_of_tanh():
@@ -119,24 +94,6 @@ def test_targets_by_hand():
 
 
 # --- Gradients -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("text", ["mlp:6,7", "cnn:8,8,8@1"])
-def test_gradients_are_those_of_finite_differences(text):
-    """In the network's own precision, so by the direction of the gradient: a long step, and a small share of error."""
-    spec = PolicySpec.parse(text)
-    learner = learner_of(random_genome(spec), spec, huber_delta=1e3)
-    batch = random_batch(spec, 32)._replace(discounts=np.zeros(32, dtype=F))
-    gradients = torch.autograd.grad(learner.loss(batch)[0], learner._leaves)
-    gradient = torch.cat([part.flatten() for part in gradients])
-    direction = gradient / torch.linalg.vector_norm(gradient)
-    ends = []
-    for side in (-1, 1):
-        learner.online.genome.add_(direction, alpha=side * 2e-3)
-        ends.append(learner.loss(batch)[0].item())
-        learner.online.genome.sub_(direction, alpha=side * 2e-3)
-    slope = (ends[1] - ends[0]) / 4e-3
-    assert slope == pytest.approx(torch.linalg.vector_norm(gradient).item(), rel=0.02)
 
 
 def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():

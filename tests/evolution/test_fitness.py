@@ -27,15 +27,6 @@ def one(drives):
     return results([[d for d, _ in drives]], [[d * share for d, share in drives]])
 
 
-@given(drives=episodes, target=st.floats(1.0, 2000.0))
-def test_everything_is_a_share(drives, target):
-    row = one(drives)
-    assert elements(row, target).shape == (1, 2)
-    assert scalar(row, target).shape == (1,)
-    for value in (*elements(row, target)[0], scalar(row, target)[0]):
-        assert 0.0 <= value <= 1.0 + 1e-12
-
-
 def test_nothing_is_0_and_the_target_is_1():
     assert elements(results([[0.0]], [[0.0]]), TARGET).tolist() == [[0.0, 0.0]]
     assert scalar(results([[0.0]], [[0.0]]), TARGET).tolist() == [0.0]

@@ -1,4 +1,4 @@
-"""The replay: transitions by hand and by an oracle, what is drawn and how often, exact restore."""
+"""The replay: transitions by an oracle, what is drawn and how often, exact restore."""
 
 import copy
 
@@ -39,22 +39,6 @@ def numbers(observations, spec=RAYS):
     if spec is RAYS:
         return np.rint(observations[:, 0] * 4096 + observations[:, 1] * 4096 * 4096).astype(int)
     return np.rint(observations[:, -1] * 4096).astype(int)
-
-
-@pytest.mark.parametrize("end", [*TERMINAL, End.TIME])
-def test_transitions_by_hand(end):
-    """The value after the last step counts only if the episode was truncated."""
-    replay = Replay(RAYS, 10, discount=0.9)
-    replay.add(episode([1, 2, 4], end))
-    batch = replay.sample(3, 200)
-    seen = {
-        (int(number), int(action), float(reward), int(after), round(float(discount), 6))
-        for number, action, reward, after, discount in zip(
-            numbers(batch.observations), batch.actions, batch.rewards, numbers(batch.next_observations),
-            batch.discounts, strict=True,
-        )
-    }  # fmt: skip
-    assert seen == {(0, 0, 1, 1, 0.9), (1, 1, 2, 2, 0.9), (2, 2, 4, 3, 0.9 if end == End.TIME else 0)}
 
 
 EPISODES = st.lists(

@@ -17,7 +17,7 @@ from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import ALONG, LANE, SHIFT, spawn
+from gridsim.traffic.world import ALONG, LANE, SHIFT
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
 F = np.float32
@@ -121,16 +121,6 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
                 assert simulator.state.worlds[i].tobytes() == traffic[at].tobytes()
             ranges, speeds, _, ends = simulator.step(wheel(ranges, speeds))
         assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
-
-
-def test_a_key_stands_for_its_world(among):
-    _, _, maps, episodes, _, _ = among
-    keys = np.arange(9, dtype=np.uint64) + 70
-    simulator = Simulator(maps, 9, CONFIG, traffic=CARS)
-    simulator.reset(episodes["start"], episodes["map"], keys=keys)
-    for k, episode in enumerate(episodes):
-        world = spawn(maps[episode["map"]].network, episode["start"][None], CARS, keys[k : k + 1], CONFIG)
-        assert simulator.state.worlds[k].tobytes() == world[0].tobytes()
 
 
 def test_what_is_rewound_goes_on_as_it_did(among):

@@ -8,7 +8,6 @@ from searching import new_genomes
 
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
-from evolution.search.breeding import RECIPE, Kind, Mutation, breed, moments
 from gridsim.car.vehicle import Action
 
 F = np.float32
@@ -89,17 +88,3 @@ def test_kernels_of_a_cnn_come_in_mirrored_pairs(frames):
     assert (output == output[::-1][:, MIRRORED_ACTIONS]).all()
     for biases in (layer[1] for layer in layers[:3]):
         assert (biases == biases[::-1]).all()
-
-
-def test_a_step_is_symmetric_whatever_its_centre_is():
-    spec = PolicySpec.parse("mlp:5+steering")
-    centre = np.random.default_rng(2).normal(size=spec.size).astype(F)
-    _, bound, source, factor = symmetry(spec)
-    recipes = np.zeros(20, dtype=RECIPE)
-    recipes["kind"], recipes["b"], recipes["seed"] = Kind.STEP, 1, np.arange(20)
-    noise = breed(np.stack([centre, np.ones(spec.size, F)]), recipes, 7, spec, Mutation()) - centre
-    np.testing.assert_allclose(noise[:, bound], factor * noise[:, source], atol=2e-6)
-    rng = np.random.default_rng(3)
-    first, second = moments(np.arange(20), rng.normal(size=20), rng.random(20), 7, spec)
-    assert (first[bound] == factor * first[source]).all()
-    assert (second[bound] == factor**2 * second[source]).all()

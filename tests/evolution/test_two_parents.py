@@ -59,17 +59,6 @@ def test_mutation_is_as_asked_for():
     assert search.ask().mutation == Mutation(rate=0.2, sigma=0.7)
 
 
-def test_the_pool_is_what_tournaments_won():
-    """Every parent is a member of the generation, and fitter ones are there more often."""
-    standing = []
-    for seed in range(8):
-        search = TwoParents(SPEC, SearchConfig(population=200, groups=1, tournament=4, elites=0), seed)
-        members = told(search, first_gene)
-        rank = {m.tobytes(): r for r, m in enumerate(members[np.argsort(-first_gene(members))])}
-        standing += [rank[p.tobytes()] for p in search.parents]
-    assert np.mean(standing) == pytest.approx(200 / 5, abs=5)  # the best of four of n is on average the n / 5th
-
-
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_who_has_no_score_is_neither_elite_nor_parent(bad):
     """Not even where all of its group is spoilt, and so equal."""

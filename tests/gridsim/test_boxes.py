@@ -15,7 +15,7 @@ from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
+from gridsim.sensing.boxes import cast_boxes, hits_box, top_speed_near
 from gridsim.sensing.rays import fan
 from gridsim.traffic.world import ALONG, COS, FIELDS, JUNCTION_BEHIND, LANE, PERMIT, SIN, SPEED, SPEED_FACTOR, X, Y
 
@@ -185,33 +185,6 @@ def test_the_fastest_of_the_near_boxes_is_found_across_the_seam():
     assert [top_speed_near(world, F(reach), F(SIDE), F(SIDE), F(4.0), F(128.0)) for reach in (9, 11, 17)] == [-1, 3, 5]
     world[0, LANE] = -1.0
     assert top_speed_near(world, F(11.0), F(SIDE), F(SIDE), F(4.0), F(128.0)) == -1.0
-
-
-@pytest.mark.parametrize("heading", [0.0, 1.0, -2.5])
-def test_a_box_is_looked_at_where_it_was(heading):
-    """Half a period ago a car at 30 m/s was 1.5 m further back."""
-    world = parked((100.0, 100.0, heading))
-    world[:, SPEED] = 30.0
-    c, s = math.cos(heading), math.sin(heading)
-    for back in (0.0, 0.25, 0.5, 1.0):
-        for beyond in (-0.01, 0.01):
-            behind = 4.0 + 3.0 * back + beyond
-            x, y = F(100.0 - behind * c), F(100.0 - behind * s)
-            hit = hits_box(K, world, F(back), F(0.1), F(SIDE), F(SIDE), x, y, F(c), F(s))
-            assert hit == (beyond < 0)
-
-
-@pytest.mark.parametrize(
-    ("forward", "aside", "speed", "expected"),
-    [(6, 0, 0, True), (13.9, 0, 0.4, True), (14.1, 0, 0, False), (6, 0, 0.6, False), (6, 1.9, 0, True),
-     (6, 2.1, 0, False), (6, -2.1, 0, False), (-6, 0, 0, False)],
-)  # fmt: skip
-def test_who_stands_ahead(forward, aside, speed, expected):
-    heading = 2.0
-    c, s = math.cos(heading), math.sin(heading)
-    world = parked(((250.0 + forward * c - aside * s) % SIDE, (3.0 + forward * s + aside * c) % SIDE, heading))
-    world[:, SPEED] = speed
-    assert stands_ahead(K, world, F(SIDE), F(SIDE), F(250.0), F(3.0), F(c), F(s)) == expected
 
 
 # --- Collisions in the simulator -------------------------------------------------------------------------------------

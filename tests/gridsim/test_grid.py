@@ -9,11 +9,8 @@ from hypothesis.extra import numpy as arrays
 
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.sensing.grid import (
-    CELLS,
-    fill_grid,
     grid_table,
     grids,
-    push_frames,
 )
 
 F = np.float32
@@ -60,30 +57,3 @@ def test_every_cell_is_what_geometry_says(sensors, shares):
     expected, unsure = cell_by_cell(config, ranges)
     assert (grids(grid_table(config), ranges[None])[0] == expected)[~unsure].all()
     assert unsure.mean() < 0.1
-
-
-def test_a_batch_is_its_cars():
-    ranges = np.random.default_rng(2).uniform(0, 50, (20, 31)).astype(F)
-    alone = np.full((20, CELLS * CELLS), 77, dtype=np.uint8)
-    for row, grid in zip(ranges, alone, strict=True):
-        fill_grid(TABLE, row, grid)
-    assert (grids(TABLE, ranges).reshape(20, -1) == alone).all()
-    assert (grids(TABLE, ranges[::2]).reshape(10, -1) == alone[::2]).all()
-    assert grids(TABLE, ranges[:0]).shape == (0, 80, 80)
-
-
-@settings(max_examples=20, derandomize=True, deadline=None)
-@given(frames=st.integers(1, 5), begins=st.lists(st.booleans(), min_size=1, max_size=12))
-def test_a_stack_holds_the_last_frames_newest_last(frames, begins):
-    stack = np.zeros((2, frames, 80, 80), dtype=np.uint8)
-    past: list[np.ndarray] = []
-    rng = np.random.default_rng(4)
-    for step, begin in enumerate(begins):
-        new = rng.integers(0, 256, (2, 80, 80)).astype(np.uint8)
-        begun = np.array([begin or step == 0, step == 0])
-        push_frames(stack, new, begun)
-        past.append(new)
-        for car in range(2):
-            first = max(k for k in range(step + 1) if k == 0 or (car == 0 and begins[k]))
-            wanted = [past[max(k, first)][car] for k in range(step - frames + 1, step + 1)]
-            assert (stack[car] == np.array(wanted)).all()

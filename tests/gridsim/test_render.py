@@ -135,19 +135,6 @@ def test_rays_end_where_the_ranges_say(scenario, state):
     assert seen > 15
 
 
-def test_grid_is_drawn_ahead_with_left_on_the_left(scenario, state):
-    car, _ = state
-    renderer = Renderer(scenario, (640, 480))
-    grid = np.full((80, 80), 127, dtype=np.uint8)
-    grid[40, 10] = 255  # 19.75 m ahead of the front axle, 14.75 m to the left
-    image = renderer.draw(car, grid=grid)
-    reddest = image[..., 0].astype(int) - image[..., 1]
-    car_free = reddest[: int(480 * render.CAR_AT) - 40]
-    row, column = np.unravel_index(car_free.argmax(), car_free.shape)
-    assert 480 * render.CAR_AT - row == pytest.approx((1.25 + 19.75) * renderer.pixels_per_m, abs=4)
-    assert 320 - column == pytest.approx(14.75 * renderer.pixels_per_m, abs=4)
-
-
 def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
     flat = dataclasses.replace(scenario, torus=False)
     image = Renderer(flat, (320, 240)).draw(car_at(0.0, 100.0, np.pi))  # heading out of the map

@@ -19,7 +19,6 @@ from gridsim.maps.roads import (
     Strips,
     clearance_nodes,
     freeze,
-    power_of_two,
 )
 
 SIDE = 64.0  # m, of the small maps
@@ -93,14 +92,6 @@ def test_the_world_is_a_torus(scenario, x, y, i, j):
 def test_sides_that_do_not_fit_are_refused(width, height):
     with pytest.raises(ValueError, match="powers of two"):
         clearance_nodes(Strips.of(), width, height)
-
-
-@given(n=st.floats(0.01, 1e6))
-def test_power_of_two(n):
-    power = power_of_two(n)
-    assert power.bit_count() == 1
-    assert power >= n
-    assert power == 1 or power / 2 < n
 
 
 # --- The start table -------------------------------------------------------------------------------------------------

@@ -1,12 +1,11 @@
 """The graphs of tiles of the seamless road, and its roundabouts, over hundreds of seeds."""
 
-import math
 from collections import Counter
 
 import numpy as np
 import pytest
 
-from gridsim.maps.generators.seamless import LANE_WIDTH, TILE, TILES, seamless_layout, tile_graph
+from gridsim.maps.generators.seamless import TILE, TILES, seamless_layout, tile_graph
 
 GRAPHS, LAID = 300, 60  # seeds of which graphs are looked at, and lanes and strips
 
@@ -26,18 +25,6 @@ def test_all_kinds_of_tiles_appear_turned_all_ways(graphs):
     assert min(edges.any(axis=1).sum() for edges in graphs) >= TILES * TILES // 2
     assert len(seen) == 12  # none; 2 straights, 4 curves, 4 Ts, 1 crossing
     assert min(seen.values()) > 0.005 * seen.total()
-
-
-def test_lanes_keep_to_the_right(laid):
-    """On a tile's edge a lane enters and leaves half a lane's width to the right of the road's centre line."""
-    for _, lanes, _, _ in laid[:10]:
-        for i in range(len(lanes)):
-            points = lanes.points[lanes.offsets[i] : lanes.offsets[i + 1]].astype(float)
-            for point, (dx, dy) in ((points[0], points[1] - points[0]), (points[-1], points[-1] - points[-2])):
-                angle = round(math.atan2(dy, dx) / (math.pi / 2)) * math.pi / 2
-                middle = (np.floor(point / TILE + 1e-6) + 0.5) * TILE
-                across = math.remainder((point - middle) @ [math.sin(angle), -math.cos(angle)], TILE)
-                assert across == pytest.approx(LANE_WIDTH / 2, abs=1e-3)
 
 
 def test_roundabouts_appear_and_only_at_junctions(graphs, laid):

@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 import oracle
 import pytest
@@ -12,7 +11,7 @@ from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
 from gridsim.sensing.rays import fan, sense
-from gridsim.sensing.simd import AMONG_THIN_WALLS, PLAIN, SIMD_RAYS, vector_march
+from gridsim.sensing.simd import SIMD_RAYS
 
 F = np.float32
 K = constants(SimConfig())
@@ -21,19 +20,6 @@ REACH = 50.0
 RAYS = np.radians(np.linspace(-60.0, 60.0, 31))
 POSES_A_MAP = 2500
 MAPS = (0, 1, 2, 3)
-
-
-def compiled(how):
-    vector = vector_march(how)
-
-    @numba.njit
-    def call(field, columns, rows, px, py, reach, beams):
-        vector(field, columns, rows, px, py, reach, beams)
-
-    return call
-
-
-VECTOR = {how: compiled(how) for how in (PLAIN, AMONG_THIN_WALLS)}
 
 
 def look(road, points, headings, k=K, count=31):
@@ -172,23 +158,3 @@ def test_any_number_of_rays(scenario, views, rays, view):
     error = np.abs(seen - views[0].exact.cast(points, angles, REACH))
     assert np.quantile(error, 0.5) <= 0.03
     assert np.quantile(error, 0.97) <= 0.2
-
-
-def test_a_short_reach_cuts_what_a_long_one_sees(scenario, views):
-    short = constants(SimConfig(sensors=SensorConfig(range=20.0)))
-    points, headings, seen = views[0].points[:300], views[0].headings[:300], views[0].seen[:300]
-    cut = look(scenario.road, points, headings, short)
-    assert cut.max() == 20.0
-    assert np.quantile(np.abs(cut - np.minimum(seen, 20.0)), 0.98) < 0.05
-
-
-@pytest.mark.parametrize("how", [PLAIN, AMONG_THIN_WALLS])
-@pytest.mark.parametrize("start", [0.0, 30.0, REACH, 60.0])
-def test_the_march_takes_a_start_and_stays_within_reach(scenario, start, how):
-    road, angles = scenario.road, np.linspace(0, 6, SIMD_RAYS)
-    beams = np.stack([np.cos(angles), np.sin(angles), np.full(SIMD_RAYS, start)]).astype(F)
-    VECTOR[how](road.field, road.columns, road.rows, F(10.0), F(10.0), F(REACH), beams)
-    assert beams[2].min() >= 0.0
-    assert beams[2].max() <= REACH
-    if start >= REACH:
-        assert (beams[2] == REACH).all()

@@ -274,25 +274,6 @@ def test_a_round_longer_than_200_m_is_new_ground_again(plain):
     assert r.states[-1, ODOMETER] == pytest.approx(r.states[-1, DISTANCE], abs=1.0)
 
 
-@pytest.mark.parametrize(
-    ("speed", "action", "end", "steps", "metres"),
-    [
-        (0.0, Action.NONE, "IDLE", 15, 0.0),
-        (0.49, Action.NONE, "IDLE", 15, 0.735),
-        (0.51, Action.NONE, "TIME", 100, 5.1),
-        (-3.0, Action.REVERSE, "IDLE", 15, 0.0),
-        (20.0, Action.NONE, "TIME", 100, 200.0),
-    ],
-)
-def test_15_steps_with_less_than_5_cm_of_new_ground_end_an_episode(straight, speed, action, end, steps, metres):
-    """Over the border of the torus, too."""
-    r = run(straight, [1010, 32, 0, speed, 0], always(action), max_steps=100)
-    assert (r.end, len(r.actions)) == (end, steps)
-    assert r.states[-1, DISTANCE] == pytest.approx(metres, abs=1e-3)
-    assert r.states[-1, X] == pytest.approx((1010 + speed * 0.1 * steps) % 1024, abs=1e-2)
-    assert r.states[-1, PACED] == 0.0
-
-
 def test_back_and_forth_earns_the_furthest_point(straight):
     """The classic cheat: ground is made good before anything counts again."""
     plan = [Action.ACCELERATE] * 15 + [Action.BRAKE] * 20 + [Action.REVERSE] * 7 + [Action.ACCELERATE] * 13

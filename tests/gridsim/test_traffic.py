@@ -30,7 +30,6 @@ from gridsim.traffic.world import (
     NEXT,
     PERMIT,
     SECOND_NEXT,
-    SHIFT,
     SIN,
     SPEED,
     SPEED_FACTOR,
@@ -409,51 +408,6 @@ def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario, wid
             assert not boxes_touch(constants(config), *away, near[COS], near[SIN], stands[COS], stands[SIN])
         poses = np.column_stack([cars[:, X], cars[:, Y], np.arctan2(cars[:, SIN], cars[:, COS])])
         assert not crashes(here.road, poses, config).any()
-
-
-def test_a_car_boxed_in_stays(abreast):
-    """The lane beside is held by one who is level."""
-    world = cars_on(abreast, (1, 200.0, 8.0, 0.4), (1, 185.0, 8.0, 1.0), (0, 186.0, 8.0, 0.4), (0, 205.0, 8.0, 0.4))
-    history = watch(abreast, world, 30)
-    assert (history[:, 1, LANE] == 1).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_nobody_cuts_in_on_another(seed):
-    """At each change of lanes on a dense highway neither the new follower nor the car itself has to brake harder than
-    is safe, by the oracle's law and their places just before."""
-    network = build("highway", seed).network
-    world = spawn(network, FAR[None], 30, np.array([seed], dtype=np.uint64), CONFIG)[0]
-    history = watch(network, world, 300)
-    lane, shift = history[:, :, LANE], history[:, :, SHIFT]
-    changes = [(t, i) for t, i in np.argwhere((shift[1:] != 0) & (shift[:-1] == 0)) if lane[t + 1, i] >= 0]
-    assert len(changes) > 20
-    followed = 0
-    for t, i in changes:
-        before, target = history[t].astype(float), int(lane[t + 1, i])
-        ahead: list[tuple[float, int]] = []
-        behind: list[tuple[float, int]] = []
-        mine = before[i]
-        if abs(history[t + 1, i, ALONG] - mine[ALONG]) > 10:
-            continue  # it came to the next piece of road in the same step
-        for j, other in enumerate(before):
-            dx, dy = other[X] - mine[X], other[Y] - mine[Y]
-            dx, dy = (dx + 512) % 1024 - 512, (dy + 64) % 128 - 64
-            if j != i and int(other[LANE]) == target and abs(dx) < 100:
-                forward = dx * mine[COS] + dy * mine[SIN]
-                (ahead if forward > 0 else behind).append((abs(forward), j))
-        for near, leads in ((ahead, True), (behind, False)):
-            if not near:
-                continue
-            gap, j = min(near)
-            rear, lead = (mine, before[j]) if leads else (before[j], mine)
-            at = network.offsets[int(rear[LANE])] + int(rear[ALONG] / network.steps[int(rear[LANE])])
-            desired = rear[SPEED_FACTOR] * network.speeds[at]
-            # Along bends of 150 m lanes differ in length by a few percent.
-            pace = oracle.idm(CONFIG, rear[SPEED], desired, gap * 1.03 + 0.3 - LENGTH, lead[SPEED])
-            assert pace > -CONFIG.traffic.safe_braking
-            followed += 1
-    assert followed > 20
 
 
 def test_more_cars_than_fit_leave_some_out():

@@ -29,8 +29,8 @@ STAGES = (16.0,)  # m, to which rays are cast before they are cast to their whol
 class ExactRoad:
     """Capsules (lines) and round-ended annular sectors (arcs), united, without rectangles (blocks), on a torus."""
 
-    def __init__(self, strips: Strips, width: float, height: float, torus: bool = True):
-        self.width, self.height, self.torus = width, height, torus
+    def __init__(self, strips: Strips, width: float, height: float):
+        self.width, self.height = width, height
         pieces = []  # arcs cut into pieces of a quarter turn at most: within one, two half planes bound the sector
         for cx, cy, radius, first, sweep, half_width in strips.arcs:
             n = max(1, math.ceil(abs(sweep) / (math.pi / 2) - 1e-9))
@@ -72,9 +72,6 @@ class ExactRoad:
         return lines, arcs, blocks
 
     def _shifts(self, at: float, radius: float, side: float) -> Iterator[float]:
-        if not self.torus:
-            yield 0.0
-            return
         # A strip may reach a side's length beyond the map itself.
         for k in range(math.floor((at - radius) / side) - 1, math.floor((at + radius) / side) + 2):
             yield k * side
@@ -160,7 +157,7 @@ class ExactRoad:
 
     def widened(self, margin: float) -> ExactRoad:
         """The road with its edges moved outwards by `margin` (m), inwards if that is negative."""
-        wider = ExactRoad(Strips(self.lines, self.arcs, self.blocks), self.width, self.height, self.torus)
+        wider = ExactRoad(Strips(self.lines, self.arcs, self.blocks), self.width, self.height)
         wider.lines[:, 4] += margin
         wider.arcs[:, 5] += margin
         wider.blocks[:, 3:5] -= margin
