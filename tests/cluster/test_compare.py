@@ -36,8 +36,6 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
         ([tmp_path / "a" / "config.json"], "no folder"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
-        (["--learners", "sarsa"], "sarsa"),
-        (["--budget", "20m"], "--budget"),
         (["--workers", -1], "--workers"),
         (["--workers", 0, "--address", "auto"], "--address"),
         (["--resume", "nowhere"], "no such folder"),
