@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from rich.console import Console
+from rich.progress import track
 
 from cluster.commands.common import FAILED, RoadFlags, UsageError, command_path, fail, main, parse, wrong_use
 from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
@@ -275,17 +276,13 @@ def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     renderer = Renderer(drives[0][0].scenario, size)
     pictures = itertools.chain.from_iterable(frames(renderer, drive, fps, title) for drive, title in drives)
     console = Console()
-    with console.status(f"filming {seconds:.0f} s of driving") as status:
-
-        def counted() -> Iterator[np.ndarray]:
-            for k, image in enumerate(itertools.islice(pictures, total)):
-                status.update(f"filming {seconds:.0f} s of driving: picture {k} of {total}")
-                yield image
-
-        try:
-            count = write_video(output, counted(), size, fps)
-        except VideoError as error:
-            fail(WATCH, str(error), code=FAILED)
+    shown = track(
+        itertools.islice(pictures, total), f"filming {seconds:.0f} s of driving", total, console=console, transient=True
+    )
+    try:
+        count = write_video(output, shown, size, fps)
+    except VideoError as error:
+        fail(WATCH, str(error), code=FAILED)
     end = drives[0][0].end
     how = "" if end == End.RUNNING else f", to its end: {end.name.lower()}"
     size_mb = output.stat().st_size / 1e6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -113,7 +113,7 @@ def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") ->
         yield picture(renderer, drive, k / fps, title)
 
 
-def write_video(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float) -> int:
+def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> int:
     """Write pictures uint8 [h, w, 3] as H.264 in an MP4, or as a GIF, by the path's suffix; whole or not at all.
 
     Returns: how many there were. Raises: VideoError with one line; a file that was there before is then kept.
@@ -130,7 +130,7 @@ def write_video(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int
     return count
 
 
-def _encode(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: float, coding: list[str]) -> int:
+def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float, coding: list[str]) -> int:
     """Pipe pictures through ffmpeg. Raises VideoError where there is none or it fails."""
     import imageio_ffmpeg
 
