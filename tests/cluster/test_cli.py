@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tracked
-from commands import all_in_mlflow, call, descendants, duration_s, finish, rows, same_run, start, summary, wait_until
+from commands import all_in_mlflow, descendants, duration_s, finish, refused, rows, same_run, start, summary, wait_until
 
 from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, dqn_main, evaluate_main, evolve_main
 from cluster.commands.compare import CompareFlags, compare_main
@@ -180,20 +180,11 @@ WRONG = [
 ]
 
 
-def said_by(monkeypatch, capsys, *arguments, main=evolve_main, prog="gridsim-evolve"):
-    """What a command says on its standard error where it refuses to begin."""
-    code, out, err = call(main, monkeypatch, capsys, *arguments)
-    assert (code, out) == (2, "")
-    assert err.startswith(f"{prog}: error: ")
-    return err.splitlines()
-
-
 @pytest.mark.parametrize(("arguments", "expected"), WRONG)
 def test_wrong_use_is_one_clear_line(arguments, expected, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     began = time.monotonic()
-    lines = said_by(monkeypatch, capsys, "--workers", "0", *arguments.split())
-    assert len(lines) <= 2
+    lines = refused(evolve_main, monkeypatch, capsys, "--workers", "0", *arguments.split())
     assert expected in lines[0]
     assert time.monotonic() - began < 30
     assert list(tmp_path.iterdir()) == []  # nothing half-written
@@ -213,10 +204,10 @@ def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(
     prog = f"gridsim-{main.__name__.removesuffix('_main')}"
     for flag, instead in flags.removed.items():
         for spelling in (flag, "--" + flag[2:].replace("-", "_")):
-            (line,) = said_by(monkeypatch, capsys, *form.format(spelling).split(), main=main, prog=prog)
+            (line,) = refused(main, monkeypatch, capsys, *form.format(spelling).split())
             assert line == f"{prog}: error: {flag} was removed: {instead}"
     # As a value it is one.
-    lines = said_by(monkeypatch, capsys, "--name", "parents", "--population", "3", "--workers", "0")
+    lines = refused(evolve_main, monkeypatch, capsys, "--name", "parents", "--population", "3", "--workers", "0")
     assert "--population must be 4 to 1,000,000" in lines[0]
 
 
@@ -236,7 +227,7 @@ def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypa
     folder = old_run(tmp_path / "old")
     before = {entry.name: entry.read_bytes() for entry in folder.iterdir()}
     for form in ([flag, path], [f"{flag}={path}"]):
-        (line,) = said_by(monkeypatch, capsys, *form)
+        (line,) = refused(evolve_main, monkeypatch, capsys, *form)
         assert "old/config.json is of a run of GridSim 0.1" in line
         assert "start a new run" in line
     assert {entry.name: entry.read_bytes() for entry in folder.iterdir()} == before
@@ -248,7 +239,7 @@ def test_a_config_of_another_format_is_refused_in_one_line(number, monkeypatch, 
     folder = old_run(tmp_path / "old")
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"format": number}))
-    (line,) = said_by(monkeypatch, capsys, "--resume", str(folder))
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", str(folder))
     assert "not a config.json of this GridSim" in line
 
 
@@ -278,12 +269,12 @@ def stopped(tmp_path):
 )
 def test_resume_refuses_contradictions(stopped, change, said, monkeypatch, capsys):
     monkeypatch.chdir(stopped.parent)
-    (line,) = said_by(monkeypatch, capsys, "--resume", "r", "--workers", "0", *change.split())
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", "r", "--workers", "0", *change.split())
     assert said in line
 
 
 def test_a_run_is_for_the_command_that_made_it(stopped, monkeypatch, capsys):
-    (line,) = said_by(monkeypatch, capsys, "--resume", str(stopped), main=dqn_main, prog="gridsim-dqn")
+    (line,) = refused(dqn_main, monkeypatch, capsys, "--resume", str(stopped))
     assert line.endswith("is a run of gridsim-evolve; give it to that command")
 
 
@@ -291,20 +282,20 @@ def test_resume_refuses_damaged_checkpoints(stopped, monkeypatch, capsys):
     path = stopped / "checkpoint.npz"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    (line,) = said_by(monkeypatch, capsys, "--resume", str(stopped))
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", str(stopped))
     assert "checkpoint.npz: truncated" in line
     path.write_bytes(whole)
     config = json.loads((stopped / "config.json").read_text())
     config["settings"]["seed"] = 99
     (stopped / "config.json").write_text(json.dumps(config))
-    (line,) = said_by(monkeypatch, capsys, "--resume", str(stopped))
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", str(stopped))
     assert line.endswith("do not belong together; one of them was edited")
 
 
 def test_a_device_that_is_not_there_is_said(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    (line,) = said_by(monkeypatch, capsys, "--workers", "0", "--device", "cuda", main=dqn_main, prog="gridsim-dqn")
+    (line,) = refused(dqn_main, monkeypatch, capsys, "--workers", "0", "--device", "cuda")
     assert "--device cuda: PyTorch finds no device" in line
 
 
@@ -319,20 +310,20 @@ def test_a_champion_that_does_not_fit_is_refused(policy, genome, said, monkeypat
     monkeypatch.chdir(tmp_path)
     genes = np.full(PolicySpec.parse(policy).size, genome, dtype=np.float32)
     Champion(genes, policy, "curved", SimConfig()).save("c.npz")
-    (line,) = said_by(monkeypatch, capsys, "--workers", "0", "--init", "c.npz")
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--workers", "0", "--init", "c.npz")
     assert said in line
 
 
-@pytest.mark.parametrize(("main", "prog"), [(evolve_main, "gridsim-evolve"), (compare_main, "gridsim-compare")])
-def test_a_folder_that_another_process_works_on_is_refused_in_one_line(main, prog, monkeypatch, capsys, tmp_path):
+@pytest.mark.parametrize("main", [evolve_main, compare_main])
+def test_a_folder_that_another_process_works_on_is_refused_in_one_line(main, monkeypatch, capsys, tmp_path):
     RunFolder(tmp_path, EvolveSettings("curved")).write_config()
     ComparisonFolder(tmp_path, Plan(("curved",), ("dqn",), 1, budget="1k")).write()
     hold = f"from cluster.runs.run import lock, Path; lock(Path({str(tmp_path)!r})); print(flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout
         other.stdout.readline()
-        (line,) = said_by(monkeypatch, capsys, "--resume", str(tmp_path), main=main, prog=prog)
+        (line,) = refused(main, monkeypatch, capsys, "--resume", str(tmp_path))
         assert line.endswith(f"{tmp_path}: another process is at work on it; wait for it, or stop it")
         other.communicate(b"\n")
-    (line,) = said_by(monkeypatch, capsys, "--resume", str(tmp_path))
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", str(tmp_path))
     assert "has no checkpoint.npz" in line

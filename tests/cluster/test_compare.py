@@ -1,30 +1,23 @@
 """The command gridsim-compare: wrong use, what is never trained again, a kill and Ctrl-C."""
 
 import csv
+import functools
 import json
 import os
 import signal
-import sys
 
 import pytest
 import tracked
-from commands import finish, start, wait_until
+from commands import call, finish, refused, start, wait_until
 from finished_runs import make_run
 
 from cluster.commands import compare
+from cluster.commands.compare import compare_main
 from cluster.comparison import results
 from cluster.comparison.plan import ComparisonFolder, Plan
 from cluster.workers.pool import PoolError
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
-
-
-def run(monkeypatch, *arguments):
-    """The command in this process. Returns its exit code."""
-    monkeypatch.setattr(sys, "argv", ["gridsim-compare", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        compare.compare_main()
-    return stop.value.code
 
 
 def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
@@ -47,11 +40,7 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
         (["--name", "../a"], "--name"),
         (["--tracking-uri", "ftp://x"], "not a tracking address"),
     ]:
-        assert run(monkeypatch, *arguments) == 2
-        first, *more = capsys.readouterr().err.splitlines()
-        assert first.startswith("gridsim-compare: error: ")
-        assert said in first
-        assert len(more) <= 1
+        assert said in refused(compare_main, monkeypatch, capsys, *arguments)[0]
     assert sorted(os.listdir(tmp_path)) == ["a", "comparison.json"]
 
 
@@ -79,23 +68,25 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     monkeypatch.setattr(compare, "train", train)
     monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
+    run = functools.partial(call, compare_main, monkeypatch, capsys)
     asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
-    assert run(monkeypatch, *asked, "--name", "c", "--seeds", 1) == 1
-    err = capsys.readouterr().err
+    code, _, err = run(*asked, "--name", "c", "--seeds", 1)
+    assert code == 1
     names = [cell.name for cell in PLAN.cells(tmp_path)]
     assert trained == names[:4]
     assert "gridsim-compare: seamless-evolution-s0 failed: the workers are gone" in err
     assert "gridsim-compare: error: 1 of 4 runs failed" in err
     assert err.splitlines()[-1].endswith("--resume runs/c")
     broken.clear()
-    assert run(monkeypatch, "--resume", "runs/c", "--seeds", 2, "--budget", "1,000", "--workers", 0) == 0
-    assert "comparing 8 runs, 3 of them finished" in capsys.readouterr().out
+    code, out, _ = run("--resume", "runs/c", "--seeds", 2, "--budget", "1,000", "--workers", 0)
+    assert code == 0
+    assert "comparing 8 runs, 3 of them finished" in out
     assert trained[4:] == ["seamless-evolution-s0", *names[4:]]
-    assert run(monkeypatch, "--resume", "runs/c", "--workers", 0) == 0
+    assert run("--resume", "runs/c", "--workers", 0)[0] == 0
     assert len(trained) == 9
     assert {"table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
     assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
-    assert run(monkeypatch, "runs/c", "--name", "again") == 0
+    assert run("runs/c", "--name", "again")[0] == 0
     rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))
     assert len(rows) == 8
     assert {row["velocity_error_percent"] for row in rows} == {"2.5"}

@@ -9,7 +9,7 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from commands import call
+from commands import call, refused
 
 from cluster.commands import watch
 from cluster.commands.watch import checkpoint_time, elite, watch_main
@@ -227,9 +227,5 @@ def test_wrong_use_is_one_clear_line(going, tmp_path, line, expected, monkeypatc
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
     arguments = line.replace("RUN", str(going)).replace("CHAMPION", str(CHAMPION)).split()
-    code, out, err = call(watch_main, monkeypatch, capsys, *arguments)
-    assert (code, out) == (2, "")
-    assert err.startswith("gridsim-watch: error: ")
-    assert err.count("\n") <= 2
-    assert expected in err
+    assert expected in " ".join(refused(watch_main, monkeypatch, capsys, *arguments))
     assert [f.name for f in tmp_path.iterdir()] == ["run"]

@@ -48,6 +48,16 @@ def call(main, monkeypatch, capsys, *arguments):
     return ended.value.code, *capsys.readouterr()
 
 
+def refused(main, monkeypatch, capsys, *arguments):
+    """The one line or two that a command says where it refuses to begin."""
+    code, out, err = call(main, monkeypatch, capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"gridsim-{main.__name__.removesuffix('_main')}: error: ")
+    lines = err.splitlines()
+    assert len(lines) <= 2
+    return lines
+
+
 def summary(folder):
     return json.loads((folder / "summary.json").read_text())
 
