@@ -9,7 +9,7 @@ from cluster.training.trainer import Maps
 from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.scenarios import HELD_OUT_SEED
-from gridsim.reference.errors import Series, driven, error_series
+from gridsim.reference.errors import Series, error_series
 from gridsim.view.drive import poses_of
 
 
@@ -37,5 +37,5 @@ def series(
             road = maps.get(chosen.maps[row["map"]])
             _, states, _ = trajectory(spec, champion.genome, road, row["start"], limits, sim, world)
             with contextlib.suppress(ValueError):  # without a metre forward
-                found.append(error_series(driven(poses_of(states), road), road, sim.vehicle))
+                found.append(error_series(poses_of(states), road, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]

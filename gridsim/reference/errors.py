@@ -19,16 +19,6 @@ from gridsim.reference.profile import BRAKING, WINDOW, arc_length, profile
 _STANDING = 1e-6  # m
 
 
-class Driven(NamedTuple):
-    """A drive as a path of new ground, without what was reversed and driven again."""
-
-    arc: np.ndarray  # float64 [n], m driven, increasing
-    points: np.ndarray  # float64 [n, 2], m, not wrapped over the torus
-    heading: np.ndarray  # float64 [n], rad
-    speed: np.ndarray  # float64 [n], m/s
-    steering: np.ndarray  # float64 [n], rad, left positive
-
-
 class Series(NamedTuple):
     """A drive and its reference at the same places of a route; float64 [n]."""
 
@@ -84,29 +74,12 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     }
 
 
-def driven(poses: np.ndarray, road_map: Map) -> Driven:
-    """A drive's path from its poses [n, 5] at the control steps, as `view.drive.poses_of` gives them.
+def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Series:
+    """A drive beside the reference driver's profile along its path, from its poses [n, 5] at the control steps.
 
-    Reversing, and the same metres driven again, are left out, because a reference only drives forward. So is standing,
-    where steering has no effect: a path from rest begins after the first control step that moves the car.
-
-    Raises: ValueError if the car never moved forward.
-    """
-    poses = np.asarray(poses, dtype=np.float64)
-    steps = road_map.shortest(np.diff(poses[:, :2], axis=0))
-    points = np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(steps, axis=0)])
-    way = np.hypot(*steps.T)
-    forward = np.concatenate([[0.0], np.cumsum(np.where(poses[1:, 3] + poses[:-1, 3] < 0.0, -way, way))])
-    furthest = np.maximum.accumulate(forward)
-    rows = np.flatnonzero(np.append(poses[0, 3] > 0.0, forward[1:] > furthest[:-1] + _STANDING))
-    if len(rows) < 2:
-        raise ValueError("nothing was driven that could be compared with a reference")
-    points = points[rows]
-    return Driven(arc_length(points), points, poses[rows, 2], poses[rows, 3], poses[rows, 4])
-
-
-def error_series(path: Driven, road_map: Map, vehicle: VehicleConfig) -> Series:
-    """A drive beside the reference driver's profile along its path.
+    Poses are as `view.drive.poses_of` gives them. Reversing, and the same metres driven again, are left out, because a
+    reference only drives forward. So is standing, where steering has no effect: a path from rest begins after the first
+    control step that moves the car.
 
     The reference begins with the agent's speed and ignores traffic, so the error in traffic includes the delay by other
     cars. Its curvature is that of the driven path over 10 m: an agent that weaves in longer waves slows the reference
@@ -114,9 +87,22 @@ def error_series(path: Driven, road_map: Map, vehicle: VehicleConfig) -> Series:
 
     Left out are the first 5 m, where the curvature is not known, and the end, from where the reference could not have
     stopped any more, because what it would have had to brake for is not known.
+
+    Raises: ValueError if the car never moved forward.
     """
+    poses = np.asarray(poses, dtype=np.float64)
+    steps = road_map.shortest(np.diff(poses[:, :2], axis=0))
+    points = np.concatenate([poses[:1, :2], poses[0, :2] + np.cumsum(steps, axis=0)])  # not wrapped over the torus
+    way = np.hypot(*steps.T)
+    forward = np.concatenate([[0.0], np.cumsum(np.where(poses[1:, 3] + poses[:-1, 3] < 0.0, -way, way))])
+    furthest = np.maximum.accumulate(forward)
+    rows = np.flatnonzero(np.append(poses[0, 3] > 0.0, forward[1:] > furthest[:-1] + _STANDING))
+    if len(rows) < 2:
+        raise ValueError("nothing was driven that could be compared with a reference")
+    points, (driven_speed, driven_steering) = points[rows], poses[rows, 3:].T
+    arc = arc_length(points)
     interval = float(road_map.road.speed_low), float(road_map.road.speed_high)
-    speed, steering = profile(path.points, interval, float(path.speed[0]), vehicle)
-    unknown = np.flatnonzero(path.arc + speed**2 / (2.0 * BRAKING) > path.arc[-1])
-    part = slice(int(np.searchsorted(path.arc, WINDOW / 2)), int(unknown[0]))
-    return Series(path.arc[part], path.speed[part], speed[part], path.steering[part], steering[part])
+    speed, steering = profile(points, interval, float(driven_speed[0]), vehicle)
+    unknown = np.flatnonzero(arc + speed**2 / (2.0 * BRAKING) > arc[-1])
+    part = slice(int(np.searchsorted(arc, WINDOW / 2)), int(unknown[0]))
+    return Series(arc[part], driven_speed[part], speed[part], driven_steering[part], steering[part])
