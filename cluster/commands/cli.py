@@ -264,11 +264,9 @@ def _evaluate() -> int:
     champion = load_champion(flags.champion)
     traffic = None if flags.traffic == -1 else flags.traffic
     chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
-    missed = None
     with wrong_use():
         figures = evaluate(champion, *chosen)
-        if flags.errors:
-            missed = errors(series(champion, *chosen), champion.sim.vehicle)
+        missed = errors(series(champion, *chosen), champion.sim.vehicle) if flags.errors else None
     if flags.json:
         print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         return 0

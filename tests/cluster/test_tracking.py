@@ -173,9 +173,8 @@ def test_prints_nothing(tmp_path, empty_database):
     with contextlib.closing(sqlite3.connect(broken)) as database:
         database.execute("ALTER TABLE metrics RENAME COLUMN is_nan TO is_gone")  # MLflow logs a traceback
     for arguments in ([f"sqlite:///{good}", "good"], [f"sqlite:///{foreign}"], [f"sqlite:///{broken}"]):
-        done = subprocess.run(
-            [sys.executable, "-c", QUIET, *arguments], env=with_path(), capture_output=True, text=True, timeout=600
-        )
+        command = [sys.executable, "-c", QUIET, *arguments]
+        done = subprocess.run(command, env=with_path(), capture_output=True, text=True, timeout=600)
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
