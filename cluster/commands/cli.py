@@ -189,9 +189,11 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
         sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
         sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
         bounds = [as_flag(name) for name in run.settings.unbound if getattr(run.settings, name)]
-        more = f" To go on beyond its end, resume it with a greater {' or '.join(bounds)}."
-        more = more if bounds and not run.saved[1]["solved"] else ""
-        console.print(f"{run.path} is finished: {run.saved[1][step]} {step}s; {sent}.{more}", soft_wrap=True)
+        more = f" To go on beyond its end, resume it with a greater {' or '.join(bounds)}." if bounds else ""
+        if run.saved[1]["solved"]:
+            more = f" It is solved; to go on from its champion, start a run with --init {short_path(run.path)}."
+        steps = count(run.saved[1][step], step)
+        console.print(f"{short_path(run.path)} is finished: {steps}; {sent}.{more}", soft_wrap=True)
         if unsent:
             print(f"{prog}: warning: {unsent}", file=sys.stderr)
         return 0
@@ -241,15 +243,16 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
 def _print_end(console: Console, session: Session) -> None:
     """The closing words of a finished run."""
     summary, name, path = session.summary, session.learning.step_name, session.run.path
-    console.print(held_out_table("The champion on held-out drives", summary["held_out"]))
+    console.print(held_out_table("The champion on held-out drives (held_out/ in MLflow)", summary["held_out"]))
     steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "not solved yet"
     console.print(
-        f"{how}: the champion succeeds in {summary['validation_success_rate']:.0%} of the validation drives, "
-        f"after {steps}, {summary['car_steps'] / 1e6:,.1f} million car-steps, {summary['wall_s']:.0f} s\n"
+        f"{how} after {steps}, {summary['car_steps']:,} car-steps, {summary['wall_s']:.0f} s\n"
+        f"success in validation, by which it was chosen: {summary['validation_success_rate']:.1%} "
+        "(validation/success_rate in MLflow)\n"
         f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"
         f"watch it: open {short_path(path / 'drive.html')} in a browser, or "
         f"{command_path('gridsim-watch')} {short_path(path)}\n"
-        f"compare: {session.tracker.where()}",
+        f"compare: {session.tracker.where(command_path('mlflow'))}",
         soft_wrap=True,
     )
 

@@ -174,7 +174,7 @@ def _train_and_compare(
         fail(PROG, problem, again, FAILED)
     if results.runs:
         results.show(console)
-    console.print(f"compare: {tracker.where()}", soft_wrap=True)
+    console.print(f"compare: {tracker.where(command_path('mlflow'))}", soft_wrap=True)
     if code:
         print(f"{PROG}: stopped; {again}", file=sys.stderr)
     elif failed:

@@ -366,6 +366,8 @@ def log_rows(tracker: Tracker, rows: list[dict[str, float]], first: int = 0) -> 
 def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any], note: str) -> None:
     """Log what a finished run has beside rows and model; its summary gets the id of MLflow's run."""
     tracker.log_row(step, description.held_out_metrics(summary["held_out"]), summary["wall_s"])
+    final = {"validation/success_rate": summary["validation_success_rate"]}  # the last candidate is tried after the end
+    tracker.log_row(step + 1, final, summary["wall_s"])
     if not summary.get("mlflow_run_id"):
         with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
             summary["mlflow_run_id"] = tracker.wait_ready(30.0)

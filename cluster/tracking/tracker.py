@@ -62,13 +62,14 @@ class Tracker:
             raise TrackingError(f"{shown(self.uri)}: {self.error or f'MLflow not ready after {timeout_s:g} s'}")
         return self.run_id
 
-    def where(self) -> str:
-        """How to see the run beside others in MLflow's UI, in words for the terminal."""
+    def where(self, mlflow: str) -> str:
+        """How to see the run beside others in MLflow's UI, in words for the terminal; `mlflow` is that command."""
         served = self.uri.startswith("http")
         table = run_table(self.uri if served else UI, self._run.experiment_id) if self._run else ""
         if served:
             return table or shown(self.uri)
-        return f"make ui, or mlflow ui --backend-store-uri {self.uri}" + (f"; then open\n{table}" if table else "")
+        make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # the one that it shows
+        return f"{make}{mlflow} ui --backend-store-uri {self.uri}" + (f"; then open\n{table}" if table else "")
 
     def log_row(self, step: int, row: Mapping[str, float], wall_s: float | None = None) -> None:
         """Send metrics of a step, of `wall_s` after the run's start, or of now. MLflow's run ends with the last one."""

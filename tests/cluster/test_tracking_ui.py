@@ -24,13 +24,15 @@ def logged(uri, name, success_rate):
         begun.log_row(step, row(step) | {"validation/success_rate": 0.25 * step})
     begun.log_row(2, {"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5}, 83.0)
     assert begun.close("FINISHED") is None
-    return begun.where()
+    return begun.where("bin/mlflow")
 
 
-def test_a_run_says_where_its_table_is(uri):
+def test_a_run_says_where_its_table_is(uri, tmp_path, monkeypatch):
     said = logged(uri, "first", 0.875)
     table = run_tables(uri, "http://127.0.0.1:5000")["gridsim"]
-    assert said == f"make ui, or mlflow ui --backend-store-uri {uri}; then open\n{table}"
+    assert said == f"bin/mlflow ui --backend-store-uri {uri}; then open\n{table}"
+    monkeypatch.chdir(tmp_path / "store")
+    assert logged(uri, "second", 0.875) == f"make ui, or {said}"  # which shows the working directory's mlflow.db
     assert re.fullmatch(
         r"http://127.0.0.1:5000/#/experiments/\d+/runs\?workflowType=machine_learning&viewStateShareKey=gridsim", table
     )
