@@ -32,7 +32,6 @@ MANY_WORKERS = 4  # a core; more give a warning
 # What tyro says of wrong flags, as patterns, and what the user reads.
 PLAIN = {
     r"Error parsing (?=--)": "",
-    r"invalid literal for int\(\) with base 10: ('[^']*')": r"\1 is no whole number",
     r"could not convert string to float: ('[^']*')": r"\1 is no number",
     r"Missing from \S+: (\S+) ([^()]*) \(required\)": r"\1 is missing: \2",
 }
@@ -42,6 +41,31 @@ _constant = attrdoc.ast_get_constant_value
 attrdoc.ast_get_constant_value = lambda node: (
     " ".join(value.split()) if isinstance(value := _constant(node), str) else value
 )
+
+registry = tyro.constructors.ConstructorRegistry()
+
+
+@registry.primitive_rule
+def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[int] | None:
+    """Integers, also written as in 1e6."""
+    if field.type is not int:
+        return None
+
+    def read(words: list[str]) -> int:
+        with contextlib.suppress(ValueError):
+            return int(words[0])
+        with contextlib.suppress(ValueError):
+            if (number := float(words[0])).is_integer():
+                return int(number)
+        raise ValueError(f"'{words[0]}' is no whole number")
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=read,
+        is_instance=lambda x: isinstance(x, int),
+        str_from_instance=lambda x: [str(x)],
+    )
 
 
 class UsageError(GridSimError):
@@ -93,7 +117,9 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
     with _reader_may_leave(), contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
-            return tyro.cli(kind, prog=prog, description=_about(kind), args=arguments, config=config, **given)
+            return tyro.cli(
+                kind, prog=prog, description=_about(kind), args=arguments, config=config, registry=registry, **given
+            )
         except SystemExit as stop:
             if not stop.code:
                 raise
@@ -157,7 +183,11 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
         if new == old or f.name in free or (f.name in may_grow and (new or math.inf) >= (old or math.inf)):
             continue
         new, old = (" ".join(value) if isinstance(value, tuple) else value for value in (new, old))
-        raise UsageError(f"{as_flag(f.name)} {new} contradicts the {what}'s {old}; leave it out, or start a new {what}")
+        problem, remedy = f"contradicts the {what}'s {old}", "leave it out"
+        if f.name in may_grow:
+            problem = problem if old else f"is not what bounds the {what}"
+            remedy = f"give a greater {' or '.join(as_flag(name) for name in may_grow if getattr(before, name))}"
+        raise UsageError(f"{as_flag(f.name)} {new} {problem}; {remedy}, or start a new {what}")
 
 
 def select(kind: type[T], flags: Any) -> T:

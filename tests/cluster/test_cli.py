@@ -128,7 +128,7 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
     assert done.returncode == 0, done.stderr
     assert len(rows(run)) == 6
     assert duration_s(run) == pytest.approx(summary(run)["wall_s"], abs=0.01)
-    assert "compare: make ui" in done.stdout
+    assert "compare: make ui, or" in done.stdout
     assert "http://127.0.0.1:5000/#/experiments/2/runs?workflowType=machine_learning&" in done.stdout
     assert summary(run)["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
 
@@ -175,7 +175,7 @@ WRONG = [
     ("--init nothing.npz", "nothing.npz: no such file"),
     ("--traffic 100000", "--traffic must be 0 to 100"),
     ("--workers 1 --address 127.0.0.1:1", "127.0.0.1:1"),
-    ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1"),
+    ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1: Connection refused; start one"),
     ("--tracking-uri file:///tmp/mlruns", "file"),
 ]
 
@@ -260,7 +260,11 @@ def stopped(tmp_path):
     [
         ("--seed 6", "--seed 6 contradicts the run's 5; leave it out, or start a new run"),
         ("--population 64", "--population 64 contradicts the run's 48"),
-        ("--generations 2", "--generations 2 contradicts the run's 6"),
+        (
+            "--generations 2",
+            "--generations 2 contradicts the run's 6; give a greater --generations, or start a new run",
+        ),
+        ("--car-steps 1e6", "--car-steps 1000000 is not what bounds the run; give a greater --generations"),
         ("--name other", "--name other contradicts the run's r"),
         ("--output elsewhere", "contradicts the run's"),
         ("--config r/config.json", "--resume and --config exclude each other"),

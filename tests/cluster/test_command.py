@@ -58,6 +58,7 @@ def refused(prog, line, capsys):
         ("gridsim-dqn", "--frobnicate", "unrecognized --frobnicate"),
         ("gridsim-evolve", "stray", "Unrecognized options: stray"),
         ("gridsim-evolve", "--population 2.5", "--population: '2.5' is no whole number"),
+        ("gridsim-evolve", "--car-steps 1e-3", "--car-steps: '1e-3' is no whole number"),
         ("gridsim-evolve", "--until soon", "--until: 'soon' is no number"),
         ("gridsim-evaluate", "--json", "CHAMPION is missing: A champion.npz, or a run's folder."),
         (
@@ -73,6 +74,12 @@ def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, te
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
     assert refused(prog, line, capsys) == [f"{prog}: error: {said}", f"see {prog} --help"]
+
+
+@pytest.mark.parametrize(("written", "meant"), [("1e6", 10**6), ("1.5e3", 1500), ("1_000_000", 10**6), ("7", 7)])
+def test_a_whole_number_may_be_written_with_an_exponent_or_underscores(written, meant):
+    assert parse(EvolveFlags, "gridsim-evolve", ["--car-steps", written]).car_steps == meant
+    assert parse(WatchFlags, "gridsim-watch", ["runs/x", f"--generation={written}"]).generation == meant
 
 
 @pytest.mark.parametrize("prog", ["gridsim-evolve", "gridsim-drive"])  # more and less than a pipe's buffer holds
@@ -92,11 +99,12 @@ def test_a_command_is_called_as_this_one_was(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "venv/bin"
     folder.mkdir(parents=True)
-    for name in ("gridsim-evolve", "gridsim-watch"):
+    for name in ("gridsim-evolve", "gridsim-watch", "mlflow"):
         (folder / name).touch()
     monkeypatch.setattr(sys, "argv", ["venv/bin/gridsim-evolve"])
     monkeypatch.setenv("PATH", "/usr/bin:/bin")
     assert command_path("gridsim-watch") == "venv/bin/gridsim-watch"
+    assert command_path("mlflow") == "venv/bin/mlflow"
     monkeypatch.setenv("PATH", f"/bin:{folder}")
     assert command_path("gridsim-watch") == "gridsim-watch"
     monkeypatch.setattr(sys, "argv", ["-c"])
