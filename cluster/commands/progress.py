@@ -1,4 +1,4 @@
-"""Live progress: a line on a terminal, plain lines elsewhere."""
+"""Live progress: two lines on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BAR = 10  # characters
 
 
 class Line(Reporter):
-    """A line on a terminal: `head`, `facts`, a bar and the time if `share` is known, and `rest`, cut off first.
+    """On a terminal `head`, `facts`, a bar and the time if `share` is known, and `rest` on a line of its own.
 
     Warnings begin with `name`; `resume` is the command that sends later what MLflow lacks.
     """
@@ -50,8 +50,8 @@ class Line(Reporter):
         if self.share is not None:
             done = round(BAR * min(self.share, 1.0))
             line.append("━" * done, "bar.complete").append("━" * (BAR - done), "bar.back")
-            line.append(f"  {clock(time.perf_counter() - self._started)}  ", "progress.elapsed")
-        return line.append(self.rest)
+            line.append(f"  {clock(time.perf_counter() - self._started)}", "progress.elapsed")
+        return line.append(f"\n{self.rest}")
 
     def warn(self, text: str) -> None:
         print(f"{self.name}: warning: {text}", file=sys.stderr, flush=True)
@@ -130,6 +130,7 @@ class Progress(Line):
 def progress_of(learning: Learning, bound: bool = True) -> str:
     """How far a run is, in words: what is done, not which step is the next."""
     done, total, unit = learning.progress()
+    done = min(done, total or done)  # a budget is spent before the last step ends
     of = f"/{total:g}" if total and bound else ""
     return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{done:.0f}{of} {unit}"
 
