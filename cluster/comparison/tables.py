@@ -15,6 +15,7 @@ import numpy as np
 from cluster.comparison.plan import Plan
 from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
 from cluster.runs.settings import RunSettings
+from cluster.tracking.tracker import count
 from gridsim.maps.scenarios import REGISTRY, label
 
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
@@ -132,7 +133,7 @@ def introduction(plan: Plan | None) -> str:
         return "Finished runs."
     sensors = {"rays": "31 rays", "grid": "the occupancy grid"}
     traffic = "traffic as each road has it by default" if plan.traffic == -1 else f"{plan.traffic} other cars"
-    return f"{plan.seeds} seeds, at most {plan.budget} a run, {sensors[plan.observation]}, {traffic}."
+    return f"{count(plan.seeds, 'seed')}, at most {plan.budget} a run, {sensors[plan.observation]}, {traffic}."
 
 
 def _seeds(group: Group) -> str:
