@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -38,7 +37,7 @@ from cluster.commands.progress import Line, clock, progress_of
 from cluster.comparison import tables
 from cluster.comparison.page import page
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import ERROR_FIGURES, Run, errors_of, read_run
+from cluster.comparison.results import Run, errors_of, read_run
 from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
@@ -165,7 +164,7 @@ def _train_and_compare(
         if not problem:
             with console.status("writing tables and the picture"):
                 results.write()
-        tracker.log_row(len(results.runs), {"runs_done": len(results.runs), **results.medians()})
+        tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
         tracker.log_files(results.files())
     if unsent := tracker.close(status):
         print(f"{PROG}: warning: {unsent}", file=sys.stderr)
@@ -214,15 +213,6 @@ class Results:
         """Those that exist."""
         names = (COMPARISON, REPORT, TABLE, ROWS, PICTURE)
         return [self.path / name for name in names if (self.path / name).is_file()]
-
-    def medians(self) -> dict[str, float]:
-        """Metrics for MLflow."""
-        found = {
-            re.sub(r"[^/\w.\- :]", "", f"{figure}/{group.road}/{group.learner}"): group.spread(figure).median
-            for group in self.groups
-            for figure in ("success_rate", "distance_m", "speed_mps", "training_s", *ERROR_FIGURES)
-        }
-        return {name: value for name, value in found.items() if math.isfinite(value)}
 
     def show(self, console: Console) -> None:
         """Print the tables without their quartiles, and where the whole ones are."""
