@@ -16,7 +16,7 @@ HERE = {
     "make evolve": f"{SMALL} --name first",
     'make dqn ARGS="--workers 2 --seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --workers 0 --name other",
     ".venv/bin/gridsim-evolve --resume runs/<name>": "",
-    ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 60000000": "--car-steps 100000",
+    ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 6e7": "--car-steps 100000",
     ".venv/bin/gridsim-evolve --config runs/<name>/config.json": "--name again",
     ".venv/bin/gridsim-evolve --init runs/<name>": f"{SMALL} --name next",
     ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",

@@ -243,12 +243,12 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
 def _print_end(console: Console, session: Session) -> None:
     """The closing words of a finished run."""
     summary, name, path = session.summary, session.learning.step_name, session.run.path
-    console.print(held_out_table("The champion on held-out drives (held_out/ in MLflow)", summary["held_out"]))
+    console.print(held_out_table("The champion on held-out drives", summary["held_out"]))
     steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "not solved yet"
     console.print(
         f"{how} after {steps}, {summary['car_steps']:,} car-steps, {summary['wall_s']:.0f} s\n"
-        f"success in validation, by which it was chosen: {summary['validation_success_rate']:.1%} "
-        "(validation/success_rate in MLflow)\n"
+        f"success in validation, on which the champion was chosen: {summary['validation_success_rate']:.1%} "
+        "(in MLflow validation/success_rate; the table's is held_out/success_rate)\n"
         f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"
         f"watch it: open {short_path(path / 'drive.html')} in a browser, or "
         f"{command_path('gridsim-watch')} {short_path(path)}\n"

@@ -129,6 +129,7 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
     assert len(rows(run)) == 6
     assert duration_s(run) == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "compare: make ui, or" in done.stdout
+    assert "chosen: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout
     assert "http://127.0.0.1:5000/#/experiments/2/runs?workflowType=machine_learning&" in done.stdout
     assert summary(run)["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
 
