@@ -381,7 +381,7 @@ def run_tables(uri: str, server: str) -> dict[str, str]:
 
 def _view() -> str:
     """The saved view as MLflow's UI writes it: the run table's columns, and curves over car-steps."""
-    columns = {f"metrics.`{name}`": width for name, width in _COLUMNS.items()}
+    columns = {"attributes.`Run Name`": 270, **{f"metrics.`{name}`": width for name, width in _COLUMNS.items()}}
     state = {
         "selectedColumns": list(columns),
         "columnOrder": list(columns),

@@ -79,6 +79,8 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
                 "car_steps", ">0.875<", ">0.625<", ">1.4min<", "Model registry",
             ):  # fmt: skip
                 browser.wait_for_text(words)
+            width = browser.run("document.querySelector('[col-id*=\"Run Name\"]').clientWidth")
+            assert width > 230  # pixels, so that names show their seeds
         with Browser(f"{link}&compareRunsMode=CHART", tmp_path / "profile") as browser:
             for words in (">first<", ">second<", "first (distance_m/mean)", "second (distance_m/mean)"):
                 browser.wait_for_text(words)
