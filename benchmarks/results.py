@@ -40,7 +40,7 @@ COMMANDS = {
         "gridsim-evolve --scenario curved --observation grid",
     ],
     "speed": ["benchmarks/throughput.py --json", "benchmarks/scaling.py --json"],
-    "comparison": ["gridsim-compare --learners evolution dqn --seeds 3"],
+    "comparison": ["gridsim-compare --learners evolution dqn --seeds 5"],
 }
 HEAD = (
     "| command | car-steps, million | to its end, s | success, % | collisions, % | speed, m/s |\n"
