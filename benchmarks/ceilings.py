@@ -27,6 +27,7 @@ from cluster.runs.settings import EvolveSettings
 from cluster.runs.train import Session
 from cluster.tracking.address import check_uri
 from cluster.training.trainer import Maps
+from cluster.workers import ray_pool
 from cluster.workers.pool import Chunk, WorkerPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import Task, Worker
@@ -158,6 +159,7 @@ def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
     recipes, task = some_recipes(chunks), make_task(rows(1))
     asked = [Chunk(slice(k, k + 1), slice(0, EPISODES)) for k in range(chunks)]
     times = []
+    cut, ray_pool.cut = ray_pool.cut, lambda _, asked, *more: [(chunk,) for chunk in asked]  # each on its own
     ray.wait = timed
     try:
         for _ in range(3):
@@ -165,7 +167,7 @@ def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
             pool.evaluate(task, recipes, asked=asked)
             times.append((time.thread_time() - begun - sum(looks) + before) / chunks)
     finally:
-        ray.wait = wait
+        ray.wait, ray_pool.cut = wait, cut
     return statistics.median(times), statistics.median(looks)
 
 

@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.workers.pool import Chunk, cut, metres
+from cluster.workers.pool import Chunk, Parcel, cut, metres
+from cluster.workers.pool import size as episodes_in
 from cluster.workers.worker import Task
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
 from evolution.search.breeding import RECIPE, Mutation
@@ -83,7 +84,7 @@ class Call:
     member_bytes: float = RECIPE.itemsize  # sent for each member, in each chunk that it is in
     member_s: float = 0.0  # of the coordinator's, for the same
 
-    def chunks(self) -> list[Chunk]:
+    def parcels(self) -> list[Parcel]:
         """As the pool cuts it, which knows from the last generation how long a metre takes."""
         n, e = self.drives.shape
         episodes = np.zeros(e, dtype=EPISODE)
@@ -98,9 +99,9 @@ class Call:
 
     def run(self) -> float:
         """Seconds from its begin to its end."""
-        k, chunks = self.costs, self.chunks()
+        k, parcels = self.costs, self.parcels()
         size = np.concatenate([np.zeros((len(self.drives), 1)), np.cumsum(self.drives, axis=1)], axis=1)
-        todo = deque(chunks)
+        todo = deque(parcels)
         idle = deque(range(self.workers))
         single: deque[int] = deque()  # who holds one chunk, in the order in which they got it
         held = [0] * self.workers
@@ -112,8 +113,8 @@ class Call:
 
         def send(worker: int) -> None:
             nonlocal now, link_s
-            rows, columns = todo.popleft()
-            members = rows.stop - rows.start
+            parcel = todo.popleft()
+            members = sum(rows.stop - rows.start for rows, _ in parcel)
             down = CHUNK_BYTES + members * self.member_bytes
             now += k.chunk_s / 2 + down * k.byte_s + members * self.member_s
             link_s = max(link_s, now) + down / k.bandwidth
@@ -123,14 +124,15 @@ class Call:
                 rounds = math.ceil(math.log2(node + 2))
                 broadcast_at[node] = link_s + rounds * (2 * k.latency_s + self.broadcast / k.bandwidth)
             begin = max(link_s + k.latency_s, free_at[worker], broadcast_at[node])
-            free_at[worker] = begin + float((size[rows, columns.stop] - size[rows, columns.start]).sum())
-            up = CHUNK_BYTES + members * (columns.stop - columns.start) * RESULT.itemsize
+            took = sum(float((size[rows, columns.stop] - size[rows, columns.start]).sum()) for rows, columns in parcel)
+            free_at[worker] = begin + took
+            up = CHUNK_BYTES + sum(map(episodes_in, parcel)) * RESULT.itemsize
             heapq.heappush(coming, (free_at[worker] + k.latency_s + up / k.bandwidth, worker, up))
             held[worker] += 1
             if held[worker] == 1:
                 single.append(worker)
 
-        left = len(chunks)
+        left = len(parcels)
         while left:
             while todo and idle:
                 send(idle.popleft())

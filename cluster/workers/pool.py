@@ -27,11 +27,11 @@ Meanwhile = Callable[[], bool | None]  # called while workers are busy, again an
 SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
 METRE_S = 1e-6  # seconds that a metre of an episode takes a small network
 UNMEASURED_METRE_S = 3e-5  # what Ray's workers are taken to need before it is measured: large networks are slower
-WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a chunk and to receive its results
-CHUNK_S = 0.0004  # of the coordinator's time, for a chunk and its results: many workers get larger chunks
-LARGEST_S = 0.5  # of evaluation in one chunk, so that progress is seen and little is lost with a worker
+WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
+PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
+LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
 LARGER = 4  # times what is worth sending, where that is more
-SHARE = 0.8  # of what would be a worker's part of the rest, in one chunk
+SHARE = 0.8  # of what would be a worker's part of the rest, in one parcel
 
 
 class PoolError(GridSimError):
@@ -39,10 +39,14 @@ class PoolError(GridSimError):
 
 
 class Chunk(NamedTuple):
-    """Some members (rows), on some of the task's episodes (columns): what is asked for, or sent to a worker at once."""
+    """Some members (rows), on some of the task's episodes (columns)."""
 
     rows: slice
     columns: slice
+
+
+Parcel = tuple[Chunk, ...]
+"""The chunks that are sent to a worker at once."""
 
 
 def size(chunk: Chunk) -> int:
@@ -256,12 +260,13 @@ class SerialPool(WorkerPool):
         started = time.perf_counter()
         maps = [self._build_map(*name) for name in task.maps]
         finish(meanwhile)
-        for index, chunk in enumerate(cut(task, asked, SERIAL_PARTS)):
-            first, stop = chunk.columns.start, chunk.columns.stop
+        for index, parcel in enumerate(cut(task, asked, SERIAL_PARTS)):
             try:
-                call.add(0, chunk, *self._worker.answer(task, maps, recipes[chunk.rows], first, stop))
+                for chunk in parcel:
+                    first, stop = chunk.columns.start, chunk.columns.stop
+                    call.add(0, chunk, *self._worker.answer(task, maps, recipes[chunk.rows], first, stop))
             except Exception as error:
-                raise PoolError(f"a worker failed on {describe(task, index, chunk)}: {last_line(error)}") from error
+                raise PoolError(f"a worker failed on {describe(task, index, parcel)}: {last_line(error)}") from error
             if on_progress:
                 on_progress(*call.progress())
         call.wall_s = time.perf_counter() - started
@@ -283,8 +288,8 @@ def metres(task: Task | CollectTask, chunk: Chunk) -> float:
 
 def cut(
     task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None
-) -> list[Chunk]:  # fmt: skip
-    """Cut what is asked for into chunks, by the seconds that it may take: large ones first, small ones last.
+) -> list[Parcel]:
+    """Cut what is asked for into parcels, by the seconds that it may take: large ones first, small ones last.
 
     Each takes most of what would be a worker's share of the rest, so that no worker waits long for the slowest, and
     little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one
@@ -295,38 +300,47 @@ def cut(
         metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
     """
     rates = [METRE_S] * len(asked) if metre_s is None else metre_s
-    chunks: list[Chunk] = []
+    parcels: list[Parcel] = []
     left = sum(rate * metres(task, block) for rate, block in zip(rates, asked, strict=True))
-    worth_s = max(WORTH_SENDING_S, CHUNK_S * workers)  # while one is at its chunk, all others get theirs
+    worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one is at its parcel, all others get theirs
     least = min(worth_s, left / (2 * workers))  # every worker gets some, however little it costs
     largest = max(LARGEST_S, LARGER * worth_s)
     goals = targets(task.episodes, task.limits)
+    parcel: Parcel = ()  # not yet full
+    room = 0.0  # seconds left in it
     for rate, (rows, columns) in zip(rates, asked, strict=True):
         seconds = rate * np.concatenate([[0.0], np.cumsum(goals[columns])])  # of one member, up to each episode
         row, column = rows.start, 0
         while row < rows.stop and columns.stop > columns.start:
-            share = min(max(SHARE * left / workers, least), largest)
-            if column == 0 and share >= seconds[-1]:
-                stop = min(row + max(int(share / seconds[-1]), 1), rows.stop)
-                chunks.append(Chunk(slice(row, stop), columns))
+            if not parcel:
+                room = min(max(SHARE * left / workers, least), largest)
+            if column == 0 and room >= seconds[-1]:
+                stop = min(row + max(int(room / seconds[-1]), 1), rows.stop)
+                parcel = (*parcel, Chunk(slice(row, stop), columns))
+                room -= (stop - row) * seconds[-1]
                 left -= (stop - row) * seconds[-1]
                 row = stop
+            elif parcel:
+                parcels.append(parcel)
+                parcel = ()
             else:
                 rest = seconds[-1] - seconds[column]
-                share = rest / math.ceil(rest / share)  # pieces as even as may be: a small one costs as much to send
+                share = rest / math.ceil(rest / room)  # pieces as even as may be: a small one costs as much to send
                 stop = int(np.searchsorted(seconds, seconds[column] + share * (1.0 + 1e-9), side="right")) - 1
                 stop = min(max(stop, column + 1), len(seconds) - 1)
-                chunks.append(Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)))
+                parcels.append((Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)),))
                 left -= seconds[stop] - seconds[column]
                 row, column = (row + 1, 0) if stop == len(seconds) - 1 else (row, stop)
-    return chunks
+    return [*parcels, parcel] if parcel else parcels
 
 
-def describe(task: Task | CollectTask, index: int, chunk: Chunk) -> str:
-    """A chunk in words."""
+def describe(task: Task | CollectTask, index: int, parcel: Parcel) -> str:
+    """A parcel in words."""
     if isinstance(task, CollectTask):
-        return f"chunk {index} (episodes {chunk.columns.start} to {chunk.columns.stop - 1})"
-    return f"chunk {index} (members {chunk.rows.start} to {chunk.rows.stop - 1})"
+        spans = [chunk.columns for chunk in parcel]
+        return f"parcel {index} (episodes {spans[0].start} to {spans[-1].stop - 1})"
+    spans = [chunk.rows for chunk in parcel]
+    return f"parcel {index} (members {', '.join(f'{span.start} to {span.stop - 1}' for span in spans)})"
 
 
 def identify(task: Task | CollectTask, chunk: Chunk, recipes: np.ndarray) -> str:

@@ -74,7 +74,7 @@ class _Job:
     """One call while it is being done."""
 
     task: Task | CollectTask
-    task_ref: Any
+    shared: Any  # the task as workers get it
     recipes: np.ndarray
     dispatch: Dispatch
     call: Outcome | Collected
@@ -140,11 +140,11 @@ class RayPool(WorkerPool):
         self._wait_for_ray()
         collecting = isinstance(task, CollectTask)
         metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in asked]
-        parts = cut(task, asked, self._asked * (FINER if collecting else 1), metre_s)
-        dispatch = Dispatch(parts, collecting)
+        parcels = cut(task, asked, self._asked * (FINER if collecting else 1), metre_s)
+        dispatch = Dispatch(parcels, collecting)
         self._serial += 1
-        task_ref, call.broadcast_bytes = self._shared.put(task)
-        job = _Job(task, task_ref, recipes, dispatch, call)
+        shared, call.broadcast_bytes = self._shared.put(task)
+        job = _Job(task, shared, recipes, dispatch, call)
         alone_since = time.monotonic()
 
         while not dispatch.finished():
@@ -153,8 +153,8 @@ class RayPool(WorkerPool):
                 if slot.sent and now - slot.heard > self._patience_s and not self._ready([slot.sent[0][1]], 0.0):
                     self._bury(slot, job, f"it did not answer for {now - slot.heard:.0f} s")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.hello and not slot.sent]
-            for number, chunk in dispatch.give(idle):
-                self._send(self._slots[number], chunk, job)
+            for number, parcel in dispatch.give(idle):
+                self._send(self._slots[number], parcel, job)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
             waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
@@ -193,21 +193,22 @@ class RayPool(WorkerPool):
             ready, _ = ray.wait(refs, num_returns=1, timeout=timeout_s)
         return ready
 
-    def _send(self, slot: _Slot, chunk: int, job: _Job) -> None:
-        rows, columns = job.dispatch.parts[chunk]
-        payload = job.recipes[rows].tobytes()
+    def _send(self, slot: _Slot, parcel: int, job: _Job) -> None:
+        chunks = job.dispatch.parcels[parcel]
+        payloads = [job.recipes[rows].tobytes() for rows, _ in chunks]
+        work = [(recipes, columns.start, columns.stop) for recipes, (_, columns) in zip(payloads, chunks, strict=True)]
         if not slot.sent:
             slot.heard = time.monotonic()
-        answer = slot.actor.run.remote(self._serial, payload, columns.start, columns.stop, *self._update(slot, job))
+        answer = slot.actor.run.remote(self._serial, work, *self._update(slot, job))
         slot.sent.append((self._serial, answer))
-        job.call.bytes_down += len(payload)
+        job.call.bytes_down += sum(map(len, payloads))
 
     def _update(self, slot: _Slot, job: _Job) -> list[Any]:
         """What a worker has to be sent of the task, once."""
         if slot.serial == self._serial:
             return []
         slot.serial = self._serial
-        return self._shared.update(slot.maps, job.task, job.task_ref)
+        return self._shared.update(slot.maps, job.task, job.shared)
 
     def _receive(self, slot: _Slot, job: _Job) -> bool:
         """Take in a worker's oldest answer, or its death. Returns whether there is progress."""
@@ -222,22 +223,23 @@ class RayPool(WorkerPool):
                 return self._bury(slot, job, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = job.dispatch.at(slot.number)
-                what = describe(job.task, at, job.dispatch.parts[at])
+                what = describe(job.task, at, job.dispatch.parcels[at])
                 raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
         except ray.exceptions.RayError as error:
             return self._bury(slot, job, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
-        chunk = job.dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
-        if chunk is not None:
-            job.call.add(slot.number, job.dispatch.parts[chunk], *pickle.loads(answer))
+        parcel = job.dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
+        if parcel is not None:
+            for chunk, found in zip(job.dispatch.parcels[parcel], pickle.loads(answer), strict=True):
+                job.call.add(slot.number, chunk, *found)
             job.call.bytes_up += len(answer)
-        return chunk is not None
+        return parcel is not None
 
     def _bury(self, slot: _Slot, job: _Job, reason: str, blamed: bool = True) -> bool:
         """Replace a worker, and see to it that what it held is done. Returns whether anything is lost."""
         dispatch, call = job.dispatch, job.call
-        lost = [dispatch.parts[chunk] for chunk in dispatch.died(slot.number, blamed)]
+        lost = [chunk for parcel in dispatch.died(slot.number, blamed) for chunk in dispatch.parcels[parcel]]
         call.retries = dispatch.retries
         for part in lost:
             call.lose(part)

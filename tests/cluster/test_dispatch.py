@@ -8,13 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.workers.dispatch import MAX_KILLS, QUEUE, Dispatch
-from cluster.workers.pool import Chunk
+from cluster.workers.pool import Chunk, Parcel
 
 
-def rows(*sizes: int) -> list[Chunk]:
-    """Chunks of so many whole members, on one episode."""
+def rows(*sizes: int) -> list[Parcel]:
+    """Parcels of so many whole members, on one episode; from the second member on in a chunk of their own."""
     ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
-    return [Chunk(slice(end - size, end), slice(0, 1)) for end, size in zip(ends, sizes, strict=True)]
+    spans = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return [
+        tuple(Chunk(slice(a, b), slice(0, 1)) for a, b in ((first, first + 1), (first + 1, stop)) if a < b)
+        for first, stop in spans
+    ]
 
 
 def new(*sizes: int) -> Dispatch:
@@ -31,10 +35,9 @@ class World:
         self.lost: set[int] = set()
         self.deaths = 0
 
-    def units(self, chunk: int) -> range:
-        part = self.dispatch.parts[chunk]
-        span = part.columns if self.by_episode else part.rows
-        return range(span.start, span.stop)
+    def units(self, parcel: int) -> list[int]:
+        spans = [part.columns if self.by_episode else part.rows for part in self.dispatch.parcels[parcel]]
+        return [unit for span in spans for unit in range(span.start, span.stop)]
 
     def give(self) -> None:
         idle = [worker for worker, queue in self.queues.items() if not queue]
@@ -72,7 +75,7 @@ def test_everything_is_answered_once_but_those_that_kill(
     """Whatever dies by chance: each of those that kill is lost, alone, and nobody else."""
     parts = rows(*sizes)
     if by_episode:
-        parts = [Chunk(part.columns, part.rows) for part in parts]
+        parts = [tuple(Chunk(part.columns, part.rows) for part in parcel) for parcel in parts]
     killers &= set(range(sum(sizes)))
     rng = random.Random(seed)
     world = World(Dispatch(parts, by_episode), workers, killers, by_episode)
@@ -106,7 +109,7 @@ def test_finding_the_killer_of_a_chunk_costs_few_workers(size: int) -> None:
 
 def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     """Validation gives one member's episodes to many workers: they are lost together."""
-    parts = [Chunk(slice(0, 1), slice(k, k + 1)) for k in range(4)] + [Chunk(slice(1, 2), slice(0, 4))]
+    parts = [(Chunk(slice(0, 1), slice(k, k + 1)),) for k in range(4)] + [(Chunk(slice(1, 2), slice(0, 4)),)]
     dispatch = Dispatch(parts, by_episode=False)
     assert [chunk for _, chunk in dispatch.give([0, 1, 2])] == [0, 1, 2]
     assert dispatch.answered(2) == 2

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.workers.pool import (
-    CHUNK_S,
+    PARCEL_S,
     UNMEASURED_METRE_S,
     WORTH_SENDING_S,
     Chunk,
@@ -145,9 +145,11 @@ def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[flo
         wanted, seen = np.zeros((n, e), dtype=int), np.zeros((n, e), dtype=int)
         for part in asked:
             wanted[part] += 1
-        for part in cut(make_task(episodes=goals(*targets)), asked, workers):
-            assert seen[part].size
-            seen[part] += 1
+        for parcel in cut(make_task(episodes=goals(*targets)), asked, workers):
+            assert parcel
+            for part in parcel:
+                assert seen[part].size
+                seen[part] += 1
         assert np.array_equal(seen, wanted)
 
 
@@ -160,9 +162,9 @@ def test_chunks_let_no_worker_wait_for_the_slowest(workers: int, n: int, episode
     task, metre_s = make_task(episodes=goals(*[target] * episodes)), 1e-6
     parts = cut(task, rectangle(n, episodes), workers, [metre_s])
     busy = [0.0] * workers
-    for part in parts:
-        busy[busy.index(min(busy))] += metres(task, part)
-    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / metre_s, CHUNK_S * workers / metre_s, target) + 1e-6
+    for parcel in parts:
+        busy[busy.index(min(busy))] += sum(metres(task, part) for part in parcel)
+    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / metre_s, PARCEL_S * workers / metre_s, target) + 1e-6
     assert len(parts) <= 16 * workers, "as few as that needs"
 
 
@@ -171,15 +173,25 @@ def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers(
     task = make_task(episodes=goals(*[2000.0] * 256, 400.0, 400.0))
     asked, metre_s = [Chunk(slice(0, 1), slice(0, 256)), Chunk(slice(1, 511), slice(256, 258))], [1e-6, 2e-7]
     busy = [0.0, 0.0]
-    for part in cut(task, asked, 2, metre_s):
-        busy[busy.index(min(busy))] += metre_s[part.columns.start // 256] * metres(task, part)
+    for parcel in cut(task, asked, 2, metre_s):
+        busy[busy.index(min(busy))] += sum(metre_s[part.columns.start // 256] * metres(task, part) for part in parcel)
     assert abs(busy[0] - busy[1]) <= WORTH_SENDING_S
+
+
+def test_a_parcel_holds_members_of_several_groups() -> None:
+    """So that the number of parcels does not grow with the number of groups."""
+    groups = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
+    task = make_task(episodes=goals(*[400.0] * 16))
+    assert len(cut(task, groups, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
+    pool = SerialPool(never_built, Answering)
+    outcome = pool.evaluate(make_task(episodes=task.episodes), make_recipes(512), asked=groups)
+    assert np.array_equal(outcome.results["distance"].sum(axis=1), make_recipes(512)["seed"] * 32.0)
 
 
 def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
     """Of a large network, 1 ms a metre, before any of it is measured."""
     task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for part in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
+    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
     assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
 
 
@@ -284,7 +296,7 @@ def test_a_failing_worker_ends_in_one_line_that_names_the_chunk(what: str) -> No
     with pytest.raises(PoolError) as caught:
         pool.evaluate(make_task(), make_recipes(512)) if what == "members" else pool.collect(make_collect_task(512))
     said = re.fullmatch(
-        rf"a worker failed on chunk \d+ \({what} (\d+) to (\d+)\): ValueError: not to be had", str(caught.value)
+        rf"a worker failed on parcel \d+ \({what} (\d+) to (\d+)\): ValueError: not to be had", str(caught.value)
     )
     assert said is not None
     assert int(said[1]) <= 300 <= int(said[2])
