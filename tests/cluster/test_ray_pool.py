@@ -214,7 +214,7 @@ def test_experience_keeps_its_order_where_workers_die(pool: RayPool, folder: Pat
 @pytest.mark.parametrize("what", ["members", "episodes"])
 def test_an_exception_ends_the_run_in_one_line(pool: RayPool, folder: Path, what: str) -> None:
     (folder / "raise-100").touch()
-    line = rf"a worker failed on chunk \d+ \({what} \d+ to \d+\): ValueError: is not to be had"
+    line = rf"a worker failed on parcel \d+ \({what} \d+ to \d+\): ValueError: is not to be had"
     with pytest.raises(PoolError) as caught:
         pool.evaluate(make_task(), make_recipes(512)) if what == "members" else pool.collect(make_collect_task(400))
     assert re.fullmatch(line, str(caught.value))
