@@ -66,7 +66,7 @@ class Actor:
                 self._maps.pop(name, None)
             self._task, self._serial = replace(pickle.loads(shared)), serial  # `replace` makes its arrays read-only
         if self._task is None or serial != self._serial:
-            raise RuntimeError(f"a chunk of task {serial} came to a worker that has task {self._serial}")
+            raise RuntimeError(f"a parcel of task {serial} came to a worker that has task {self._serial}")
         mine = [self._maps[name] for name in self._task.maps]
         answers = [
             self._worker.answer(self._task, mine, np.frombuffer(recipes, RECIPE), first, stop)

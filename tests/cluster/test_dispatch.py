@@ -1,4 +1,4 @@
-"""Which chunk goes where when workers die: simulated, by random events, without Ray or a clock."""
+"""Which parcel goes where when workers die: simulated, by random events, without Ray or a clock."""
 
 import random
 from collections import Counter, deque
@@ -41,24 +41,24 @@ class World:
 
     def give(self) -> None:
         idle = [worker for worker, queue in self.queues.items() if not queue]
-        for worker, chunk in self.dispatch.give(idle):
-            self.queues[worker].append(chunk)
+        for worker, parcel in self.dispatch.give(idle):
+            self.queues[worker].append(parcel)
             assert len(self.queues[worker]) <= QUEUE
 
     def bury(self, worker: int, blamed: bool = True) -> None:
         self.deaths += 1
         self.queues[worker].clear()
-        for chunk in self.dispatch.died(worker, blamed):
-            self.lost.update(self.units(chunk))
+        for parcel in self.dispatch.died(worker, blamed):
+            self.lost.update(self.units(parcel))
 
     def work(self, worker: int) -> None:
-        """The worker does its first chunk, or dies of it."""
-        chunk = self.queues[worker].popleft()
-        if self.killers & set(self.units(chunk)):
+        """The worker does its first parcel, or dies of it."""
+        parcel = self.queues[worker].popleft()
+        if self.killers & set(self.units(parcel)):
             self.bury(worker)
         elif (settled := self.dispatch.answered(worker)) is not None:
-            assert settled == chunk
-            self.answered.update(self.units(chunk))
+            assert settled == parcel
+            self.answered.update(self.units(parcel))
 
 
 @given(
@@ -111,11 +111,11 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     """Validation gives one member's episodes to many workers: they are lost together."""
     parts = [(Chunk(slice(0, 1), slice(k, k + 1)),) for k in range(4)] + [(Chunk(slice(1, 2), slice(0, 4)),)]
     dispatch = Dispatch(parts, by_episode=False)
-    assert [chunk for _, chunk in dispatch.give([0, 1, 2])] == [0, 1, 2]
+    assert [parcel for _, parcel in dispatch.give([0, 1, 2])] == [0, 1, 2]
     assert dispatch.answered(2) == 2
     for _ in range(MAX_KILLS - 1):
         assert dispatch.died(0) == []
-        assert [chunk for _, chunk in dispatch.give([0])] == [0]
+        assert [parcel for _, parcel in dispatch.give([0])] == [0]
     assert dispatch.died(0) == [0, 1, 3]
     assert dispatch.answered(1) is None, "it is not asked for any more"
     assert list(dispatch.give([0, 1])) == [(0, 4)]
@@ -124,9 +124,9 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
 
 
 def test_nothing_is_queued_with_a_suspect() -> None:
-    """So that the next time it is clear which killed. What waited behind a dead worker's chunk is a suspect too."""
+    """So that the next time it is clear which killed. What waited behind a dead worker's parcel is a suspect too."""
     dispatch = new(*[5] * 9)
-    assert [chunk for _, chunk in dispatch.give([0, 1])] == [0, 1, 2, 3]
+    assert [parcel for _, parcel in dispatch.give([0, 1])] == [0, 1, 2, 3]
     dispatch.died(0)
     assert list(dispatch.give([0])) == [(0, 0)]
     assert list(dispatch.give([])) == []

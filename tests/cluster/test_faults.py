@@ -50,15 +50,16 @@ def generations(run: Path) -> int:
 
 
 class Stopping(Answering):
-    """Stops its own process where it is told to, in the midst of a chunk: nobody hears of it again."""
+    """Stops its own process where it is told to, in the midst of a parcel: nobody hears of it again."""
 
     def __init__(self, folder: Path):
         self._folder = folder
 
     def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
-        with contextlib.suppress(FileNotFoundError):
-            (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
-            os.kill(os.getpid(), signal.SIGSTOP)
+        if len(recipes):  # else it is being prepared, and there is nothing to send again
+            with contextlib.suppress(FileNotFoundError):
+                (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
+                os.kill(os.getpid(), signal.SIGSTOP)
         return super().evaluate(task, maps, recipes)
 
 
