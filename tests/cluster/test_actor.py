@@ -62,8 +62,8 @@ def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_
 
 def test_a_chunk_of_another_task_is_refused() -> None:
     actor = Actor(Answering)
-    with pytest.raises(RuntimeError, match="a chunk of task 1 came to a worker that has task 0"):
+    with pytest.raises(RuntimeError, match="a parcel of task 1 came to a worker that has task 0"):
         actor.run(1, [(make_recipes(2).tobytes(), 0, 2)])
     actor.run(1, [(make_recipes(2).tobytes(), 0, 2)], (), (), pickle.dumps(make_task()))
-    with pytest.raises(RuntimeError, match="a chunk of task 2 came to a worker that has task 1"):
+    with pytest.raises(RuntimeError, match="a parcel of task 2 came to a worker that has task 1"):
         actor.run(2, [(make_recipes(2).tobytes(), 0, 2)])
