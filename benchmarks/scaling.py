@@ -126,11 +126,19 @@ def last_generations(
     this = session(folder, f"last-{workers}-{settings.population}", settings, pool, maps)
     learning, curriculum = this.learning, this.learning.curriculum
     compile_kernels(settings.policy, settings.traffic, settings.command)
-    validation, nobody = curriculum.validation(), np.zeros((1, learning.spec.size), dtype=np.float32)
-    # Until all are at work, and have the maps that they would have by then.
-    while len(learning.drive("warm", nobody, validation, curriculum.goal_limits()).busy_s) < workers:
-        pass
-    learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
+    nobody = np.zeros((1, learning.spec.size), dtype=np.float32)
+
+    def restore() -> None:
+        learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
+
+    # By then MLflow's run is open, all workers are at work, and they have nearly all maps.
+    this.tracker.wait_ready()
+    restore()
+    coming = [curriculum.episodes(learning.generation + k) for k in range(LAST + 1)]
+    for episodes in (curriculum.validation(), *coming):
+        while len(learning.drive("warm", nobody, episodes, curriculum.goal_limits()).busy_s) < workers:
+            pass
+    restore()
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
     begun = 0.0
 
@@ -156,7 +164,7 @@ def last_generations(
         goals[groups[0].columns], np.concatenate([seconds[part] for part in groups]),
         goals[leader.columns], seconds[leader][0], learning.spec.size,
     )  # fmt: skip
-    return {name: values[1:] for name, values in figures.items()}, load  # the first one puts training's maps
+    return {name: values[1:] for name, values in figures.items()}, load  # the first one measures how fast metres are
 
 
 def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:

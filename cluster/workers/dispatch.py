@@ -50,7 +50,8 @@ class Dispatch:
     def give(self, idle: Sequence[int]) -> Iterator[tuple[int, int]]:
         """Yield (worker, parcel) of all that is to be sent now.
 
-        The last parcels only go to idle workers. So do suspects, and nothing is queued behind them.
+        Parcels come largest first, so the last worker will be the first to need a second one. The last parcels only go
+        to idle workers. So do suspects, and nothing is queued behind them.
 
         Args:
             idle: workers that hold nothing, of no earlier call either.
@@ -58,7 +59,7 @@ class Dispatch:
         for worker in idle[: len(self._todo)]:
             yield self._send(worker)
         busy = sum(1 for held in self._held.values() if held)
-        for worker, held in self._held.items():
+        for worker, held in reversed(self._held.items()):
             if len(self._todo) > busy and 0 < len(held) < QUEUE and self._suspects.isdisjoint((held[0], self._todo[0])):
                 yield self._send(worker)
 

@@ -31,7 +31,7 @@ WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a 
 PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
 LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
 LARGER = 4  # times what is worth sending, where that is more
-SHARE = 0.8  # of what would be a worker's part of the rest, in one parcel
+SHARE = 0.9  # of what would be a worker's part of the rest, in one parcel
 
 
 class PoolError(GridSimError):

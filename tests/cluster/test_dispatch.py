@@ -123,16 +123,21 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     assert dispatch.finished()
 
 
+def test_the_worker_with_the_smallest_parcel_is_the_first_to_get_another() -> None:
+    """Parcels come largest first: a small one behind the largest would be the last to be done."""
+    assert list(new(*[5] * 9).give([0, 1, 2])) == [(0, 0), (1, 1), (2, 2), (2, 3), (1, 4), (0, 5)]
+
+
 def test_nothing_is_queued_with_a_suspect() -> None:
     """So that the next time it is clear which killed. What waited behind a dead worker's parcel is a suspect too."""
     dispatch = new(*[5] * 9)
-    assert [parcel for _, parcel in dispatch.give([0, 1])] == [0, 1, 2, 3]
+    assert list(dispatch.give([0, 1])) == [(0, 0), (1, 1), (1, 2), (0, 3)]
     dispatch.died(0)
     assert list(dispatch.give([0])) == [(0, 0)]
     assert list(dispatch.give([])) == []
     assert dispatch.answered(1) == 1
-    assert dispatch.answered(1) == 3
-    assert list(dispatch.give([1])) == [(1, 2)]
+    assert dispatch.answered(1) == 2
+    assert list(dispatch.give([1])) == [(1, 3)]
     assert dispatch.answered(0) == 0
     assert list(dispatch.give([0])) == [(0, 4), (0, 5)]
 
