@@ -39,7 +39,9 @@ settings.load_profile("gridsim")
 def _ctrl_c_as_before() -> Iterator[None]:
     """Commands inherit whether Ctrl-C is ignored: a test that leaves it so spoils later ones."""
     yield
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) != signal.SIG_IGN
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")

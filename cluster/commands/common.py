@@ -1,4 +1,4 @@
-"""What the commands share: reading the command line, failing in one clear line, stopping on Ctrl-C and SIGTERM."""
+"""What the commands share: reading the command line, failing in one clear line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import math
 import os
 import re
 import shutil
-import signal
 import sys
 import textwrap
 import warnings
@@ -235,11 +234,10 @@ def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
 
 
 def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
-    """Run a command, which Ctrl-C and SIGTERM stop, and exit with the code that `body` returns.
+    """Run a command and exit with the code that `body` returns.
 
     Errors for the user are shown in one line, and a second one if there is a hint for their kind; warnings in one line.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
     try:
         sys.exit(body())

@@ -1,22 +1,39 @@
-"""Entry points of the console scripts: --version, and a guard, so that Ctrl-C is quiet even while libraries load."""
+"""Entry points of the console scripts: --version, and what Ctrl-C and SIGTERM do, also while libraries load."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
+import threading
 import time
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
+from types import FrameType
 
 STARTED = time.perf_counter()  # of the process, but for Python's own start of some 30 ms
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """Signal handler: KeyboardInterrupt, but once the import system is left.
+
+    Raised there, it can be lost, or leave the import lock held, for which other threads then wait forever.
+    """
+    if frame and frame.f_code.co_filename.startswith("<frozen importlib"):
+        threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
+    else:
+        raise KeyboardInterrupt
 
 
 def _enter(module: str, name: str) -> None:
     if "--version" in sys.argv[1:]:
         print(f"gridsim {version('gridsim')}")
         return
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the shell has it ignored
+        signal.signal(signal.SIGINT, interrupt)
+    signal.signal(signal.SIGTERM, interrupt)
     try:
         getattr(import_module(f"cluster.commands.{module}"), name)()
     except KeyboardInterrupt:

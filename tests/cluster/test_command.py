@@ -1,9 +1,12 @@
 """What the commands share: their help, wrong flags, what they call each other, --version."""
 
+import importlib
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from importlib.metadata import entry_points, version
 
 import pytest
@@ -170,3 +173,14 @@ def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monke
     warn_of_many_workers("gridsim-compare", 4, "")
     warn_of_many_workers("gridsim-compare", 1000, "head:6379")
     assert capsys.readouterr().err == ""
+
+
+def test_an_interrupt_within_the_import_system_comes_after_it():
+    before = signal.signal(signal.SIGINT, entry.interrupt)
+    try:
+        # The innermost frame is one of importlib's; an exception here could leave its lock held for good.
+        importlib._bootstrap._call_with_frames_removed(signal.raise_signal, signal.SIGINT)  # type: ignore
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(10.0)
+    finally:
+        signal.signal(signal.SIGINT, before)
