@@ -68,6 +68,11 @@ class _Slot:
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (serial of the task, answer), oldest first
     heard: float = 0.0  # when it last answered, or was sent something after all was answered
 
+    @property
+    def due(self) -> Any:
+        """The answer that it gives next, or None."""
+        return self.hello or (self.sent[0][1] if self.sent else None)
+
 
 @dataclass
 class _Job:
@@ -150,14 +155,15 @@ class RayPool(WorkerPool):
         while not dispatch.finished():
             now = time.monotonic()
             for slot in self._slots:
-                if slot.sent and now - slot.heard > self._patience_s and not self._ready([slot.sent[0][1]], 0.0):
-                    self._bury(slot, job, f"it did not answer for {now - slot.heard:.0f} s")
-            idle = [slot.number for slot in self._slots if slot.pid and not slot.hello and not slot.sent]
+                silent_s = now - slot.heard if slot.pid and slot.due else 0.0
+                if silent_s > self._patience_s and not self._ready([slot.due], 0.0):
+                    self._bury(slot, job, f"it did not answer for {silent_s:.0f} s")
+            idle = [slot.number for slot in self._slots if slot.pid and not slot.due]
             for number, parcel in dispatch.give(idle):
                 self._send(self._slots[number], parcel, job)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
-            waiting = {slot.hello or slot.sent[0][1]: slot for slot in self._slots if slot.hello or slot.sent}
+            waiting = {slot.due: slot for slot in self._slots if slot.due}
             for ref in self._ready(list(waiting), 0.0 if meanwhile and self.pids() else 1.0):
                 if waiting[ref].hello:
                     self._greet(waiting[ref], job)
@@ -333,5 +339,6 @@ class RayPool(WorkerPool):
             self._replace(slot)
         else:
             self._last_failure = ""
+            slot.heard = time.monotonic()
             prepared = slot.serial > 0
             slot.hello = None if prepared else slot.actor.prepare.remote(self._serial, *self._update(slot, job))

@@ -50,13 +50,13 @@ def generations(run: Path) -> int:
 
 
 class Stopping(Answering):
-    """Stops its own process where it is told to, in the midst of a parcel: nobody hears of it again."""
+    """Stops its own process where it is told to, in a parcel or while it is prepared: nobody hears of it again."""
 
-    def __init__(self, folder: Path):
-        self._folder = folder
+    def __init__(self, folder: Path, prepared: bool = True):
+        self._folder, self._prepared = folder, prepared
 
     def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
-        if len(recipes):  # else it is being prepared, and there is nothing to send again
+        if bool(len(recipes)) is self._prepared:
             with contextlib.suppress(FileNotFoundError):
                 (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
                 os.kill(os.getpid(), signal.SIGSTOP)
@@ -78,6 +78,20 @@ def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> No
         assert pid not in pool.pids()
         pool._patience_s = 60.0
         wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2, 60)
+    wait_until(lambda: not psutil.pid_exists(pid), 30)
+
+
+def test_an_only_worker_that_stops_while_it_is_prepared_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "stop").touch()
+    pool = RayPool(
+        1, never_built, worker_factory=functools.partial(Stopping, tmp_path, prepared=False), patience_s=15.0
+    )
+    with contextlib.closing(pool):
+        outcome = pool.evaluate(make_task(), make_recipes(8))
+        wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(8))
+        assert outcome.results.tobytes() == wanted.results.tobytes()
+        pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
+        assert pid not in pool.pids()
     wait_until(lambda: not psutil.pid_exists(pid), 30)
 
 
