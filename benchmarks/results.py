@@ -1,11 +1,12 @@
 """Measure the tables of docs/results.md: python benchmarks/results.py [TABLE ...] [--output DIR] [--quick] [--write]
 
-Each row is a command, run as a user would run it and timed from start to exit, and then the success of its champion on
-512 held-out drives. What is measured is kept in DIR as a JSON file for each command; it is measured again only after a
-change of gridsim, evolution or cluster. So an interrupted measurement goes on where it was. --write puts the tables of
-which all rows are there into docs/results.md, with the commit. Nothing else should run on the machine.
+Each command is run as a user would run it and timed from start to exit; then its champion drives 512 held-out drives. A
+row is one command, or one with several seeds: their median, and the worst of them in brackets. What is measured is kept
+in DIR as a JSON file for each command; it is measured again only after a change of gridsim, evolution or cluster. So an
+interrupted measurement goes on where it was. --write puts the tables of which all rows are there into docs/results.md,
+with the commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, other, speed, comparison; all by default, in an hour on two cores.
+Tables: seeds, roads, other, speed, comparison; all by default, in an hour and a half on two cores.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import argparse
 import json
 import re
 import shlex
+import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,24 +29,43 @@ PAGE = ROOT / "docs" / "results.md"
 PRODUCT = ("gridsim", "evolution", "cluster")
 BIN = Path(sys.executable).parent
 EPISODES = 512  # held-out drives of each champion
+SEEDS, SEEDS_IN_TRAFFIC = 8, 3
 ROADS = (
-    ("highway", 0), ("curved", 0), ("roundabout", 0), ("city", 0),
+    ("seamless", 0), ("highway", 0), ("curved", 0), ("roundabout", 0), ("city", 0),
     ("highway", 8), ("curved", 6), ("seamless", 6), ("roundabout", 4), ("city", 6),
 )  # fmt: skip
-COMMANDS = {
-    "seeds": [f"gridsim-evolve --seed {seed}" for seed in range(5)],
-    "roads": [f"gridsim-evolve --scenario {road} --traffic {cars}" for road, cars in ROADS],
-    "other": [
-        *(f"gridsim-evolve --policy mlp:6,7 --seed {seed}" for seed in range(3)),
-        "gridsim-evolve --recombination two",
-        "gridsim-evolve --scenario curved --observation grid",
-    ],
-    "speed": ["benchmarks/throughput.py --json", "benchmarks/scaling.py --json"],
-    "comparison": ["gridsim-compare --learners evolution dqn --seeds 5"],
+
+
+def over_seeds(command: str, seeds: int) -> dict[str, list[str]]:
+    """A row of several seeds."""
+    return {command: [f"{command} --seed {seed}" for seed in range(seeds)]}
+
+
+def alone(*commands: str) -> dict[str, list[str]]:
+    """A row for each command."""
+    return {command: [command] for command in commands}
+
+
+# Tables, their rows, and the commands that a row is the median of.
+TABLES: dict[str, dict[str, list[str]]] = {
+    "seeds": alone(*(f"gridsim-evolve --seed {seed}" for seed in range(5))),
+    "roads": {
+        label: commands
+        for road, cars in ROADS
+        for label, commands in over_seeds(
+            f"gridsim-evolve --scenario {road} --traffic {cars}", SEEDS_IN_TRAFFIC if cars else SEEDS
+        ).items()
+    },
+    "other": {
+        **over_seeds("gridsim-evolve --policy mlp:6,7", 5),
+        **alone("gridsim-evolve --recombination two", "gridsim-evolve --scenario curved --observation grid"),
+    },
+    "speed": alone("benchmarks/throughput.py --json", "benchmarks/scaling.py --json"),
+    "comparison": alone("gridsim-compare --learners evolution dqn --seeds 5"),
 }
 HEAD = (
-    "| command | car-steps, million | to its end, s | success, % | collisions, % | speed, m/s |\n"
-    "| --- | ---: | ---: | ---: | ---: | ---: |"
+    "| command | seeds | car-steps, million | to its end, s | success, % | collisions, % | speed, m/s |\n"
+    "| --- | ---: | ---: | ---: | ---: | ---: | ---: |"
 )
 
 
@@ -123,36 +144,46 @@ def compare(command: str, store: Store) -> str:
     return (folder / "table.md").read_text()
 
 
-def render(commands: Sequence[str], store: Store) -> str | None:
-    """A table as Markdown; None while it lacks a row."""
-    measured = [store.kept(command) for command in commands]
-    rows = [row for row in measured if row is not None]
-    if len(rows) < len(measured):
+def render(rows: Mapping[str, Sequence[str]], store: Store) -> str | None:
+    """A table as Markdown; None while it lacks a measurement."""
+    measured = {label: [store.kept(command) for command in commands] for label, commands in rows.items()}
+    whole = {label: [run for run in runs if run is not None] for label, runs in measured.items()}
+    if any(len(whole[label]) < len(measured[label]) for label in rows):
         return None
-    if "table" in rows[0]:
-        return str(rows[0]["table"]).strip()
-    if "figures" in rows[0]:
-        figures = {name: value for row in rows for name, value in row["figures"].items()}
+    firsts = [runs[0] for runs in whole.values()]
+    if "table" in firsts[0]:
+        return str(firsts[0]["table"]).strip()
+    if "figures" in firsts[0]:
+        figures = {name: value for row in firsts for name, value in row["figures"].items()}
         return "\n".join(
             ["| figure | value |", "| --- | ---: |", *(f"| `{k}` | {v:,.2f} |" for k, v in figures.items())]
         )
-    return "\n".join([HEAD, *map(row_of, rows)])
+    return "\n".join([HEAD, *(row_of(label, runs) for label, runs in whole.items())])
 
 
-def row_of(measured: dict[str, Any]) -> str:
-    """A run's row."""
-    held_out = measured["held_out"]
+def row_of(label: str, runs: Sequence[dict[str, Any]]) -> str:
+    """A row: values of one run, or medians and the worst of several."""
+
+    def cell(values: Iterable[float], worst: Callable[[list[float]], float] | None, digits: int) -> str:
+        values = list(values)
+        median = f"{statistics.median(values):.{digits}f}"
+        return median if len(values) == 1 or worst is None else f"{median} ({worst(values):.{digits}f})"
+
+    held_out = [run["held_out"] for run in runs]
     return (
-        f"| `{measured['command']}` | {measured['car_steps'] / 1e6:.1f} | {measured['seconds']:.0f} | "
-        f"{100 * held_out['success_rate']:.1f} | {100 * held_out['collision_rate']:.1f} | {held_out['speed_mps']:.1f} |"
+        f"| `{label}` | {len(runs)} | {cell((run['car_steps'] / 1e6 for run in runs), max, 1)} | "
+        f"{cell((run['seconds'] for run in runs), max, 0)} | "
+        f"{cell((100 * drives['success_rate'] for drives in held_out), min, 1)} | "
+        f"{cell((100 * drives['collision_rate'] for drives in held_out), max, 1)} | "
+        f"{cell((drives['speed_mps'] for drives in held_out), None, 1)} |"
     )
 
 
 def write(store: Store) -> None:
     """Put the whole tables, and the commit, into the page, each between its two marks."""
     page = PAGE.read_text()
-    for table in COMMANDS:
-        text = render(COMMANDS[table], store)
+    for table in TABLES:
+        text = render(TABLES[table], store)
         if text is not None:
             marks = f"<!-- {table} -->", f"<!-- end of {table} -->"
             text = f"{text}\n\nMeasured at commit {store.commit}."
@@ -168,19 +199,17 @@ def commit() -> str:
     return f"{last}+changes" if subprocess.run([*git, *diff, *PRODUCT]).returncode else last
 
 
-def quick() -> dict[str, list[str]]:
+def quick() -> dict[str, dict[str, list[str]]]:
     """The first command of each table, on a small scale."""
     small = {"gridsim-evolve": "--car-steps 1000", "gridsim-compare": "--quick"}
-    firsts = {table: commands[0] for table, commands in COMMANDS.items()}
-    return {table: [f"{first} {small.get(first.split()[0], '--runs 1')}"] for table, first in firsts.items()}
+    firsts = {table: next(iter(rows.values()))[0] for table, rows in TABLES.items()}
+    return {table: alone(f"{first} {small.get(first.split()[0], '--runs 1')}") for table, first in firsts.items()}
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "tables", nargs="*", choices=[[], *COMMANDS], metavar="TABLE", help="which ones; all by default"
-    )
+    parser.add_argument("tables", nargs="*", choices=[[], *TABLES], metavar="TABLE", help="which ones; all by default")
     parser.add_argument(
         "--output", type=Path, default=ROOT / "runs" / "results", help="where runs and results are kept"
     )
@@ -190,16 +219,17 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="write the tables into docs/results.md")
     options = parser.parse_args()
     store = Store(options.output.resolve(), commit())
-    commands = quick() if options.quick else COMMANDS
+    tables = quick() if options.quick else TABLES
     subprocess.run(
         [sys.executable, "-m", "cluster.workers.kernels", "everything"], check=True, stdout=subprocess.DEVNULL
     )
-    for table in options.tables or commands:
-        for k, command in enumerate(commands[table]):
+    for table in options.tables or tables:
+        commands = [command for row in tables[table].values() for command in row]
+        for k, command in enumerate(commands):
             if store.kept(command) is None:
-                print(f"{table} {k + 1}/{len(commands[table])}: {command}", file=sys.stderr, flush=True)
+                print(f"{table} {k + 1}/{len(commands)}: {command}", file=sys.stderr, flush=True)
                 store.keep(command, measure(command, store))
-        print(f"\n{table}, commit {store.commit}\n\n{render(commands[table], store)}", flush=True)
+        print(f"\n{table}, commit {store.commit}\n\n{render(tables[table], store)}", flush=True)
     if options.write:
         write(store)
 
