@@ -28,8 +28,8 @@ START_CELLS_PER_M = 1  # cells of the ray start table per metre
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
 THIN_WALL = 3.0  # m; a plain ray may miss walls that are thinner
 
-_F, _I, _U = np.float32, np.int32, np.uint32
-_SIMD_CONES = 16  # cones of the ray start table that are marched in lockstep
+_F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
+_SIMD_CONES = 64  # cones of the ray start table that are marched in lockstep
 
 
 class Road(NamedTuple):
@@ -207,45 +207,59 @@ def _ray_starts(nodes, row_of, ray_range):
     without fast math, so that every machine computes the same table.
     Returns: ranges as bytes [table's rows, HEADING_BINS].
     """
-    rows, columns = nodes.shape
-    k = CELLS_PER_M // START_CELLS_PER_M
-    cells_x, cells_y = columns // k, rows // k
-    ranges = np.empty((row_of.max() + 1, HEADING_BINS), dtype=np.uint8)
+    k, scale = CELLS_PER_M // START_CELLS_PER_M, _F(CELLS_PER_M)
+    columns, mask_x, mask_y, flat = (
+        _I(nodes.shape[1]),
+        _I(nodes.shape[1] - 1),
+        _I(nodes.shape[0] - 1),
+        nodes.reshape(-1),
+    )
     radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
     spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
     margin = _F(0.2)  # m; the march ends below it
-    mask_x, mask_y, flat = _I(columns - 1), _I(rows - 1), nodes.reshape(-1)
     # Whole turns of the torus are added, so that positions are positive and truncation rounds down.
     turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
-    turn_y = _F(rows * math.ceil(ray_range * CELLS_PER_M / rows) + 0.5)
-    # Cones are marched in lockstep, so that the inner loop is vectorised; finished ones do not move.
-    cones = (HEADING_BINS + _SIMD_CONES - 1) // _SIMD_CONES * _SIMD_CONES
-    c, s = np.empty(cones, dtype=np.float32), np.empty(cones, dtype=np.float32)
-    for b in range(cones):
-        angle = (b + 0.5) * 2.0 * math.pi / HEADING_BINS
-        c[b], s[b] = _F(math.cos(angle) * CELLS_PER_M), _F(math.sin(angle) * CELLS_PER_M)
-    t = np.empty(cones, dtype=np.float32)
-    for j in range(cells_y):
-        for i in range(cells_x):
-            row = row_of[j * cells_x + i]
-            if row < 0:
-                continue
-            x, y = _F((i + 0.5) * k) + turn_x, _F((j + 0.5) * k) + turn_y
-            t[:] = _F(0.0)
-            for first in range(0, cones, _SIMD_CONES):
-                going = _I(1)
-                while going:
-                    going = _I(0)
-                    for b in range(first, first + _SIMD_CONES):
-                        # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
-                        column = _I(x + t[b] * c[b]) & mask_x
-                        line = _I(y + t[b] * s[b]) & mask_y
-                        free = flat[line * _I(columns) + column] - radius - spread * t[b]
-                        goes = free > margin and t[b] < ray_range
-                        t[b] += free if goes else _F(0.0)
-                        going |= _I(goes)
-            for b in range(HEADING_BINS):
-                ranges[row, b] = np.uint8(min(t[b], ray_range) * _F(START_UNITS))
+    turn_y = _F(nodes.shape[0] * math.ceil(ray_range * CELLS_PER_M / nodes.shape[0]) + 0.5)
+    cells = np.flatnonzero(row_of >= 0)
+    count, across = len(cells), nodes.shape[1] // k
+    x, y = np.zeros(count + _SIMD_CONES, dtype=np.float32), np.zeros(count + _SIMD_CONES, dtype=np.float32)
+    for row in range(count):
+        x[row] = _F((cells[row] % across + 0.5) * k) + turn_x
+        y[row] = _F((cells[row] // across + 0.5) * k) + turn_y
+    ranges = np.empty((count, HEADING_BINS), dtype=np.uint8)
+    first, t = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.float32)
+    free, at = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.uint32)
+    # Cones of neighbouring cells in one direction are about as long as each other. They are marched in lockstep, by loops
+    # of which all but the one that reads the field are vectorised; finished ones do not move.
+    lanes = _N(_SIMD_CONES)
+    for block in range(0, count, _SIMD_CONES):
+        here, any_free = _N(block), _I(0)
+        for r in range(lanes):  # the first step is the same in all directions
+            at[r] = (_I(y[here + r]) & mask_y) * columns + (_I(x[here + r]) & mask_x)
+        for r in range(lanes):
+            room = flat[at[r]] - radius
+            first[r] = room if room > margin else _F(0.0)
+            any_free |= _I(room > margin)
+        for b in range(HEADING_BINS):
+            angle = (b + 0.5) * 2.0 * math.pi / HEADING_BINS
+            c, s = _F(math.cos(angle)) * scale, _F(math.sin(angle)) * scale
+            t[:] = first
+            going = any_free
+            while going:
+                # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
+                for r in range(lanes):
+                    column, line = _I(x[here + r] + t[r] * c) & mask_x, _I(y[here + r] + t[r] * s) & mask_y
+                    at[r] = line * columns + column
+                for r in range(lanes):
+                    free[r] = flat[at[r]]
+                going = _I(0)
+                for r in range(lanes):
+                    room = free[r] - radius - spread * t[r]
+                    goes = (room > margin) & (t[r] < ray_range)
+                    t[r] += room if goes else _F(0.0)
+                    going |= _I(goes)
+            for r in range(min(_SIMD_CONES, count - block)):
+                ranges[block + r, b] = np.uint8(min(t[r], ray_range) * _F(START_UNITS))
     return ranges
 
 
