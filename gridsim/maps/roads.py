@@ -229,8 +229,8 @@ def _ray_starts(nodes, row_of, ray_range):
     ranges = np.empty((count, HEADING_BINS), dtype=np.uint8)
     first, t = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.float32)
     free, at = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.uint32)
-    # Cones of neighbouring cells in one direction are about as long as each other. They are marched in lockstep, by loops
-    # of which all but the one that reads the field are vectorised; finished ones do not move.
+    # Cones of neighbouring cells in one direction are about as long as each other. They are marched in lockstep, by
+    # loops of which all but the one that reads the field are vectorised; finished ones do not move.
     lanes = _N(_SIMD_CONES)
     for block in range(0, count, _SIMD_CONES):
         here, any_free = _N(block), _I(0)
