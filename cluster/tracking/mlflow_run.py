@@ -276,6 +276,13 @@ def _note_tags(text: str) -> dict[str, str]:
     return {NOTE_TAG: text, OWN_NOTE_TAG: hashlib.sha256(text.encode()).hexdigest()} if text else {}
 
 
+def preload() -> None:
+    """Import what `write_model` needs, which takes three seconds, so that a run's end need not wait for it."""
+    with contextlib.suppress(Exception):  # `write_model` meets it again
+        import mlflow.pytorch  # noqa: F401
+        import torch._dynamo  # noqa: F401  # as torch.export does when it is called
+
+
 def write_model(folder: Path, model: Model) -> None:
     """Write a torch model as MLflow's: graph and weights (`pt2`), signature and input example.
 

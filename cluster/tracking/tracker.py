@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from cluster.tracking.address import UI, TrackingError, one_line, shown
-from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, run_table
+from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload, run_table
 
 FLUSH_S = 2.0  # rows that come within this time go out as one request: 5 ms of CPU for a row alone, 0.8 ms among many
 RETRY_S = 5.0
@@ -53,6 +53,7 @@ class Tracker:
 
         self._tried, self._news, self._closed = (threading.Event() for _ in range(3))
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
+        self._preload = threading.Thread(target=preload, name="preload", daemon=True)
 
     def wait_ready(self, timeout_s: float = 30.0) -> str:
         """The run's id, once there is one. Raises TrackingError when an attempt fails, or after `timeout_s`."""
@@ -126,6 +127,8 @@ class Tracker:
         while not self._closed.is_set():
             self._news.clear()
             synced = self._sync()
+            if synced and self._preload.ident is None:
+                self._preload.start()
             self._closed.wait(FLUSH_S if synced else RETRY_S)
             if synced:
                 self._news.wait()
