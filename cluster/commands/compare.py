@@ -227,7 +227,8 @@ class Results:
             for row in rows:
                 table.add_row(*(cell.partition(" (")[0] for cell in row))
             console.print(table, "")
-        console.print(tables.NOTES.replace(", quartiles in brackets", ""), highlight=False)
+        for note in tables.notes(self.groups):
+            console.print(f"- {note}".replace(", quartiles in brackets", ""), highlight=False)
         console.print(f"tables, picture and drives: {short_path(self.path / REPORT)}", soft_wrap=True)
 
 
@@ -261,7 +262,7 @@ class Progress(Line):
         console.print(f"comparing {self._total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
     def begin(self, cell: Cell) -> None:
-        self.name, self.resume = cell.name, f"{cell.settings.command} --resume {cell.folder}"
+        self.name, self.resume = cell.name, f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
         self._begun = time.perf_counter()
         self.note("reading what is finished" if cell.finished() else "starting")
 

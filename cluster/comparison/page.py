@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from cluster.comparison.plan import Plan
 from cluster.comparison.results import Run
-from cluster.comparison.tables import DRIVING, ERRORS, NOTES, Group, introduction, table
+from cluster.comparison.tables import DRIVING, ERRORS, Group, introduction, notes, table
 from cluster.runs.run import PAGE
 
 STYLE = """\
@@ -29,12 +29,12 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path
     for columns in (DRIVING, ERRORS):
         head, *rows = [[escape(cell) for cell in row] for row in table(groups, columns)]
         parts.append(_table(head, rows))
-    parts.append("<ul>" + "".join(f"<li>{escape(note[2:])}" for note in NOTES.splitlines()) + "</ul>")
+    parts.append("<ul>" + "".join(f"<li>{escape(note)}" for note in notes(groups)) + "</ul>")
     drives = [
         [escape(group.road), escape(group.name), ", ".join(_link(folder, run) for run in group.runs)]
         for group in groups
     ]
-    parts += ["<h2>Drives on a held-out map</h2>", _table(["road", "learner", "runs"], drives)]
+    parts += ["<h2>Drives of the champions</h2>", _table(["road", "learner", "runs"], drives)]
     data = base64.b64encode(picture.read_bytes()).decode()
     parts.append(f'<p><img alt="errors and training times" src="data:image/png;base64,{data}"></p>')
     top = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'

@@ -24,9 +24,6 @@ COLUMNS = (
 )  # fmt: skip
 """Of table.csv."""
 NOTHING = "–"
-NOTES = """\
-- Medians over seeds, quartiles in brackets. Fewer than 3 seeds are too few for a verdict.
-- Errors are means over the metres that were driven: small ones of drivers that crash soon say nothing."""
 
 
 class Spread(NamedTuple):
@@ -123,14 +120,24 @@ def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
 
 def table_md(groups: Sequence[Group], plan: Plan | None = None) -> bytes:
     """The plan, two tables, and notes on them."""
-    parts = [introduction(plan), *(_markdown(table(groups, columns)) for columns in (DRIVING, ERRORS)), NOTES]
+    parts = [introduction(plan), *(_markdown(table(groups, columns)) for columns in (DRIVING, ERRORS))]
+    parts.append("\n".join(f"- {note}" for note in notes(groups)))
     return ("\n\n".join(parts) + "\n").encode()
+
+
+def notes(groups: Sequence[Group]) -> list[str]:
+    """What to keep in mind when reading the tables."""
+    few = " Fewer than 3 seeds are too few for a verdict." if min(len(group.runs) for group in groups) < 3 else ""
+    return [
+        f"Medians over seeds, quartiles in brackets.{few}",
+        "Errors are means over the metres that were driven: those of a driver that crashes soon say little.",
+    ]
 
 
 def introduction(plan: Plan | None) -> str:
     """The plan in a line."""
     if plan is None:
-        return "Finished runs."
+        return "Finished runs. Their budgets may differ: compare training times and car-steps first."
     sensors = {"rays": "31 rays", "grid": "the occupancy grid"}
     traffic = "traffic as each road has it by default" if plan.traffic == -1 else f"{plan.traffic} other cars"
     return f"{count(plan.seeds, 'seed')}, at most {plan.budget} a run, {sensors[plan.observation]}, {traffic}."

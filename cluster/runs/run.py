@@ -152,7 +152,10 @@ def open_run(folder: Path) -> RunFolder:
     meta = run.saved[1]
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():
-        raise RunError(f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together; one of them was edited")
+        raise RunError(
+            f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together: one of them was edited, or another "
+            f"version of GridSim wrote them; start a new run, --init {folder} begins with its champion"
+        )
     run.tracking_key = str(meta["tracking"]["key"])
     return run
 

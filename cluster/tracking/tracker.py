@@ -70,7 +70,9 @@ class Tracker:
         if served:
             return table or shown(self.uri)
         make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # the one that it shows
-        return f"{make}{mlflow} ui --backend-store-uri {self.uri}" + (f"; then open\n{table}" if table else "")
+        return f"{make}MLFLOW_DISABLE_TELEMETRY=true {mlflow} ui --backend-store-uri {self.uri}" + (
+            f"; then open\n{table}" if table else ""
+        )
 
     def log_row(self, step: int, row: Mapping[str, float], wall_s: float | None = None) -> None:
         """Send metrics of a step, of `wall_s` after the run's start, or of now. MLflow's run ends with the last one."""

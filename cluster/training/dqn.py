@@ -2,8 +2,8 @@
 
 Batch k is collected with the weights after update block k - 2, the newest ones when it is sent out: block k - 1 is
 trained meanwhile, on the batches up to k - 1. So workers and learner do not wait for each other, and the network is the
-same for any number of workers. A step of the run is an evaluation: the current network drives validation's first
-episodes, beside the candidate that did well there the last time, as evolution's champions are found.
+same for any number of workers. A step of the run is an evaluation: the averaged network drives the validation
+episodes, as evolution's candidates do.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ COLUMNS = (
 )  # fmt: skip
 """Columns of history.csv after `evaluation`; the names that MLflow has them under.
 
-`mean` is of the training episodes since the evaluation before, `best` of the network on validation's first episodes.
+`mean` is of the training episodes since the evaluation before, `best` of the network in validation.
 """
 
 EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there

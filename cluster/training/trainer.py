@@ -1,8 +1,8 @@
 """What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
 
-A learner is a loop of steps between a pool and a run's files; `coordinator` has the genetic algorithm's, `dqn_loop` the
-DQN's. Everything it decides follows from the seed and from what the workers return; nothing depends on the clock or
-on which worker returned it.
+A learner is a loop of steps between a pool and a run's files: `evolution` has that of the searches, `dqn` the DQN's.
+Everything it decides follows from the seed and from what the workers return; nothing depends on the clock or on which
+worker returned it.
 """
 
 from __future__ import annotations
