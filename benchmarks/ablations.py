@@ -1,7 +1,7 @@
 """What each part of the default search is worth: python benchmarks/ablations.py [VARIANT ...] [--scenario NAME] ...
 
 Each variant changes one thing and learns with several seeds, without validation. Printed is the success of the leader
-in the 256 validation drives after so many million car-steps: the mean over the seeds, and the worst of them in brackets.
+in the 256 validation drives after so many million car-steps: the mean over the seeds, and in brackets the worst.
 All variants on `seamless` with 8 seeds take half an hour on two cores.
 """
 

@@ -154,7 +154,7 @@ def open_run(folder: Path) -> RunFolder:
     if meta.get("digest") != run.digest():
         raise RunError(
             f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together: one of them was edited, or another "
-            f"version of GridSim wrote them; start a new run, --init {folder} begins with its champion"
+            "version of GridSim wrote them; start a new run"
         )
     run.tracking_key = str(meta["tracking"]["key"])
     return run
