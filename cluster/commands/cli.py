@@ -57,9 +57,9 @@ class RunFlags(WorkFlags):
     name: str = ""
     """Name of the run; by default made of scenario, algorithm, seed and time."""
     resume: str = ""
-    """Folder of a run to continue, exactly where its checkpoint stands."""
+    """Folder of a run to continue exactly from its checkpoint."""
     config: str = ""
-    """A run's config.json: repeat that run; flags beside it change it."""
+    """A run's config.json: repeat that run; other flags override it."""
     init: str = ""
     """A champion.npz, or a run's folder, to start from in place of random networks."""
 
@@ -105,12 +105,12 @@ Flags = EvolveFlags | DqnFlags
 
 @dataclass(frozen=True)
 class EvaluateFlags(RoadFlags):
-    """Drive a champion through episodes on maps it never saw, and say how good it is."""
+    """Drive a champion through episodes on maps it never saw, and report how well it drives."""
 
     champion: tyro.conf.Positional[str]
     """A champion.npz, or a run's folder."""
     episodes: int = 64
-    """How many; the default 64 are the held-out episodes of every run."""
+    """Number of episodes; the default 64 are the held-out episodes of every run."""
     errors: bool = False
     """Also its velocity and steering errors against the reference driver."""
     json: bool = False

@@ -83,13 +83,13 @@ class WorkFlags:
     workers: int = field(default_factory=cores)
     """Worker processes; 0 evaluates in this process."""
     output: str = "runs"
-    """Folder in which the new folder is made."""
+    """Folder in which the run's folder is created."""
     address: str = ""
     """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
     patience: float = 0.0
-    """Seconds to wait for workers when there are none; 0: 300 on a cluster, else 60. Then it stops, to be resumed."""
+    """Seconds without any worker after which a run stops, to be resumed. By default 60, on a cluster 300."""
     tracking_uri: str = ""
-    """MLflow's store. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
+    """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: str = "gridsim"
     """MLflow's experiment."""
 
@@ -103,7 +103,7 @@ class RoadFlags:
     traffic: int = -1
     """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
     seed: int = HELD_OUT_SEED
-    """Seed of the first map; those of held-out maps begin at 2,000,000."""
+    """Seed of the first map; held-out maps have seeds from 2,000,000 on."""
 
 
 def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:

@@ -58,14 +58,14 @@ class CompareFlags(WorkFlags, Plan):
 
     Trains every learner on every scenario with every seed, then writes comparison.html: tables, a picture, and a link
     to each champion's drive; also table.md, table.csv and comparison.png. A run's folder is kept for each, and what is
-    finished is never done again. With RUNS, folders of runs (or of comparisons) that are there, it trains nothing and
-    compares these.
+    finished is never done again. With RUNS, folders of finished runs or of comparisons, it only compares
+    these.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]] = ()
     """Folders of finished runs to compare, in place of training."""
     quick: bool = False
-    """A first look, in minutes."""
+    """A first look, in minutes: one seed, 10 s a run."""
     name: str = ""
     """Name of the comparison; by default made of the time."""
     resume: str = ""
@@ -237,7 +237,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     default = CompareFlags()
     for f in dataclasses.fields(CompareFlags):
         if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(default, f.name):
-            raise UsageError(f"{as_flag(f.name)}: runs that are there are compared as they are; leave it out")
+            raise UsageError(f"{as_flag(f.name)}: finished runs are compared as they are; leave it out")
     runs = read_runs([Path(name) for name in flags.runs])
     results = Results(new_folder(Path(flags.output), flags.name, "comparison"))
     with console.status("measuring errors") as shown:

@@ -75,7 +75,7 @@ class Progress(Line):
         self.facts, self.rest = "success 0%  ETA -:--", "starting the workers"
 
     def compiling(self) -> AbstractContextManager[object]:
-        return self.console.status("compiling the simulator for this machine, once (some 10 s)")
+        return self.console.status("compiling the simulator for this machine, once (some 20 s)")
 
     def stopping(self) -> None:
         Console(stderr=True).print("stopping; a moment ...", style="dim")

@@ -52,7 +52,7 @@ class WatchFlags(RoadFlags):
     source: tyro.conf.Positional[str]
     """A run's folder, a champion.npz, or a recorded drive.csv."""
     beside: tyro.conf.Positional[tuple[str, ...]] = ()
-    """More of them, to be shown on one page on the same road: --output drive.html."""
+    """More of them, to compare on one page on the same road; needs --output FILE.html."""
     output: str = ""
     """Write a film, .mp4 or .gif, or a page, .html, in place of the window."""
     generation: int | None = None
@@ -81,7 +81,7 @@ class DriveFlags:
     traffic: int = -1
     """Other cars on the road; -1: as many as the scenario has by default."""
     record: str = ""
-    """Keep the drive in this new CSV file."""
+    """Record the drive to this new CSV file."""
     seed: int = 0
     """Seed of the map and of the start."""
     seconds: float = 0.0
@@ -131,7 +131,7 @@ def _watch() -> int:
         with wrong_use():
             check_name(flags.scenario)
     if flags.beside and not flags.output.lower().endswith(".html"):
-        raise UsageError("several champions are shown on a page alone: --output drive.html")
+        raise UsageError("several champions can only be shown on a page: --output drive.html")
     if flags.output.lower().endswith(".html"):
         _page(flags, seconds)
     elif flags.output:

@@ -77,10 +77,10 @@ class Plan:
     seeds: int = 3
     """Seeds of each, 0 and up; 1 with --quick."""
     observation: Observation = "rays"
-    """What the networks see: 31 ranges, or the occupancy grid; and the speed."""
+    """What the networks see beside the speed: rays (31 ranges) or grid (an occupancy grid)."""
     budget: str = "60s"
     """What a run may use at most: car-steps (20M, 500k) or wall time (60s, 5min, 1h); 10s with --quick. Car-steps give
-    the same networks on any machine. A run also ends by its learner's own rule."""
+    the same networks on any machine. A run may end earlier by its learner's own stopping rule."""
     traffic: int = -1
     """Other cars on the road; -1: as many as each scenario has by default."""
     population: int = 0

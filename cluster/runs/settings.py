@@ -44,24 +44,24 @@ class RunSettings:
     counts: ClassVar[tuple[str, ...]]  # integers in a checkpoint that say how far a run has come
 
     scenario: str = "seamless"
-    """Road to learn to drive on: its name, or a map's file (.yaml of map_server's form, or a picture; docs/maps.md)."""
+    """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
     traffic: int = -1
     """Other cars on the road; -1: as many as the scenario has by default. A map from a file has no lanes for them."""
     seed: int = 0
     """Seed of every random number of the run."""
     observation: Observation = "rays"
-    """What the network sees: 31 ranges, or the occupancy grid; and the speed."""
+    """What the network sees beside the speed: rays (31 ranges) or grid (an occupancy grid)."""
     policy: str = ""
     """Network; by default one that suits the observation."""
     car_steps: int = 0
     """Car-steps at most, checked after each generation; 0: 30 million, in traffic 60, and any number if generations are
     given."""
     until: float = 0.99
-    """Stop when the champion succeeds in this share of validation episodes, at a fair pace; above 1: never."""
+    """Stop when the champion succeeds in this share of validation episodes, at --pace or faster; above 1: never."""
 
     pace: float = 0.0
-    """Mean speed in m/s below which a champion's success counts for less, and which training's time limits follow; 0:
-    the scenario's own, a little above its lower speed."""
+    """Mean speed in m/s that a champion should reach: slower success counts for less, and training's time limits
+    follow from it. By default a little above the lower end of the road's speed interval."""
 
     def __post_init__(self) -> None:
         if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
@@ -153,8 +153,8 @@ class EvolveSettings(RunSettings):
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: str = ""
-    """Network: mlp: and the sizes of its hidden layers, with +motion if it sees how fast the cars that rays meet come
-    closer, +steering if it sees how its own wheels stand; by default mlp:64+steering, in traffic
+    """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the
+    cars that rays hit approach, +steering to see its own steering angle; by default mlp:64+steering, in traffic
     mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
     of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: int = 0
@@ -163,18 +163,18 @@ class EvolveSettings(RunSettings):
     """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
     otherwise no more than 30 million car-steps, in traffic 60."""
     recombination: Literal["all", "two"] = "all"
-    """Whose genes a child has: all winners of the tournaments, averaged into one centre (an evolution strategy), or
-    two parents' (the classic genetic algorithm)."""
+    """all: the winners of all tournaments are averaged into one centre (an evolution strategy); two: each child
+    has two parents (the classic genetic algorithm)."""
     tournament: int = 4
-    """Members of a tournament."""
+    """Members of a tournament; more select more strictly."""
     sigma: float = 0.5
-    """Standard deviation of mutation; that of all winners' centre adapts from there."""
+    """Standard deviation of mutation; with --recombination all the first one, which then adapts."""
     elites: int = 8
-    """With --recombination two: members that go on unmodified."""
+    """With --recombination two: members that are copied unchanged into the next generation."""
     mutation_rate: float = 0.03
     """With --recombination two: share of a child's genes that are mutated."""
     search: Literal["evolution", "random"] = "evolution"
-    """random: new random genomes in every generation, the baseline that evolution must beat."""
+    """evolution, or random: new random genomes in each generation, as a baseline."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -261,13 +261,13 @@ class DqnSettings(RunSettings):
     }  # fmt: skip
 
     policy: str = ""
-    """Network of the Q function: mlp: and the sizes of its hidden layers, with +steering if it sees how its own wheels
-    stand, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
+    """Network of the Q function: mlp: and the sizes of its hidden layers, +steering to see its own steering
+    angle, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
     layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
-    """Car-steps at most, but for the last batch (some 33,000) and the evaluation after it; 0: any number."""
+    """Car-steps at most; the last batch (some 33,000) and the evaluation after it may exceed it."""
     episodes: int = 0
-    """Training episodes at most, but for those of the last batch; 0: any number."""
+    """Training episodes at most; the last batch may exceed it."""
     converged: float = 0.01
     """Stop when the Q values of fixed observations change by less than this share of their spread from one evaluation
     to the next, three times in a row; 0: never."""
@@ -282,14 +282,14 @@ class DqnSettings(RunSettings):
     discount: float = 0.99
     """Discount factor of a step."""
     learning_rate: float = 0.0
-    """Of Adam, at the start; it falls to a twentieth over --anneal. 0: 0.001, on the grid 0.0005."""
+    """Adam's learning rate at the start; it falls to a twentieth over --anneal. 0: 0.001, on the grid 0.0005."""
     anneal: int = 0
     """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth. 0: 30
     million, on the grid 4 million."""
     target_period: int = 0
     """Updates from one copy of the target network to the next; 0: 200, on the grid 500."""
     epsilon: float = 0.4
-    """Share of random actions of the episode that explores most; others of a batch explore less (Horgan et al.
+    """Share of random actions in the episode of a batch that explores most; the others explore less (Horgan et al.
     2018)."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where the learner computes: auto, cpu or cuda."""
