@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import tyro
@@ -40,7 +40,7 @@ from cluster.report.pictures import errors_table, held_out_table
 from cluster.runs.champion import evaluate, load_champion
 from cluster.runs.checkpoint import CHECKPOINT, CONFIG, CheckpointError
 from cluster.runs.run import RunFolder, is_finished, lock, new_run, open_run, read_config
-from cluster.runs.settings import DqnSettings, EvolveSettings, check_workers
+from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
 from cluster.tracking.address import check_uri
 from cluster.tracking.tracker import count
@@ -54,13 +54,13 @@ from gridsim.reference.errors import errors
 class RunFlags(WorkFlags):
     """Which run it is, and where it is computed, kept and logged."""
 
-    name: str = ""
+    name: Annotated[str, IN_WORDS] = ""
     """Name of the run; by default made of scenario, algorithm, seed and time."""
-    resume: str = ""
+    resume: Annotated[str, IN_WORDS] = ""
     """Folder of a run to continue exactly from its checkpoint."""
-    config: str = ""
+    config: Annotated[str, IN_WORDS] = ""
     """A run's config.json: repeat that run; other flags override it."""
-    init: str = ""
+    init: Annotated[str, IN_WORDS] = ""
     """A champion.npz, or a run's folder, to start from in place of random networks."""
 
 
@@ -72,6 +72,7 @@ class EvolveFlags(RunFlags, EvolveSettings):
     curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
+    example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1 --workers 2"
     #: Flags that version 0.1 had, and what takes their place.
     removed: ClassVar[dict[str, str]] = {
         "--islands": "a run has one population; use --recombination all, the default, which needs no others",
@@ -92,6 +93,7 @@ class DqnFlags(RunFlags, DqnSettings):
     depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
+    example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1 --workers 2"
     #: Flags that version 0.2 had, and why they went.
     removed: ClassVar[dict[str, str]] = {
         **dict.fromkeys(("--prioritised", "--no-prioritised"), "transitions are drawn uniformly, which does as well"),
@@ -116,6 +118,7 @@ class EvaluateFlags(RoadFlags):
     json: bool = False
     """Print one JSON object and nothing else."""
 
+    example: ClassVar[str] = "gridsim-evaluate runs/NAME --scenario city --episodes 500"
     removed: ClassVar[dict[str, str]] = {"--reference": "errors are those against the reference driver; use --errors"}
 
 

@@ -17,11 +17,12 @@ import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from docstring_parser import attrdoc
 
+from cluster.runs.settings import IN_WORDS
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED
 
@@ -84,11 +85,11 @@ class WorkFlags:
     """Worker processes; 0 evaluates in this process."""
     output: str = "runs"
     """Folder in which the run's folder is created."""
-    address: str = ""
+    address: Annotated[str, IN_WORDS] = ""
     """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
-    patience: float = 0.0
+    patience: Annotated[float, IN_WORDS] = 0.0
     """Seconds without any worker after which a run stops, to be resumed. By default 60, on a cluster 300."""
-    tracking_uri: str = ""
+    tracking_uri: Annotated[str, IN_WORDS] = ""
     """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: str = "gridsim"
     """MLflow's experiment."""
@@ -98,10 +99,10 @@ class WorkFlags:
 class RoadFlags:
     """Which road a champion drives on."""
 
-    scenario: str = ""
+    scenario: Annotated[str, IN_WORDS] = ""
     """Road to drive on; by default the one it learned on."""
-    traffic: int = -1
-    """Other cars on the road; -1: as many as it learned among, or as another scenario has by default."""
+    traffic: Annotated[int, IN_WORDS] = -1
+    """Other cars on the road; by default as many as it learned among, or as another road usually has."""
     seed: int = HELD_OUT_SEED
     """Seed of the first map; held-out maps have seeds from 2,000,000 on."""
 
@@ -165,7 +166,8 @@ def as_flag(name: str) -> str:
 
 def _about(kind: type) -> str:
     """A command's description as --help shows it. tyro keeps lines that begin with a space."""
-    paragraphs = [*inspect.cleandoc(kind.__doc__ or "").split("\n\n"), "--version prints GridSim's version."]
+    summary, *more = inspect.cleandoc(kind.__doc__ or "").split("\n\n")
+    paragraphs = [summary, f"Example: {kind.example}", *more, "--version prints GridSim's version."]  # type: ignore[attr-defined]
     width = shutil.get_terminal_size().columns
     return "\n".join(textwrap.fill(text, width, initial_indent=" ", subsequent_indent=" ") for text in paragraphs)
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import tyro
 from rich.box import SIMPLE
@@ -41,7 +41,7 @@ from cluster.comparison.results import Run, errors_of, read_run
 from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
-from cluster.runs.settings import check_workers
+from cluster.runs.settings import IN_WORDS, check_workers
 from cluster.runs.train import Session, Workers, train
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
@@ -58,19 +58,19 @@ class CompareFlags(WorkFlags, Plan):
 
     Trains every learner on every scenario with every seed, then writes comparison.html: tables, a picture, and a link
     to each champion's drive; also table.md, table.csv and comparison.png. A run's folder is kept for each, and what is
-    finished is never done again. With RUNS, folders of finished runs or of comparisons, it only compares
-    these.
+    finished is never done again. With RUNS, folders of finished runs or of comparisons, it only compares these.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]] = ()
     """Folders of finished runs to compare, in place of training."""
     quick: bool = False
     """A first look, in minutes: one seed, 10 s a run."""
-    name: str = ""
+    name: Annotated[str, IN_WORDS] = ""
     """Name of the comparison; by default made of the time."""
-    resume: str = ""
+    resume: Annotated[str, IN_WORDS] = ""
     """Folder of a comparison to continue; a larger --seeds adds to it."""
 
+    example: ClassVar[str] = "gridsim-compare --scenarios curved city --learners evolution dqn --seeds 5"
     removed: ClassVar[dict[str, str]] = {"--reference": "errors are those against the reference driver; leave it out"}
 
 

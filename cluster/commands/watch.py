@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
 import tyro
@@ -26,7 +27,7 @@ from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import CHECKPOINT, CONFIG, ELITES, RunError, read_config
-from cluster.runs.settings import MAX_TRAFFIC
+from cluster.runs.settings import IN_WORDS, MAX_TRAFFIC
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
@@ -49,22 +50,23 @@ class WatchFlags(RoadFlags):
     In the window: N goes on to the next road, Esc or Q ends.
     """
 
+    example: ClassVar[str] = "gridsim-watch runs/NAME --scenario city --output drive.gif"
     source: tyro.conf.Positional[str]
     """A run's folder, a champion.npz, or a recorded drive.csv."""
     beside: tyro.conf.Positional[tuple[str, ...]] = ()
     """More of them, to compare on one page on the same road; needs --output FILE.html."""
-    output: str = ""
+    output: Annotated[str, IN_WORDS] = ""
     """Write a film, .mp4 or .gif, or a page, .html, in place of the window."""
-    generation: int | None = None
+    generation: Annotated[int | None, IN_WORDS] = None
     """Watch this generation's elite (of a DQN: this evaluation's network), not the champion; 0 is the first, as in
     history.csv and MLflow."""
     follow: bool = False
     """Watch the newest elite, while the run is still going."""
-    seconds: float = 0.0
+    seconds: Annotated[float, IN_WORDS] = 0.0
     """Seconds of driving to show; by default all of a recorded drive, else 60 in a film and no limit in a window."""
-    fps: int = 0
+    fps: Annotated[int, IN_WORDS] = 0
     """Pictures a second; by default 30 in a window, 20 in an .mp4, 10 in a .gif."""
-    size: str = ""
+    size: Annotated[str, IN_WORDS] = ""
     """Width x height in pixels; by default 960x640 in a window, 640x360 in a film."""
 
 
@@ -76,16 +78,17 @@ class DriveFlags:
     time, pose, speed, steering, action, and the map; gridsim-watch shows it again.
     """
 
+    example: ClassVar[str] = "gridsim-drive --scenario city --record drive.csv"
     scenario: str = "seamless"
-    """Road to drive on: its name, or a map's file."""
-    traffic: int = -1
-    """Other cars on the road; -1: as many as the scenario has by default."""
-    record: str = ""
+    """Road to drive on: highway, curved, seamless, roundabout, city, or a map file."""
+    traffic: Annotated[int, IN_WORDS] = -1
+    """Other cars on the road; by default as many as it usually has."""
+    record: Annotated[str, IN_WORDS] = ""
     """Record the drive to this new CSV file."""
     seed: int = 0
     """Seed of the map and of the start."""
-    seconds: float = 0.0
-    """End after so many seconds of driving; 0: when the window is closed."""
+    seconds: Annotated[float, IN_WORDS] = 0.0
+    """End after so many seconds of driving; by default when the window is closed."""
     size: str = "960x640"
     """Width x height of the window, in pixels."""
 

@@ -16,12 +16,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, read_run
 from cluster.runs import checkpoint
 from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, new_run, open_run, read_config
-from cluster.runs.settings import MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
+from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
@@ -81,12 +81,12 @@ class Plan:
     budget: str = "60s"
     """What a run may use at most: car-steps (20M, 500k) or wall time (60s, 5min, 1h); 10s with --quick. Car-steps give
     the same networks on any machine. A run may end earlier by its learner's own stopping rule."""
-    traffic: int = -1
-    """Other cars on the road; -1: as many as each scenario has by default."""
-    population: int = 0
-    """Members of a generation, of evolution and random search; 0: as gridsim-evolve has it."""
-    generations: int = 0
-    """Generations at most, of evolution and random search; 0: any number, within the budget."""
+    traffic: Annotated[int, IN_WORDS] = -1
+    """Other cars on the road; by default as many as each road usually has."""
+    population: Annotated[int, IN_WORDS] = 0
+    """Members of a generation, of evolution and random search; by default as for gridsim-evolve."""
+    generations: Annotated[int, IN_WORDS] = 0
+    """Generations at most, of evolution and random search; by default any number within the budget."""
 
     def __post_init__(self) -> None:
         absolute = tuple(os.path.abspath(name) if is_map_file(name) else name for name in self.scenarios)

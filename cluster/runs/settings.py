@@ -7,7 +7,9 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_type_hints
+
+import tyro
 
 from evolution.episodes.curriculum import CurriculumConfig
 from evolution.networks.policy import Observation, PolicySpec
@@ -27,6 +29,9 @@ MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Of evolution, by default.
 CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
 
+IN_WORDS = tyro.conf.arg(help_behavior_hint="")
+"""Of flags whose help says in words what their default means."""
+
 S = TypeVar("S", bound="RunSettings")
 
 
@@ -45,21 +50,21 @@ class RunSettings:
 
     scenario: str = "seamless"
     """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
-    traffic: int = -1
-    """Other cars on the road; -1: as many as the scenario has by default. A map from a file has no lanes for them."""
+    traffic: Annotated[int, IN_WORDS] = -1
+    """Other cars on the road; by default as many as the road usually has (docs/roads.md), on a map file none."""
     seed: int = 0
     """Seed of every random number of the run."""
     observation: Observation = "rays"
     """What the network sees beside the speed: rays (31 ranges) or grid (an occupancy grid)."""
-    policy: str = ""
+    policy: Annotated[str, IN_WORDS] = ""
     """Network; by default one that suits the observation."""
-    car_steps: int = 0
-    """Car-steps at most, checked after each generation; 0: 30 million, in traffic 60, and any number if generations are
-    given."""
+    car_steps: Annotated[int, IN_WORDS] = 0
+    """Car-steps at most, checked after each generation; by default 30 million, in traffic 60, and any number with
+    --generations."""
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at --pace or faster; above 1: never."""
 
-    pace: float = 0.0
+    pace: Annotated[float, IN_WORDS] = 0.0
     """Mean speed in m/s that a champion should reach: slower success counts for less, and training's time limits
     follow from it. By default a little above the lower end of the road's speed interval."""
 
@@ -152,16 +157,15 @@ class EvolveSettings(RunSettings):
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
-    policy: str = ""
+    policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the
     cars that rays hit approach, +steering to see its own steering angle; by default mlp:64+steering, in traffic
     mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
     of a dense layer and the number of frames, by default cnn:8,16,32@1."""
-    population: int = 0
-    """Members of a generation; 0: 256, in traffic 128, where each drives more episodes."""
-    generations: int = 0
-    """Generations at most; a run whose champion is solved stops earlier. 0: any number, and unless --car-steps says
-    otherwise no more than 30 million car-steps, in traffic 60."""
+    population: Annotated[int, IN_WORDS] = 0
+    """Members of a generation; by default 256, in traffic 128, where each drives more episodes."""
+    generations: Annotated[int, IN_WORDS] = 0
+    """Generations at most; by default any number. A run whose champion reaches --until stops earlier."""
     recombination: Literal["all", "two"] = "all"
     """all: the winners of all tournaments are averaged into one centre (an evolution strategy); two: each child
     has two parents (the classic genetic algorithm)."""
@@ -260,34 +264,35 @@ class DqnSettings(RunSettings):
         },
     }  # fmt: skip
 
-    policy: str = ""
+    policy: Annotated[str, IN_WORDS] = ""
     """Network of the Q function: mlp: and the sizes of its hidden layers, +steering to see its own steering
     angle, by default mlp:64,64+steering; on the grid cnn: with the channels of two convolutions, the units of a dense
     layer and the number of frames, by default cnn:16,32,256@4."""
     car_steps: int = 40_000_000
     """Car-steps at most; the last batch (some 33,000) and the evaluation after it may exceed it."""
-    episodes: int = 0
-    """Training episodes at most; the last batch may exceed it."""
+    episodes: Annotated[int, IN_WORDS] = 0
+    """Training episodes at most, by default any number; the last batch may exceed it."""
     converged: float = 0.01
     """Stop when the Q values of fixed observations change by less than this share of their spread from one evaluation
     to the next, three times in a row; 0: never."""
-    evaluate_every: int = 0
-    """Car-steps from one evaluation to the next; 0: a million, on the grid 250,000."""
-    batch: int = 0
-    """Transitions of one update; 0: 256, on the grid 64."""
-    updates: float = 0.0
-    """Updates for each thousand car-steps collected; 0: 4, on the grid 16."""
-    replay: int = 0
-    """Observations that the replay buffer holds; 0: a million, of grids a hundred thousand."""
+    evaluate_every: Annotated[int, IN_WORDS] = 0
+    """Car-steps from one evaluation to the next; by default a million, on the grid 250,000."""
+    batch: Annotated[int, IN_WORDS] = 0
+    """Transitions of one update; by default 256, on the grid 64."""
+    updates: Annotated[float, IN_WORDS] = 0.0
+    """Updates for each thousand car-steps collected; by default 4, on the grid 16."""
+    replay: Annotated[int, IN_WORDS] = 0
+    """Observations that the replay buffer holds; by default a million, of grids a hundred thousand."""
     discount: float = 0.99
     """Discount factor of a step."""
-    learning_rate: float = 0.0
-    """Adam's learning rate at the start; it falls to a twentieth over --anneal. 0: 0.001, on the grid 0.0005."""
-    anneal: int = 0
-    """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth. 0: 30
-    million, on the grid 4 million."""
-    target_period: int = 0
-    """Updates from one copy of the target network to the next; 0: 200, on the grid 500."""
+    learning_rate: Annotated[float, IN_WORDS] = 0.0
+    """Adam's learning rate at the start; it falls to a twentieth over --anneal. By default 0.001, on the grid
+    0.0005."""
+    anneal: Annotated[int, IN_WORDS] = 0
+    """Car-steps over which the learning rate falls; exploration falls from random driving in the first fiftieth. By
+    default 30 million, on the grid 4 million."""
+    target_period: Annotated[int, IN_WORDS] = 0
+    """Updates from one copy of the target network to the next; by default 200, on the grid 500."""
     epsilon: float = 0.4
     """Share of random actions in the episode of a batch that explores most; the others explore less (Horgan et al.
     2018)."""

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -43,6 +44,18 @@ def test_help_fills_its_lines(prog, columns, monkeypatch, capsys):
     without_flag = {"gridsim-watch": " SOURCE [BESIDE]", "gridsim-evaluate": " CHAMPION", "gridsim-compare": " [RUNS]"}
     assert lines[0] == f"usage: {prog} [-h] [OPTIONS]{without_flag.get(prog, '')}"
     assert columns - 8 <= max(map(len, lines)) <= columns
+
+
+@pytest.mark.parametrize("prog", FLAGS)
+def test_help_has_an_example_and_says_in_words_what_happens_by_default(prog, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit):
+        parse(FLAGS[prog], prog, ["--help"])
+    shown = capsys.readouterr().out
+    assert f"Example: {prog} " in shown
+    defaults = dict(re.findall(r"--([\w-]+) .*\(default: (.*?)\)", shown))
+    assert len(defaults) >= 2
+    assert {name for name, default in defaults.items() if default in ("-1", "0", "0.0", "''", "None")} <= {"seed"}
 
 
 def refused(prog, line, capsys):
