@@ -53,7 +53,7 @@ def test_results_are_measured_once_and_printed_as_a_table(tmp_path: Path) -> Non
     command = [sys.executable, str(FOLDER / "results.py"), "seeds", "--quick", "--output", str(tmp_path)]
     first = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert first.returncode == 0, first.stderr
-    assert "| `gridsim-evolve --seed 0 --car-steps 1000` | 1 | 0.0 | " in first.stdout
+    assert "| `gridsim-evolve --seed 0 --car-steps 1000` | 1 | 0.0 | inf | " in first.stdout
     runs = sorted(tmp_path.glob("*/summary.json"))
     again = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert (again.stdout, sorted(tmp_path.glob("*/summary.json"))) == (first.stdout, runs)
