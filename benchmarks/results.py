@@ -67,7 +67,8 @@ TABLES: dict[str, dict[str, list[str]]] = {
     "comparison": alone("gridsim-compare --learners evolution dqn --seeds 5"),
 }
 HEAD = (
-    "| command | seeds | car-steps, million | to 95 % of validation | total time, s | success, % | collisions, % | speed, m/s |\n"
+    "| command | seeds | car-steps, million | to 95 % of validation | total time, s | success, % | collisions, % "
+    "| speed, m/s |\n"
     "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
 )
 
