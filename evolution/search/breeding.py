@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from statistics import NormalDist
 
 import numpy as np
-from scipy.special import ndtri
 
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
@@ -38,7 +38,8 @@ _LEVELS = 1 << 12
 
 def _quantiles() -> np.ndarray:
     """Quantiles of N(0, 1) at the middles of _LEVELS equal shares, float32, scaled to variance 1."""
-    values = ndtri((np.arange(_LEVELS) + 0.5) / _LEVELS)
+    # By the standard library, to the same bits: each worker would import scipy.special for a fifth of a second.
+    values = np.array([NormalDist().inv_cdf((k + 0.5) / _LEVELS) for k in range(_LEVELS)])
     return freeze((values / values.std()).astype(np.float32))
 
 
