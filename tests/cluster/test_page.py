@@ -86,6 +86,10 @@ def text(name):
 def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
     champion, drive, *shown = shown_drives()
     path = tmp_path / "drive.html"
+    write_page(path, "one drive", shown[1:], champion.sim)
+    with Browser(path.as_uri(), tmp_path / "profile") as browser:
+        browser.wait_for("at > 1")
+        assert browser.faults == []
     write_page(path, "two drives", shown, champion.sim)
     with Browser(f"{path.as_uri()}#t=3.2&paused", tmp_path / "profile") as browser:
         browser.wait_for(f"{text('clock')} === '0:03.2'")
