@@ -51,8 +51,8 @@ from gridsim.reference.errors import errors
 
 
 @dataclass(frozen=True)
-class RunFlags(WorkFlags):
-    """Which run it is, and where it is computed, kept and logged."""
+class RunFlags:
+    """Which run it is, and what it begins with."""
 
     name: Annotated[str, IN_WORDS] = ""
     """Name of the run; by default made of scenario, algorithm, seed and time."""
@@ -65,13 +65,14 @@ class RunFlags(WorkFlags):
 
 
 @dataclass(frozen=True)
-class EvolveFlags(RunFlags, EvolveSettings):
+class EvolveFlags(RunFlags, WorkFlags, EvolveSettings):
     """Evolve a driver: a population of neural networks is evaluated in parallel and recombined.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every generation; MLflow holds its
     curves. The champion depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
+    groups: ClassVar[dict[str, type]] = {"learning": EvolveSettings, "work": WorkFlags, "run": RunFlags}
     example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1 --workers 2"
     #: Flags that version 0.1 had, and what takes their place.
     removed: ClassVar[dict[str, str]] = {
@@ -85,7 +86,7 @@ class EvolveFlags(RunFlags, EvolveSettings):
 
 
 @dataclass(frozen=True)
-class DqnFlags(RunFlags, DqnSettings):
+class DqnFlags(RunFlags, WorkFlags, DqnSettings):
     """Train a driver by deep Q-learning: the workers collect experience while the learner trains on what they brought.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
@@ -93,6 +94,7 @@ class DqnFlags(RunFlags, DqnSettings):
     depends on the scenario, the seed and the algorithm's parameters alone, never on the workers.
     """
 
+    groups: ClassVar[dict[str, type]] = {"learning": DqnSettings, "work": WorkFlags, "run": RunFlags}
     example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1 --workers 2"
     #: Flags that version 0.2 had, and why they went.
     removed: ClassVar[dict[str, str]] = {

@@ -110,16 +110,21 @@ class RoadFlags:
 def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:
     """Read the command line. Ends the process: 0 after --help, 2 with a clear line for wrong use."""
     _check_flags(kind, prog, arguments)
-    config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone)
+    config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone, tyro.conf.OmitArgPrefixes)
     given: dict[str, Any] = {} if default is None else {"default": default}
+    asked: type = kind
+    if groups := getattr(kind, "groups", None):  # a field for each, which --help shows by itself
+        shown = [(name, part, field(default=select(part, default or kind()))) for name, part in groups.items()]
+        asked, given = dataclasses.make_dataclass(kind.__name__, shown), {}
     printed = io.StringIO()
     # Without a terminal tyro draws no box and uses no colours: its error is read below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
     with _reader_may_leave(), contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
-            return tyro.cli(
-                kind, prog=prog, description=_about(kind), args=arguments, config=config, registry=registry, **given
+            found: Any = tyro.cli(
+                asked, prog=prog, description=_about(kind), args=arguments, config=config, registry=registry, **given
             )
+            return kind(**{k: v for name in groups for k, v in vars(getattr(found, name)).items()}) if groups else found
         except SystemExit as stop:
             if not stop.code:
                 raise

@@ -55,6 +55,8 @@ def test_help_has_an_example_and_says_in_words_what_happens_by_default(prog, mon
     assert f"Example: {prog} " in shown
     defaults = dict(re.findall(r"--([\w-]+) .*\(default: (.*?)\)", shown))
     assert len(defaults) >= 2
+    for group in getattr(FLAGS[prog], "groups", ()):
+        assert f" {group} options " in shown
     assert {name for name, default in defaults.items() if default in ("-1", "0", "0.0", "''", "None")} <= {"seed"}
 
 
