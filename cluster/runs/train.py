@@ -34,7 +34,7 @@ from cluster.training.evolution import Evolution
 from cluster.training.trainer import Learning, Maps, State, held_out_episodes, now
 from cluster.workers import kernels
 from cluster.workers.pool import SerialPool, WorkerPool
-from evolution.episodes.curriculum import HELD_OUT_SEEDS
+from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
 from gridsim.car.ego import DISTANCE
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
@@ -137,6 +137,7 @@ def train(
             with reporter.compiling():
                 warming.wait()
         maps.ahead(session.learning.curriculum.map_seeds[:3])
+        maps.ahead(VALIDATION_SEEDS, later=True)  # while Ray starts, cores are idle
         kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
         lock(run.path)
         run.write_config()

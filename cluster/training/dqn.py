@@ -112,7 +112,7 @@ class Dqn(Learning):
         s, k = self.settings, self.batches
         n = int(np.clip(BATCH_STEPS / self._mean_steps, *EPISODES))
         episodes = self.curriculum.starts(k, n)
-        self._build_ahead(self.curriculum.map_seeds[: k + 8])
+        self.maps.ahead(self.curriculum.map_seeds[: k + 8])
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         task = CollectTask(
             policy=s.policy,

@@ -81,7 +81,7 @@ class Evolution(Learning):
         n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
         goals = targets(episodes.rows, limits)[:e]  # of any group
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
-        self._build_ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
+        self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
 
         call = _Call(Bred(asked.parents, asked.recipes, asked.key, asked.mutation), episodes, list(groups))
         if leader is not None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import threading
 import time
 import warnings
@@ -27,7 +26,6 @@ from cluster.workers.worker import Task
 from evolution.episodes.curriculum import (
     HELD_OUT_EPISODES,
     HELD_OUT_SEEDS,
-    VALIDATION_SEEDS,
     Curriculum,
     spread_starts,
     success_rate,
@@ -41,9 +39,6 @@ from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build, seed_of_map
-
-MAPS_A_STEP = 4  # of validation's that are begun ahead at a time, so that a short run builds few for nothing
-
 
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
@@ -149,7 +144,6 @@ class Learning(ABC):
         self.curriculum = Curriculum(
             s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period, s.traffic
         )
-        self._for_validation = iter(VALIDATION_SEEDS)  # maps that are not begun
         self.outcomes: list[Outcome] = []  # of the last step, for statistics
 
     # ------------------------------------------------------------------------------------------------------ the loop
@@ -210,11 +204,6 @@ class Learning(ABC):
         if self.champion is None or (score, distance) > (self.champion.score, self.champion.distance_m):
             self.champion = Champion(candidate, score, float(success_rate(results)[0]), distance, step)
         self.solved = self.champion.score >= self.settings.until
-
-    def _build_ahead(self, seeds: Sequence[int]) -> None:
-        """Begin to build maps that training needs soon, and some of validation's."""
-        self.maps.ahead(seeds)
-        self.maps.ahead(list(itertools.islice(self._for_validation, MAPS_A_STEP)), later=True)
 
     # ------------------------------------------------------------------------------------------------- evaluating
 
