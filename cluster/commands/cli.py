@@ -149,7 +149,8 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         else:
             settings, init = read_config(Path(config))
         if settings.command != prog:
-            raise UsageError(f"{resume or config} is a run of {settings.command}; give it to that command")
+            flag, path = ("--resume", resume) if resume else ("--config", config)
+            raise UsageError(f"{path} is of another learner; use {settings.command} {flag} {path}")
         base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)

@@ -166,18 +166,18 @@ def _train_and_compare(
                 results.write()
         tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
         tracker.log_files(results.files())
+    again = f"{command_path(PROG)} --resume {short_path(folder.path)}"
     if unsent := tracker.close(status):
-        print(f"{PROG}: warning: {unsent}", file=sys.stderr)
-    again = f"continue with: {command_path(PROG)} --resume {short_path(folder.path)}"
+        print(f"{PROG}: warning: {unsent}; send it later with: {again}", file=sys.stderr)
     if problem:
-        fail(PROG, problem, again, FAILED)
+        fail(PROG, problem, f"continue with: {again}", FAILED)
     if results.runs:
         results.show(console)
     console.print(f"compare: {tracker.where(command_path('mlflow'))}", soft_wrap=True)
     if code:
-        print(f"{PROG}: stopped; {again}", file=sys.stderr)
+        print(f"{PROG}: stopped; continue with: {again}", file=sys.stderr)
     elif failed:
-        fail(PROG, f"{failed} of {len(cells)} runs failed", again, FAILED)
+        fail(PROG, f"{failed} of {len(cells)} runs failed", f"continue with: {again}", FAILED)
     return code
 
 

@@ -23,7 +23,7 @@ def main(port: str) -> None:
     except (OSError, OverflowError, ValueError):
         sys.exit(f"make ui: port {port} is in use or none; choose another with make ui PORT=...")
     except Exception as error:  # a database of another MLflow
-        sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}")
+        sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}; move it elsewhere if another MLflow made it")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]
     server = subprocess.Popen(

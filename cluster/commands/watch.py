@@ -175,7 +175,7 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     """Gives the champion or elite before each drive, with its title. Raises UsageError, RunError, CheckpointError."""
     source, of_run = Path(flags.source), flags.generation is not None or flags.follow
     if flags.generation is not None and flags.follow:
-        raise UsageError("--generation and --follow exclude each other")
+        raise UsageError("--generation and --follow exclude each other; leave one out")
     if of_run and source.is_file():
         raise UsageError(f"{source} holds one driver; give a run's folder with --generation or --follow")
     if flags.follow and flags.output:
@@ -241,7 +241,7 @@ def _output(flags: WatchFlags) -> Path:
     if output.suffix.lower() not in (*CODING, ".html"):
         raise UsageError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
     if not output.parent.is_dir():
-        raise UsageError(f"--output {output}: there is no folder {output.parent}")
+        raise UsageError(f"--output {output}: there is no folder {output.parent}; create it first")
     return output
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, CONFIG
+from cluster.runs.checkpoint import CHECKPOINT, CONFIG, CheckpointError
 from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict
 from cluster.tracking import description
 from gridsim.config import SimConfig
@@ -99,7 +99,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         if form in OLD_FORMATS:
             raise RunError(f"{path} is of a run of GridSim 0.1, which this version cannot go on with; start a new run")
         if form != CONFIG_FORMAT:
-            raise RunError(f"{path}: not a {CONFIG} of this GridSim")
+            raise RunError(f"{path}: not a {CONFIG} of this GridSim; start a new run")
         settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))
         if config.get("map_sha256", "") != _map_sha256(settings):
             raise RunError(f"{settings.scenario} is not what it was for {path}; put it back, or start a new run")
@@ -148,7 +148,10 @@ def open_run(folder: Path) -> RunFolder:
     run = RunFolder(folder.resolve(), settings, init, map_sha256=_map_sha256(settings))
     if not (folder / CHECKPOINT).is_file():
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from; start it anew with --config {folder / CONFIG}")
-    run.saved = checkpoint.load(folder / CHECKPOINT)
+    try:
+        run.saved = checkpoint.load(folder / CHECKPOINT)
+    except CheckpointError as error:
+        raise CheckpointError(f"{error}; start it anew with --config {folder / CONFIG}") from error
     meta = run.saved[1]
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():

@@ -233,7 +233,7 @@ class EvolveSettings(RunSettings):
                 and self.search != "random"
                 and getattr(self, name) != getattr(EvolveSettings, name)
             ):
-                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two")
+                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two; add that, or leave it out")
         classic = self.recombination == "two" or self.search == "random"
         if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
             raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
@@ -343,7 +343,7 @@ def from_dict(kind: type[S], values: dict[str, Any]) -> S:
     fields = {f.name: f for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(fields))
     if unknown:
-        raise SettingsError(f"unknown setting {unknown[0]!r}")
+        raise SettingsError(f"unknown setting {unknown[0]!r}, perhaps of another version of GridSim; start a new run")
     defaults = kind()
     for name, value in values.items():
         wanted = type(getattr(defaults, name))

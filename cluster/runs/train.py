@@ -395,7 +395,7 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
     except GridSimError as error:
         return "", f"what MLflow lacks is not sent: {error}"
     except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited
-        reason = f"{run.path} has not the files of a finished run ({type(error).__name__})"
+        reason = f"{path} is damaged ({type(error).__name__}); delete it, and make it again with --resume {run.path}"
         return "", f"what MLflow lacks is not sent: {reason}"
     tracker = make_tracker(run, uri, experiment, finished=True, started=started)
     log_rows(tracker, history)

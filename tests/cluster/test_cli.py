@@ -280,7 +280,7 @@ def test_resume_refuses_contradictions(stopped, change, said, monkeypatch, capsy
 
 def test_a_run_is_for_the_command_that_made_it(stopped, monkeypatch, capsys):
     (line,) = refused(dqn_main, monkeypatch, capsys, "--resume", str(stopped))
-    assert line.endswith("is a run of gridsim-evolve; give it to that command")
+    assert line.endswith(f"{stopped} is of another learner; use gridsim-evolve --resume {stopped}")
 
 
 def test_resume_refuses_damaged_checkpoints(stopped, monkeypatch, capsys):
@@ -289,6 +289,7 @@ def test_resume_refuses_damaged_checkpoints(stopped, monkeypatch, capsys):
     path.write_bytes(whole[: len(whole) // 2])
     (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", str(stopped))
     assert "checkpoint.npz: truncated" in line
+    assert line.endswith(f"; start it anew with --config {stopped}/config.json")
     path.write_bytes(whole)
     config = json.loads((stopped / "config.json").read_text())
     config["settings"]["seed"] = 99

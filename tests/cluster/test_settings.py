@@ -39,7 +39,7 @@ def test_what_a_file_does_not_say_is_as_by_default():
         ({"observation": 3}, "must be str"),
         ({"population": True}, "must be int"),
         ({"recombination": "some"}, "'recombination' must be all or two"),
-        ({"crossover": 1}, "^unknown setting 'crossover'$"),
+        ({"crossover": 1}, "^unknown setting 'crossover', perhaps of another version of GridSim; start a new run$"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(change, said):

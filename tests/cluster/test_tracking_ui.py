@@ -81,10 +81,14 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
                 browser.wait_for_text(words)
             width = browser.run("document.querySelector('[col-id*=\"Run Name\"]').clientWidth")
             assert width > 230  # pixels, so that names show their seeds
-        with Browser(f"{link}&compareRunsMode=CHART", tmp_path / "profile") as browser:
-            for words in (">first<", ">second<", "first (distance_m/mean)", "second (distance_m/mean)"):
+            browser.run("document.querySelector('input[value=CHART]').click()")  # the second button above the table
+            for words in ("first (distance_m/mean)", "second (distance_m/mean)"):
                 browser.wait_for_text(words)
-            browser.wait_for("""/class="xtitle"[^>]*>car_steps</.test(document.documentElement.outerHTML)""")
+            browser.wait_for("document.querySelector('.xtitle')?.textContent == 'car_steps'")
+            curves = "new Set(document.querySelector('.js-plotly-plot').data.map(line => line.name)).size"
+            browser.wait_for(f"{curves} == 2")
+            browser.run("document.querySelector('.is-visibility-toggle-checkbox').click()")  # the eye in front of a run
+            browser.wait_for(f"{curves} == 1")
         events = urllib.request.Request(
             f"http://127.0.0.1:{port}/ajax-api/3.0/mlflow/ui-telemetry",
             b'{"records": []}',
