@@ -130,9 +130,6 @@ class RayPool(WorkerPool):
         self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
         self._thread.start()
 
-    def workers(self) -> int:
-        return len(self.pids())
-
     def pids(self) -> list[int]:
         """Process ids of the workers that are up, on whichever machine they are."""
         return [slot.pid for slot in self._slots if slot.pid]
