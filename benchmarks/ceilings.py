@@ -241,7 +241,7 @@ def sleeping_efficiency(workers: int, members: int, generations: int = 3) -> flo
     pool = RayPool(workers, maps.build, worker_factory=SleepingWorker)
     recipes, task = some_recipes(members), make_task(rows(ROWS))
     try:
-        while pool.workers() < workers:  # all are up, and it is known how long a metre takes
+        while len(pool.pids()) < workers:  # all are up, and it is known how long a metre takes
             pool.evaluate(task, recipes)
         walls = [pool.evaluate(task, recipes).wall_s for _ in range(generations)]
     finally:

@@ -97,6 +97,11 @@ class EpisodeConfig:
     progress: float = 0.05  # m of new ground; a step with less is without progress
     revisit: float = 200.0  # m of driving within which the same ground does not count again
 
+    @property
+    def steps(self) -> int:
+        """The time limit in control steps."""
+        return round(self.time_limit / self.control_period)
+
 
 @dataclass(frozen=True)
 class TrafficConfig:

@@ -46,7 +46,7 @@ from cluster.tracking.address import check_uri
 from cluster.tracking.tracker import count
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import default_traffic, is_map_file, label
+from gridsim.maps.scenarios import is_map_file, label
 from gridsim.reference.errors import errors
 
 
@@ -280,8 +280,7 @@ def _evaluate() -> int:
         print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         return 0
     road = flags.scenario or champion.scenario
-    if traffic is None:
-        traffic = champion.traffic if road == champion.scenario else default_traffic(road)
+    traffic = champion.traffic_on(road) if traffic is None else traffic
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     Console().print(held_out_table(title, figures))

@@ -204,9 +204,7 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
         champion, name = driver()
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, seed, champion.sim)
-        traffic = champion.traffic if road == champion.scenario else default_traffic(road)
-        if flags.traffic != -1:
-            traffic = flags.traffic
+        traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
         world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim)[0]
         yield record(champion, scenario, start, seconds, world), f"{name}    {label(road)}, map {scenario.seed:,}"
 

@@ -29,7 +29,7 @@ def series(
     """
     name = scenario or champion.scenario
     sim, spec, maps = champion.sim, PolicySpec.parse(champion.policy), Maps(name, champion.sim)
-    limits = Limits(sim.episode.target, round(sim.episode.time_limit / sim.episode.control_period))
+    limits = Limits(sim.episode.target, sim.episode.steps)
     found = []
     with contextlib.closing(maps):
         chosen = held_out(champion, maps, name, episodes, seed, traffic)

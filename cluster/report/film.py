@@ -74,7 +74,7 @@ def record(
     start = np.asarray(start, dtype=np.float32)
     result, cars, worlds = trajectory(spec, champion.genome, scenario, start, limits, champion.sim, world)
     end = End(int(result["end"]))
-    if end == End.TIME and steps < round(episode.time_limit / episode.control_period):
+    if end == End.TIME and steps < episode.steps:
         end = End.RUNNING
     ranges, closing = views(scenario, cars, worlds, champion.sim)
     outputs = None

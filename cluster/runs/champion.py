@@ -66,6 +66,10 @@ class Champion:
         """What it sees: rays or grid."""
         return PolicySpec.parse(self.policy).observation
 
+    def traffic_on(self, scenario: str) -> int:
+        """Other cars on a scenario unless told otherwise: as many as it learned among, elsewhere the scenario's own."""
+        return self.traffic if scenario == self.scenario else default_traffic(scenario)
+
     def act(
         self, observation: np.ndarray | dict[str, np.ndarray], speed: float | np.ndarray | None = None
     ) -> int | np.ndarray:
@@ -185,7 +189,7 @@ def evaluate(
     Raises: ValueError for an unknown scenario or fewer than one episode.
     """
     name, episode = scenario or champion.scenario, champion.sim.episode
-    limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
+    limits = Limits(episode.target, episode.steps)
     maps = Maps(name, champion.sim)
     try:
         chosen = held_out(champion, maps, name, episodes, seed, traffic)
@@ -202,8 +206,7 @@ def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int
     check_name(name)
     if episodes < 1:
         raise ValueError(f"episodes must be 1 or more, not {episodes}")
-    if traffic is None:
-        traffic = champion.traffic if name == champion.scenario else default_traffic(name)
+    traffic = champion.traffic_on(name) if traffic is None else traffic
     if not 0 <= traffic <= MAX_TRAFFIC:
         raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     used = max(len(HELD_OUT_SEEDS), episodes // 8)

@@ -13,13 +13,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import EvolveSettings
-from cluster.training.trainer import Bred, Learning, check_any_left, mean_speed, named
+from cluster.training.trainer import Learning, check_any_left, mean_speed, named
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.search import fitness
-from evolution.search.base import Search
+from evolution.search.base import Generation, Search
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 
@@ -83,13 +83,13 @@ class Evolution(Learning):
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
 
-        call = _Call(Bred(asked.parents, asked.recipes, asked.key, asked.mutation), episodes, list(groups))
+        call = _Call(asked, episodes, list(groups))
         if leader is not None:
             followed = curriculum.leader_episodes(self.generation)
             leading = call.add(leader, followed)
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
-        driven = self._evaluate("evolve", call.bred, call.episodes, limits, call.asked, self.meanwhile)
+        driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self.meanwhile)
         check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
@@ -187,14 +187,14 @@ class Evolution(Learning):
 class _Call:
     """What one call of the pool drives: members on their groups' episodes, and single genomes on their own."""
 
-    bred: Bred
+    members: Generation
     episodes: Episodes
     asked: list[Chunk]
 
     def add(self, genome: np.ndarray, episodes: Episodes) -> Chunk:
         """Drive a genome float32 [genes] on episodes; they are sent first, since they take longest."""
-        n, e = len(self.bred.recipes), len(self.episodes.rows)
+        n, e = len(self.members.recipes), len(self.episodes.rows)
         part = Chunk(slice(n, n + 1), slice(e, e + len(episodes.rows)))
-        self.bred, self.episodes = self.bred.and_copies(genome[None]), self.episodes.and_then(episodes)
+        self.members, self.episodes = self.members.and_copies(genome[None]), self.episodes.and_then(episodes)
         self.asked.insert(0, part)
         return part

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,8 +33,7 @@ from evolution.episodes.curriculum import (
 from evolution.episodes.rollout import Limits
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import recipes
-from evolution.search.breeding import Kind, Mutation
+from evolution.search.base import Generation, recipes
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
@@ -208,14 +207,14 @@ class Learning(ABC):
     # ------------------------------------------------------------------------------------------------- evaluating
 
     def _evaluate(
-        self, stage: str, bred: Bred, episodes: Episodes, limits: Limits,
+        self, stage: str, members: Generation, episodes: Episodes, limits: Limits,
         asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
     ) -> Outcome:  # fmt: skip
         task = Task(
             policy=self.settings.policy,
-            parents=bred.parents,
-            key=bred.key,
-            mutation=bred.mutation,
+            parents=members.parents,
+            key=members.key,
+            mutation=members.mutation,
             episodes=episodes.rows,
             worlds=episodes.worlds,
             maps=tuple((self.settings.scenario, seed_of_map(self.settings.scenario, seed)) for seed in episodes.maps),
@@ -224,7 +223,7 @@ class Learning(ABC):
         )
         progress = self.on_progress
         tell = (lambda k, n: progress(stage, k, n)) if progress else None
-        outcome = self.pool.evaluate(task, bred.recipes, tell, asked, meanwhile)
+        outcome = self.pool.evaluate(task, members.recipes, tell, asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
         self._report_lost(stage, outcome)
@@ -310,26 +309,9 @@ def genes_of(genome: np.ndarray | None) -> np.ndarray:
     return np.zeros(0, dtype=np.float32) if genome is None else genome
 
 
-class Bred(NamedTuple):
-    """Members to be driven: their recipes and the genomes that these refer to."""
-
-    parents: np.ndarray  # float32 [p, genes]
-    recipes: np.ndarray  # RECIPE [n]
-    key: int = 0
-    mutation: Mutation = Mutation()
-
-    def and_copies(self, genomes: np.ndarray) -> Bred:
-        """These, and then plain copies of genomes float32 [k, genes]."""
-        copies = recipes(len(genomes))
-        copies["kind"], copies["a"] = Kind.COPY, np.arange(len(self.parents), len(self.parents) + len(genomes))
-        return self._replace(
-            parents=np.concatenate([self.parents, genomes]), recipes=np.concatenate([self.recipes, copies])
-        )
-
-
-def unmodified(genomes: np.ndarray) -> Bred:
+def unmodified(genomes: np.ndarray) -> Generation:
     """Plain copies of genomes float32 [n, genes]."""
-    return Bred(genomes[:0], recipes(0)).and_copies(genomes)
+    return Generation(genomes[:0], recipes(0)).and_copies(genomes)
 
 
 def check_any_left(lost: np.ndarray, stage: str) -> None:

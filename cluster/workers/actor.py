@@ -38,8 +38,7 @@ class Actor:
 
     def __init__(self, factory: Callable[[], Worker]):
         self._worker = factory()
-        self._serial = 0
-        self._task: Task | CollectTask | None = None
+        self._task: Task | CollectTask
         self._maps: dict[Name, Map] = {}
 
     def hello(self) -> int:
@@ -47,13 +46,13 @@ class Actor:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return os.getpid()
 
-    def prepare(self, serial: int, *update: Any) -> int:
+    def prepare(self, *update: Any) -> int:
         """Take up a first task and load its kernels with an empty chunk: if that kills it, no member is blamed."""
-        self.run(serial, [(b"", 0, 0)], *update)
+        self.run([(b"", 0, 0)], *update)
         return os.getpid()
 
     def run(
-        self, serial: int, work: Sequence[Work],
+        self, work: Sequence[Work],
         names: Sequence[Name] = (), gone: Sequence[Name] = (), shared: bytes | None = None, *maps: Any,
     ) -> bytes:  # fmt: skip
         """What `Worker.answer` returns for each piece of work, pickled: Ray is slower with arrays than with bytes.
@@ -64,9 +63,7 @@ class Actor:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:
                 self._maps.pop(name, None)
-            self._task, self._serial = replace(pickle.loads(shared)), serial  # `replace` makes its arrays read-only
-        if self._task is None or serial != self._serial:
-            raise RuntimeError(f"a parcel of task {serial} came to a worker that has task {self._serial}")
+            self._task = replace(pickle.loads(shared))  # which makes its arrays read-only
         mine = [self._maps[name] for name in self._task.maps]
         answers = [
             self._worker.answer(self._task, mine, np.frombuffer(recipes, RECIPE), first, stop)

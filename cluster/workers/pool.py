@@ -194,10 +194,6 @@ class WorkerPool(ABC):
     `meanwhile` is done to its end before a call returns. What it raises ends the call.
     """
 
-    @abstractmethod
-    def workers(self) -> int:
-        """Workers that are up now."""
-
     def evaluate(
         self,
         task: Task,
@@ -249,9 +245,6 @@ class SerialPool(WorkerPool):
     def __init__(self, build_map: BuildMap, worker_factory: Callable[[], Worker] = Worker):
         self._build_map = build_map
         self._worker = worker_factory()
-
-    def workers(self) -> int:
-        return 1
 
     def _work(
         self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,

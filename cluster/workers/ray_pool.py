@@ -130,9 +130,6 @@ class RayPool(WorkerPool):
         self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
         self._thread.start()
 
-    def workers(self) -> int:
-        return len(self.pids())
-
     def pids(self) -> list[int]:
         """Process ids of the workers that are up, on whichever machine they are."""
         return [slot.pid for slot in self._slots if slot.pid]
@@ -205,7 +202,7 @@ class RayPool(WorkerPool):
         work = [(recipes, columns.start, columns.stop) for recipes, (_, columns) in zip(payloads, chunks, strict=True)]
         if not slot.sent:
             slot.heard = time.monotonic()
-        answer = slot.actor.run.remote(self._serial, work, *self._update(slot, job))
+        answer = slot.actor.run.remote(work, *self._update(slot, job))
         slot.sent.append((self._serial, answer))
         job.call.bytes_down += sum(map(len, payloads))
 
@@ -341,4 +338,4 @@ class RayPool(WorkerPool):
             self._last_failure = ""
             slot.heard = time.monotonic()
             prepared = slot.serial > 0
-            slot.hello = None if prepared else slot.actor.prepare.remote(self._serial, *self._update(slot, job))
+            slot.hello = None if prepared else slot.actor.prepare.remote(*self._update(slot, job))

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.breeding import RECIPE, Mutation, breed
+from evolution.search.breeding import RECIPE, Kind, Mutation, breed
 
 Arrays = dict[str, np.ndarray]
 
@@ -43,13 +44,21 @@ class SearchConfig:
 
 
 class Generation(NamedTuple):
-    """A generation to evaluate."""
+    """A generation to evaluate, or other members to be driven."""
 
     parents: np.ndarray  # float32 [p, genes], the rows that recipes refer to
     recipes: np.ndarray  # RECIPE [population]
-    key: int  # 64 bits, seed of the generation's random numbers
-    mutation: Mutation
-    groups: list[slice]  # the members of each group, which are consecutive
+    key: int = 0  # 64 bits, seed of the generation's random numbers
+    mutation: Mutation = Mutation()
+    groups: Sequence[slice] = ()  # the members of each group, which are consecutive
+
+    def and_copies(self, genomes: np.ndarray) -> Generation:
+        """These, and then plain copies of genomes float32 [k, genes], which are in no group."""
+        copies = recipes(len(genomes))
+        copies["kind"], copies["a"] = Kind.COPY, np.arange(len(self.parents), len(self.parents) + len(genomes))
+        return self._replace(
+            parents=np.concatenate([self.parents, genomes]), recipes=np.concatenate([self.recipes, copies])
+        )
 
 
 class Search(ABC):
@@ -128,7 +137,7 @@ def split(members: int, groups: int, first: int = 0) -> list[slice]:
     return [slice(a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)]
 
 
-def ranks(scores: np.ndarray, groups: list[slice]) -> np.ndarray:
+def ranks(scores: np.ndarray, groups: Sequence[slice]) -> np.ndarray:
     """Rank of each member in its group, float64 [n] in (0, 1): the share of lower scores plus half the share of ties.
 
     Ranks of members can be compared even if their groups had easier or harder episodes.

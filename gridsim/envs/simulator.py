@@ -117,7 +117,7 @@ class Simulator:
         self.config = config or SimConfig()
         episode = self.config.episode
         self.target = episode.target if target is None else target
-        self.max_steps = round(episode.time_limit / episode.control_period) if max_steps is None else max_steps
+        self.max_steps = episode.steps if max_steps is None else max_steps
         if cars < 1:
             raise ValueError(f"a simulator needs 1 car or more, not {cars}")
         if traffic < 0:

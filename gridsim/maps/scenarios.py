@@ -29,7 +29,6 @@ HELD_OUT_SEED = 2_000_000  # ... of the maps on which it is reported, used for n
 class Scenario:
     """A kind of road: its layout and its driving limitations (the paper's term)."""
 
-    summary: str
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int  # default number of cars beside the ego car
     thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
@@ -37,11 +36,11 @@ class Scenario:
 
 
 REGISTRY: dict[str, Scenario] = {
-    "highway": Scenario("four lanes one way, long easy bends", (15.0, 25.0), 8, False, highway_layout),
-    "curved": Scenario("one winding two-lane loop without a junction", (6.0, 15.0), 0, False, curved_layout),
-    "seamless": Scenario("two-lane network of tiles that never ends", (5.0, 12.0), 0, False, seamless_layout),
-    "roundabout": Scenario("roundabouts joined by short roads", (5.0, 10.0), 4, True, roundabout_layout),
-    "city": Scenario("narrow irregular blocks, parked cars at the kerb", (3.0, 10.0), 6, True, city_layout),
+    "highway": Scenario((15.0, 25.0), 8, False, highway_layout),
+    "curved": Scenario((6.0, 15.0), 0, False, curved_layout),
+    "seamless": Scenario((5.0, 12.0), 0, False, seamless_layout),
+    "roundabout": Scenario((5.0, 10.0), 4, True, roundabout_layout),
+    "city": Scenario((3.0, 10.0), 6, True, city_layout),
 }
 
 

@@ -24,21 +24,15 @@ from gridsim.maps.scenarios import check_name
 from gridsim.traffic.world import LANE
 from gridsim.view.render import Renderer, Window, interpolate
 
-#: The columns of a recorded drive, and what their numbers are within; whole numbers are from 0.
-_LIMITS: dict[str, float] = {
-    "time_s": 1e7,  # since the episode's start
-    "x_m": 1e5,
-    "y_m": 1e5,
-    "heading_rad": 100.0,
-    "speed_mps": 200.0,
-    "steering_rad": 3.2,
-    "action": len(Action) - 1,
-    "episode": 1 << 31,  # which one of the file: a restart begins the next one
-    "traffic": 1000,  # other cars
-    "scenario": math.nan,  # a name
-    "map_seed": (1 << 63) - 1,
-}
-COLUMNS = tuple(_LIMITS)
+COLUMNS = (
+    "time_s",  # since the episode's start
+    "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action",
+    "episode",  # which one of the file: a restart begins the next one
+    "traffic",  # other cars
+    "scenario", "map_seed",
+)  # fmt: skip
+"""Of a recorded drive."""
+MAX_TRAFFIC = 1000  # of a drive that is read
 MAX_BYTES = 1 << 28  # of a file that is read
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
@@ -149,52 +143,44 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
         if os.stat(path).st_size > MAX_BYTES:
             raise DriveError(f"{path}: too large for a recorded drive")
         with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.reader(file, strict=True))
+            reader = csv.DictReader(file, restval="", strict=True)
+            try:
+                return _drive_of(reader)
+            except (csv.Error, ValueError) as error:
+                place = f"{path}, line {max(reader.line_num, 1)}"
+                raise DriveError(f"{place}: no recorded drive, or not a whole one: {str(error)[:200]}") from error
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DriveError(f"{path}: not a recorded drive: it is not a CSV file ({type(error).__name__})") from error
-    if not rows or tuple(rows[0]) != COLUMNS:
-        raise DriveError(f"{path}: not a recorded drive: its first line must be {','.join(COLUMNS)}")
-    if len(rows) < 2:
-        raise DriveError(f"{path}: nothing was driven: it has no rows")
-    table: list[list[float]] = []
-    for line, row in enumerate(rows[1:], start=2):
-        try:
-            if len(row) != len(COLUMNS):
-                raise ValueError(f"it has {len(row)} columns, not {len(COLUMNS)}; was the file cut off?")
-            table.append([_number(*pair) for pair in zip(COLUMNS, row, strict=True) if pair[0] != "scenario"])
-            check_name(row[9][:1000])
-            time, episode = table[-1][0], table[-1][7]
-            before, last = (table[-2][0], table[-2][7]) if line > 2 else (0.0, -1)
-            if episode not in (last, last + 1):
-                raise ValueError(f"episode {episode} does not follow the one before")
-            if (time <= before) if episode == last else (time != 0.0):
-                raise ValueError(f"time_s {row[0]} does not follow the time before")
-            if row[8:] != rows[1][8:]:
-                raise ValueError("traffic, scenario and map_seed must be the same in all rows")
-        except ValueError as error:
-            raise DriveError(f"{path}, line {line}: {error}") from error
-    traffic, seed = table[0][8:]
-    poses = np.array([numbers[1:6] for numbers in table], dtype=np.float32)
-    actions, episodes = np.array([numbers[6:8] for numbers in table], dtype=np.int64).T
-    return Drive(rows[1][9], int(seed), int(traffic), episodes, poses, actions)
 
 
-def _number(column: str, text: str) -> float:
-    """The number in a column. Raises ValueError."""
-    limit = _LIMITS[column]
-    if isinstance(limit, int):
-        if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= limit):
-            raise ValueError(f"{column} is {text[:40]!r}, not a whole number from 0 to {limit}")
-        return int(text)
-    try:
-        value = float(text)
-    except ValueError:
-        raise ValueError(f"{column} is {text[:40]!r}, which is not a number") from None
-    if not abs(value) <= limit:
-        raise ValueError(f"{column} is {value:g}, which is outside the possible range")
-    return value
+def _drive_of(reader: csv.DictReader[str]) -> Drive:
+    """The drive of a file's rows. Raises: ValueError or csv.Error at the first one that does not fit."""
+    if reader.fieldnames != [*COLUMNS]:
+        raise ValueError(f"the first line must be {','.join(COLUMNS)}")
+    poses: list[list[float]] = []
+    actions: list[int] = []
+    episodes = [-1]
+    roads: set[tuple[str, int, int]] = set()
+    for row in reader:
+        poses.append([float(row[name]) for name in COLUMNS[1:6]])
+        action, episode, traffic, seed = (int(row[name]) for name in ("action", "episode", "traffic", "map_seed"))
+        roads.add((row["scenario"], seed, traffic))
+        check_name(row["scenario"])
+        for fits, text in (
+            (all(abs(value) <= 1e5 for value in poses[-1]), "a number of the pose is out of range"),
+            (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
+            (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
+            (0 <= traffic <= MAX_TRAFFIC, f"traffic must be 0 to {MAX_TRAFFIC} cars"),
+            (len(roads) == 1, "traffic, scenario and map_seed must be the same in all rows"),
+        ):
+            if not fits:
+                raise ValueError(text)
+        actions.append(action)
+        episodes.append(episode)
+    if not poses:
+        raise ValueError("it has no rows; nothing was driven")
+    ((scenario, seed, traffic),) = roads
+    return Drive(scenario, seed, traffic, np.array(episodes[1:]), np.array(poses, np.float32), np.array(actions))
 
 
 def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_pool import MAPS, Answering, drive_task, make_recipes, make_task
+from test_pool import MAPS, drive_task, make_recipes, make_task
 
 from cluster.workers.actor import Actor, Shared
 from cluster.workers.pool import SerialPool
@@ -50,20 +50,11 @@ def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_
     wanted = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes).results
     actor = Actor(Worker)
 
-    def run(serial: int, rows: slice, *update: Any) -> np.ndarray:
-        return pickle.loads(actor.run(serial, [(recipes[rows].tobytes(), 0, len(task.episodes))], *update))[0][0]
+    def run(rows: slice, *update: Any) -> np.ndarray:
+        return pickle.loads(actor.run([(recipes[rows].tobytes(), 0, len(task.episodes))], *update))[0][0]
 
-    first = run(1, slice(0, 8), MAPS, (), pickle.dumps(task), *(each.arrays() for each in maps))
-    assert np.concatenate([first, run(1, slice(8, 20))]).tobytes() == wanted.tobytes()
-    assert run(2, slice(0, 20), (), (), pickle.dumps(task)).tobytes() == wanted.tobytes()
+    first = run(slice(0, 8), MAPS, (), pickle.dumps(task), *(each.arrays() for each in maps))
+    assert np.concatenate([first, run(slice(8, 20))]).tobytes() == wanted.tobytes()
+    assert run(slice(0, 20), (), (), pickle.dumps(task)).tobytes() == wanted.tobytes()
     with pytest.raises(KeyError):  # it forgets maps when it is to
-        run(3, slice(0, 20), (), MAPS, pickle.dumps(task))
-
-
-def test_a_chunk_of_another_task_is_refused() -> None:
-    actor = Actor(Answering)
-    with pytest.raises(RuntimeError, match="a parcel of task 1 came to a worker that has task 0"):
-        actor.run(1, [(make_recipes(2).tobytes(), 0, 2)])
-    actor.run(1, [(make_recipes(2).tobytes(), 0, 2)], (), (), pickle.dumps(make_task()))
-    with pytest.raises(RuntimeError, match="a parcel of task 2 came to a worker that has task 1"):
-        actor.run(2, [(make_recipes(2).tobytes(), 0, 2)])
+        run(slice(0, 20), (), MAPS, pickle.dumps(task))

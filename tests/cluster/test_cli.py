@@ -177,7 +177,6 @@ WRONG = [
     ("--traffic 100000", "--traffic must be 0 to 100"),
     ("--workers 1 --address 127.0.0.1:1", "127.0.0.1:1"),
     ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1: Connection refused; start one"),
-    ("--tracking-uri file:///tmp/mlruns", "file"),
 ]
 
 

@@ -68,7 +68,7 @@ def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> No
     wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(512)).results.tobytes()
     pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path))
     with contextlib.closing(pool):
-        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2, 60)
+        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and len(pool.pids()) == 2, 60)
         pool._patience_s = 5.0
         (tmp_path / "stop").touch()
         outcome = pool.evaluate(make_task(), make_recipes(512))
@@ -77,7 +77,7 @@ def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> No
         pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
         assert pid not in pool.pids()
         pool._patience_s = 60.0
-        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and pool.workers() == 2, 60)
+        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and len(pool.pids()) == 2, 60)
     wait_until(lambda: not psutil.pid_exists(pid), 30)
 
 

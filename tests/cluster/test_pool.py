@@ -1,5 +1,6 @@
 """SerialPool and what all pools share: chunks, one-line errors, the same result from any number of workers."""
 
+import dataclasses
 import re
 import time
 from collections.abc import Sequence
@@ -304,15 +305,21 @@ def test_a_failing_worker_ends_in_one_line_that_names_the_chunk(what: str) -> No
     assert last_line(MemoryError()) == "MemoryError"
 
 
-def test_chunks_change_nothing_for_the_real_worker() -> None:
-    """All at once, in the pool's chunks, and member by member: the same bits."""
+@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,8@2"])
+def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
+    """All at once, in the pool's chunks, and one member and episode at a time: the same bits, rewound ones, too."""
     task, maps = drive_task()
-    recipes = make_recipes(40)
+    parents = np.random.default_rng(0).standard_normal((8, PolicySpec.parse(policy).size)).astype(np.float32)
+    episodes, recipes = task.episodes.copy(), make_recipes(40)
+    episodes["rewind"] = 8
+    task = dataclasses.replace(task, policy=policy, parents=parents, episodes=episodes)
     for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (30, Kind.MIRRORED), (35, Kind.COPY)):
         recipes["kind"][first : first + 5] = kind
     outcome = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes)
-    whole, _, _, seconds = Worker().evaluate(task, maps, recipes)
-    single = np.concatenate([Worker().evaluate(task, maps, recipes[i : i + 1])[0] for i in range(40)])
-    assert outcome.results.tobytes() == whole.tobytes() == single.tobytes()
+    whole, rewound, _, seconds = Worker().evaluate(task, maps, recipes)
+    assert outcome.results.tobytes() == whole.tobytes()
+    for i, e in np.ndindex(whole.shape):
+        alone, back, _, _ = Worker().answer(task, maps, recipes[i : i + 1], e, e + 1)
+        assert (alone.tobytes(), back.tobytes()) == (whole[i, e].tobytes(), rewound[i, e].tobytes())
     assert whole["distance"].max() > 0
     assert seconds > 0

@@ -208,7 +208,6 @@ WRONG = [
     ("RUN --follow --generation 1", "exclude each other"),
     ("CHAMPION --output a.avi", ".mp4 or .gif"),
     ("CHAMPION --output no/a.mp4", "no folder"),
-    ("CHAMPION --output a.mp4 --size 641x360", "--size"),
     ("CHAMPION --output a.gif --fps 30", "--fps"),
     ("CHAMPION --output a.mp4 --fps 1000", "--fps"),
     ("CHAMPION --output a.mp4 --seconds nan", "--seconds"),

@@ -1,4 +1,4 @@
-"""The two elements, their bounds, and the scalar."""
+"""The fitness, and its bounds."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evolution.episodes.rollout import RESULT
-from evolution.search.fitness import elements, scalar
+from evolution.search.fitness import scalar
 
 TARGET = 500.0
 
@@ -28,10 +28,8 @@ def one(drives):
 
 
 def test_nothing_is_0_and_the_target_is_1():
-    assert elements(results([[0.0]], [[0.0]]), TARGET).tolist() == [[0.0, 0.0]]
     assert scalar(results([[0.0]], [[0.0]]), TARGET).tolist() == [0.0]
     for beyond in (TARGET, 3 * TARGET):
-        assert elements(results([[beyond]], [[beyond]]), TARGET) == pytest.approx(np.ones((1, 2)))
         assert scalar(results([[beyond]], [[beyond]]), TARGET) == pytest.approx([1.0])
 
 
@@ -42,13 +40,10 @@ def test_further_and_better_paced_is_never_worse(drives, which, more):
     k = which % len(drives)
     further["distance"][0, k] += more
     paced["paced"][0, k] += more
-    for better, element in ((further, 0), (paced, 1)):
+    for better in (further, paced):
         assert scalar(better, TARGET)[0] >= scalar(row, TARGET)[0]
-        assert elements(better, TARGET)[0, element] >= elements(row, TARGET)[0, element]
-        assert elements(better, TARGET)[0, 1 - element] == elements(row, TARGET)[0, 1 - element]
-    if further["distance"][0, k] < TARGET:
-        assert scalar(further, TARGET)[0] > scalar(row, TARGET)[0]
-        assert elements(further, TARGET)[0, 0] > elements(row, TARGET)[0, 0]
+        if further["distance"][0, k] < TARGET:
+            assert scalar(better, TARGET)[0] > scalar(row, TARGET)[0]
 
 
 def test_the_first_bend_is_worth_as_much_as_a_long_way_later():
@@ -58,7 +53,7 @@ def test_the_first_bend_is_worth_as_much_as_a_long_way_later():
 
 def test_each_episode_may_have_its_own_target():
     drives = np.array([[100.0, 100.0]])
-    value = elements(results(drives, drives), np.array([100.0, 400.0]))
-    alone = [elements(results([[100.0]], [[100.0]]), t)[0, 0] for t in (100.0, 400.0)]
-    assert value[0, 0] == pytest.approx(np.mean(alone))
+    value = scalar(results(drives, drives), np.array([100.0, 400.0]))
+    alone = [scalar(results([[100.0]], [[100.0]]), t)[0] for t in (100.0, 400.0)]
+    assert value[0] == pytest.approx(np.mean(alone))
     assert alone[0] == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Whole populations, alone and among traffic: the fused rollout, a worker and `Simulator` agree bit for bit."""
+"""Episodes among traffic: the fused rollout, a worker and `Simulator` agree bit for bit."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 
 from cluster.runs.champion import load_champion
 from cluster.workers.worker import Task, Worker
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, trajectory
+from evolution.episodes.rollout import RESULT, Limits, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack
 from evolution.search.breeding import RECIPE, Mutation
@@ -15,48 +15,12 @@ from gridsim.car.ego import COS, SIN, SPEED, STEERING, End, X, Y
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import ALONG, LANE, SHIFT
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
 F = np.float32
 CONFIG = SimConfig()
-
-
-@pytest.fixture(scope="module")
-def scenarios():
-    return [build("seamless", seed) for seed in (0, 11)]
-
-
-# --- Whole populations -----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def task(scenarios):
-    rng = np.random.default_rng(8)
-    spec = PolicySpec.parse("mlp:6,7")
-    genomes = rng.normal(size=(6, spec.size)).astype(F) * F(0.5)
-    starts = np.zeros(4, dtype=EPISODE)
-    starts["map"] = [0, 1, 0, 1]
-    starts["start"] = [sample_starts(scenarios[m], 1, rng)[0] for m in starts["map"]]
-    return spec, genomes, starts
-
-
-@pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,8@2"])
-def test_results_do_not_depend_on_the_company(scenarios, task, policy):
-    spec, episodes, limits = PolicySpec.parse(policy), task[2].copy(), Limits(80.0, 100)
-    genomes = np.random.default_rng(8).normal(size=(6, spec.size)).astype(F) * F(0.2)
-    episodes["rewind"] = 8
-    together, rewound, _ = evaluate(spec, genomes, scenarios, episodes, limits, CONFIG)
-    for i, e in np.ndindex(together.shape):
-        alone, back, _ = evaluate(spec, genomes[i : i + 1], scenarios, episodes[e : e + 1], limits, CONFIG)
-        assert alone[0, 0].tobytes() == together[i, e].tobytes()
-        assert back[0, 0].tobytes() == rewound[i, e].tobytes()
-
-
-# --- Among traffic ---------------------------------------------------------------------------------------------------
-
 CARS = 8
 AMONG = Limits(1000.0, 1700)
 
