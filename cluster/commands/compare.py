@@ -95,10 +95,10 @@ def _compare(arguments: Sequence[str]) -> int:
     cells = folder.plan.cells(folder.path)
     for cell in cells:
         cell.check()
-    uri = check_uri(flags.tracking_uri or None)
+    folder.tracking_uri = check_uri(flags.tracking_uri, folder.tracking_uri)
     lock(folder.path)
     warn_of_many_workers(PROG, flags.workers, flags.address)
-    return _train_and_compare(console, folder, cells, flags, uri)
+    return _train_and_compare(console, folder, cells, flags)
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
@@ -119,11 +119,10 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
     return ComparisonFolder(new_folder(Path(flags.output), flags.name, "comparison"), plan), flags
 
 
-def _train_and_compare(
-    console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str
-) -> int:
+def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags) -> int:
     """Train what is not finished, one run after the other on one pool of workers; write tables and a picture of all."""
     folder.write()
+    uri = folder.tracking_uri
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
     tags = {"algorithm": "comparison"}
     tracker = Tracker(Identity(uri, flags.experiment, folder.path.name, params, tags, key=folder.tracking_key))

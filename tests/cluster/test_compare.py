@@ -92,6 +92,20 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     assert {row["velocity_error_percent"] for row in rows} == {"2.5"}
 
 
+def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, monkeypatch, capsys):
+    away = f"http://127.0.0.1:{tracked.free_port()}"
+    folder = ComparisonFolder(tmp_path / "c", Plan(("curved",), ("evolution",), 1, budget="1k"), away)
+    folder.path.mkdir()
+    folder.write()
+    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    code, _, err = call(compare_main, monkeypatch, capsys, "--resume", folder.path, "--workers", 0)
+    assert code == 0
+    nested, unsent = err.splitlines()
+    assert nested.endswith(f"its runs are not nested in MLflow: {away}: Connection refused")
+    assert unsent.startswith(f"gridsim-compare: warning: not logged to MLflow at {away}: ")
+
+
 SMALL = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--population", "32",
          "--workers", "0", "--name", "c"]  # fmt: skip
 

@@ -1,8 +1,10 @@
 """A run's lifecycle: how it ends in MLflow, and what its caller is shown."""
 
 import pytest
-from tracked import client, steps
+from commands import call
+from tracked import client, free_port, steps
 
+from cluster.commands.cli import evolve_main
 from cluster.runs import train
 from cluster.runs.run import new_run, open_run, read_config
 from cluster.runs.settings import EvolveSettings
@@ -75,3 +77,17 @@ def test_what_could_not_be_sent_is_said(tmp_path, monkeypatch):
     (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
     train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0), uri, "driving", notes)
     assert notes.seen == [1, 2, "finished"]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_run_is_resumed_while_its_server_is_away(tmp_path, monkeypatch, capsys):
+    away = f"http://127.0.0.1:{free_port()}"
+    monkeypatch.setattr(train.Session, "finish", end(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0), away, "driving", Notes())
+    flags = ["--resume", tmp_path / "r", "--generations", 3, "--workers", 0]
+    code, _, err = call(evolve_main, monkeypatch, capsys, *flags)
+    assert code == 130
+    said = f"warning: not logged to MLflow at {away}: 3 rows (step 0 to 2), the status KILLED: Connection refused"
+    assert [line for line in err.splitlines() if "warning" in line] == [f"gridsim-evolve: {said}"]
+    assert len(open_run(tmp_path / "r").saved[0]["history"]) == 3
