@@ -328,17 +328,21 @@ class RayPool(WorkerPool):
         """A worker is up and is to be prepared, or it is prepared, or it could not start."""
         import ray
 
+        preparing = slot.serial > 0
         try:
             slot.pid = ray.get(slot.hello)
         except ray.exceptions.RayError as error:
-            if not ray_session.is_to_blame(error):
+            reason, blamed = ray_session.reason(error), ray_session.is_to_blame(error)
+            if preparing:  # it has no parcel yet, and so no member is blamed
+                self._bury(slot, job, reason, blamed)
+                return
+            if not blamed:
                 return self._replace(slot)
             if ray_session.failed_as_it_began(error) and not self.pids():
-                raise PoolError(f"no worker can be started: {ray_session.reason(error)}{self._logs}") from error
-            self._last_failure = f"; the last one: {ray_session.reason(error)}{self._logs}"
+                raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
+            self._last_failure = f"; the last one: {reason}{self._logs}"
             self._replace(slot)
         else:
             self._last_failure = ""
             slot.heard = time.monotonic()
-            prepared = slot.serial > 0
-            slot.hello = None if prepared else slot.actor.prepare.remote(self._serial, *self._update(slot, job))
+            slot.hello = None if preparing else slot.actor.prepare.remote(self._serial, *self._update(slot, job))

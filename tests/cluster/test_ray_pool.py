@@ -29,6 +29,7 @@ from test_pool import (
     never_built,
 )
 
+from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import CollectTask, Task, Worker
@@ -176,6 +177,21 @@ def test_a_worker_that_dies_of_a_first_task_before_it_has_a_member_blames_none(p
     assert (folder / f"kill-{NOBODY}").read_text() <= "0", "both were prepared, and died of it"
     assert outcome.results.tobytes() == expected(512)
     assert outcome.retries <= 4, "of the two that were killed with two chunks each"
+
+
+@pytest.mark.parametrize("what", ["kill", "raise"])
+def test_workers_that_cannot_be_prepared_are_given_up(
+    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    monkeypatch.setattr(ray_pool, "MAX_DEATHS", 6)
+    order = folder / f"{what}-{NOBODY}"
+    order.write_text("9")
+    for pid in pool.pids():
+        os.kill(pid, signal.SIGKILL)
+    with pytest.raises(PoolError, match=r"^workers die whatever they are given, 7 in a row; the last time "):
+        pool.evaluate(make_task(), make_recipes(512))
+    order.unlink()
+    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
 
 
 def test_a_member_that_always_kills_is_lost_alone(pool: RayPool, folder: Path) -> None:
