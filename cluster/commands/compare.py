@@ -140,10 +140,10 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
                     print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
             for cell in cells:
                 shown.begin(cell)
-                if cell.finished():
-                    results.add(read_run(cell.folder))
-                    continue
                 try:
+                    if cell.finished():
+                        results.add(read_run(cell.folder))
+                        continue
                     run = cell.open()
                     train(run, workers, uri, flags.experiment, shown, parent_id=parent, wall_limit_s=wall_s)
                     shown.note("measuring errors")
@@ -262,8 +262,8 @@ class Progress(Line):
 
     def begin(self, cell: Cell) -> None:
         self.name, self.resume = cell.name, f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
-        self._begun = time.perf_counter()
-        self.note("reading what is finished" if cell.finished() else "starting")
+        self._begun, self._is_new = time.perf_counter(), not cell.finished()
+        self.note("starting" if self._is_new else "reading what is finished")
 
     def note(self, text: str, more: str = "") -> None:
         """How far it is, and more where there is room."""
@@ -295,7 +295,7 @@ class Progress(Line):
         )
 
     def failed(self, reason: str) -> None:
-        self.left -= 1
+        self.left -= self._is_new
         print(f"{PROG}: {self.name} failed: {reason}", file=sys.stderr, flush=True)
 
     def _counter(self) -> str:
