@@ -143,6 +143,20 @@ class RayPool(WorkerPool):
     ) -> None:  # fmt: skip
         started = time.perf_counter()
         self._wait_for_ray()
+        import ray
+
+        try:
+            self._share_out(task, recipes, asked, call, on_progress, meanwhile)
+        except ray.exceptions.RayError as error:  # Ray itself is in trouble: a worker's end is seen to where it shows
+            raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
+        self._measure(task, asked, call)
+        call.wall_s = time.perf_counter() - started
+
+    def _share_out(
+        self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,
+        on_progress: Progress | None, meanwhile: Meanwhile | None,
+    ) -> None:  # fmt: skip
+        """Have the workers do all that is asked for."""
         collecting = isinstance(task, CollectTask)
         metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in asked]
         parcels = cut(task, asked, self._asked * (FINER if collecting else 1), metre_s)
@@ -175,8 +189,6 @@ class RayPool(WorkerPool):
                 why = ray_session.capacity() + self._last_failure
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
-        self._measure(task, asked, call)
-        call.wall_s = time.perf_counter() - started
 
     def _measure(self, task: Task | CollectTask, asked: Sequence[Chunk], call: Outcome | Collected) -> None:
         """Remember what a metre took."""

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
+import ray
 from commands import wait_until
 from driving import to_bytes
 from test_pool import (
@@ -235,6 +236,17 @@ def test_an_exception_ends_the_run_in_one_line(pool: RayPool, folder: Path, what
         pool.evaluate(make_task(), make_recipes(512)) if what == "members" else pool.collect(make_collect_task(400))
     assert re.fullmatch(line, str(caught.value))
     (folder / "raise-100").unlink()
+    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
+
+
+def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wait(*_: object, **__: object) -> None:
+        raise ray.exceptions.RaySystemError("the store\nis gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ray, "wait", wait)
+        with pytest.raises(PoolError, match=r"^Ray failed: .*is gone \(logs: .*/logs\)$"):
+            pool.evaluate(make_task(), make_recipes(512))
     assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
 
 
