@@ -171,7 +171,9 @@ class RayPool(WorkerPool):
             for slot in self._slots:
                 silent_s = now - slot.heard if slot.pid and slot.due else 0.0
                 if silent_s > self._patience_s and not self._ready([slot.due], 0.0):
-                    self._bury(slot, job, f"it did not answer for {silent_s:.0f} s")
+                    silence = f"did not answer for {silent_s:.0f} s"
+                    call.warnings.append(f"a worker {silence} (--patience) and is replaced")
+                    self._bury(slot, job, f"it {silence}")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.due]
             for number, parcel in dispatch.give(idle):
                 self._send(self._slots[number], parcel, job)
