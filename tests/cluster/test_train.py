@@ -1,5 +1,7 @@
 """A run's lifecycle: how it ends in MLflow, and what its caller is shown."""
 
+import dataclasses
+
 import pytest
 from commands import call
 from tracked import client, free_port, steps
@@ -89,5 +91,30 @@ def test_a_run_is_resumed_while_its_server_is_away(tmp_path, monkeypatch, capsys
     code, _, err = call(evolve_main, monkeypatch, capsys, *flags)
     assert code == 130
     said = f"warning: not logged to MLflow at {away}: 3 rows (step 0 to 2), the status KILLED: Connection refused"
-    assert [line for line in err.splitlines() if "warning" in line] == [f"gridsim-evolve: {said}"]
+    *begun, warning = [line for line in err.splitlines() if "warning" in line]
+    assert warning == f"gridsim-evolve: {said}"
+    assert len(begun) <= 1, "told of already while it went on"
     assert len(open_run(tmp_path / "r").saved[0]["history"]) == 3
+
+
+def test_an_outage_of_mlflow_is_told_of_once_and_its_end(tmp_path, monkeypatch):
+    class Tracker:
+        uri, run_id, errors = "http://me:secret@host", None, iter([None, "refused", "refused", None, None, None])
+        error = property(lambda self: next(self.errors))
+
+        def log_row(self, *_):
+            pass
+
+        def close(self, status):
+            return None
+
+    class Told(Notes):
+        def warn(self, text):
+            self.seen.append(text)
+
+    monkeypatch.setattr(train.Session, "finish", end(None))
+    monkeypatch.setattr(train, "make_tracker", lambda *_, **__: Tracker())
+    settings, notes = dataclasses.replace(SETTINGS, generations=5), Told()
+    train.train(new_run(tmp_path, "r", settings), train.Workers(0, None, 0.0), "", "driving", notes)
+    away = "MLflow at http://host takes nothing for now: refused; the run goes on, and sends it later"
+    assert notes.seen == [1, 2, away, 3, 4, "MLflow at http://host is back, and has what it missed", 5]
