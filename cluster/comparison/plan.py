@@ -53,7 +53,10 @@ class Cell(NamedTuple):
         """Raises ExperimentError or RunError where the folder holds something else."""
         if (self.folder / CONFIG).is_file():
             if read_config(self.folder / CONFIG)[0] != self.settings:
-                raise ExperimentError(f"{self.folder} is not what {COMPARISON} asks for; one of them was edited")
+                raise ExperimentError(
+                    f"{self.folder} is not what {COMPARISON} asks for: one of them was edited, or another version of "
+                    "GridSim wrote it; start a new comparison"
+                )
         # Killed while it wrote its first file, a run leaves a hidden one.
         elif self.folder.is_file() or any(self.folder.glob("[!.]*")):
             raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
