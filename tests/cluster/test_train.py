@@ -19,7 +19,10 @@ class Notes(train.Reporter):
     """Keeps what it is shown."""
 
     def __init__(self):
-        self.seen = []
+        self.seen, self.told = [], []
+
+    def warn(self, text):
+        self.told.append((len(self.seen), text))
 
     def row(self, steps, row):
         self.seen.append(steps)
@@ -94,7 +97,9 @@ def test_a_run_is_resumed_while_its_server_is_away(tmp_path, monkeypatch, capsys
     *begun, warning = [line for line in err.splitlines() if "warning" in line]
     assert warning == f"gridsim-evolve: {said}"
     assert len(begun) <= 1, "told of already while it went on"
-    assert len(open_run(tmp_path / "r").saved[0]["history"]) == 3
+    saved = open_run(tmp_path / "r").saved
+    assert saved is not None
+    assert len(saved[0]["history"]) == 3
 
 
 def test_an_outage_of_mlflow_is_told_of_once_and_its_end(tmp_path, monkeypatch):
@@ -108,13 +113,9 @@ def test_an_outage_of_mlflow_is_told_of_once_and_its_end(tmp_path, monkeypatch):
         def close(self, status):
             return None
 
-    class Told(Notes):
-        def warn(self, text):
-            self.seen.append(text)
-
     monkeypatch.setattr(train.Session, "finish", end(None))
     monkeypatch.setattr(train, "make_tracker", lambda *_, **__: Tracker())
-    settings, notes = dataclasses.replace(SETTINGS, generations=5), Told()
+    settings, notes = dataclasses.replace(SETTINGS, generations=5), Notes()
     train.train(new_run(tmp_path, "r", settings), train.Workers(0, None, 0.0), "", "driving", notes)
     away = "MLflow at http://host takes nothing for now: refused; the run goes on, and sends it later"
-    assert notes.seen == [1, 2, away, 3, 4, "MLflow at http://host is back, and has what it missed", 5]
+    assert notes.told == [(2, away), (4, "MLflow at http://host is back, and has what it missed")]
