@@ -109,7 +109,7 @@ def test_a_finished_run_that_is_damaged_counts_as_failed_and_stops_no_other(tmp_
     assert f"gridsim-compare: {damaged.name} failed: {damaged.folder}/champion.npz" in err
     assert "gridsim-compare: error: 1 of 4 runs failed" in err
     assert f"run 4/4  {new.name}: success 50%" in out
-    assert len((folder.path / "table.csv").read_text().splitlines()) == 1 + 3
+    assert "| curved | evolution | missing |" in (folder.path / "table.md").read_text()
 
 
 def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, monkeypatch, capsys):
