@@ -204,7 +204,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
             print(f"{prog}: warning: {unsent}", file=sys.stderr)
         return 0
     saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
-    uri = check_uri(flags.tracking_uri or saved or None)
+    uri = check_uri(flags.tracking_uri, saved)
     address = flags.address or os.environ.get("RAY_ADDRESS") or None
     if address and flags.workers:
         from cluster.workers.ray_session import check_address  # and Ray

@@ -95,10 +95,10 @@ def _compare(arguments: Sequence[str]) -> int:
     cells = folder.plan.cells(folder.path)
     for cell in cells:
         cell.check()
-    uri = check_uri(flags.tracking_uri or None)
+    folder.tracking_uri = check_uri(flags.tracking_uri, folder.tracking_uri)
     lock(folder.path)
     warn_of_many_workers(PROG, flags.workers, flags.address)
-    return _train_and_compare(console, folder, cells, flags, uri)
+    return _train_and_compare(console, folder, cells, flags)
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
@@ -119,11 +119,10 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
     return ComparisonFolder(new_folder(Path(flags.output), flags.name, "comparison"), plan), flags
 
 
-def _train_and_compare(
-    console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, uri: str
-) -> int:
+def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags) -> int:
     """Train what is not finished, one run after the other on one pool of workers; write tables and a picture of all."""
     folder.write()
+    uri = folder.tracking_uri
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
     tags = {"algorithm": "comparison"}
     tracker = Tracker(Identity(uri, flags.experiment, folder.path.name, params, tags, key=folder.tracking_key))
@@ -141,10 +140,10 @@ def _train_and_compare(
                     print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
             for cell in cells:
                 shown.begin(cell)
-                if cell.finished():
-                    results.add(read_run(cell.folder))
-                    continue
                 try:
+                    if cell.finished():
+                        results.add(read_run(cell.folder))
+                        continue
                     run = cell.open()
                     train(run, workers, uri, flags.experiment, shown, parent_id=parent, wall_limit_s=wall_s)
                     shown.note("measuring errors")
@@ -263,8 +262,8 @@ class Progress(Line):
 
     def begin(self, cell: Cell) -> None:
         self.name, self.resume = cell.name, f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
-        self._begun = time.perf_counter()
-        self.note("reading what is finished" if cell.finished() else "starting")
+        self._begun, self._is_new = time.perf_counter(), not cell.finished()
+        self.note("starting" if self._is_new else "reading what is finished")
 
     def note(self, text: str, more: str = "") -> None:
         """How far it is, and more where there is room."""
@@ -296,7 +295,7 @@ class Progress(Line):
         )
 
     def failed(self, reason: str) -> None:
-        self.left -= 1
+        self.left -= self._is_new
         print(f"{PROG}: {self.name} failed: {reason}", file=sys.stderr, flush=True)
 
     def _counter(self) -> str:

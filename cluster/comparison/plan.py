@@ -22,6 +22,7 @@ from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, 
 from cluster.runs import checkpoint
 from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, new_run, open_run, read_config
 from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
+from cluster.tracking.address import shown
 from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
@@ -52,7 +53,10 @@ class Cell(NamedTuple):
         """Raises ExperimentError or RunError where the folder holds something else."""
         if (self.folder / CONFIG).is_file():
             if read_config(self.folder / CONFIG)[0] != self.settings:
-                raise ExperimentError(f"{self.folder} is not what {COMPARISON} asks for; one of them was edited")
+                raise ExperimentError(
+                    f"{self.folder} is not what {COMPARISON} asks for: one of them was edited, or another version of "
+                    "GridSim wrote it; start a new comparison"
+                )
         # Killed while it wrote its first file, a run leaves a hidden one.
         elif self.folder.is_file() or any(self.folder.glob("[!.]*")):
             raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
@@ -168,10 +172,11 @@ def limits(budget: str) -> tuple[int, float]:
 
 @dataclass
 class ComparisonFolder:
-    """Where a comparison is kept, its plan, and the key by which MLflow's parent run is found again."""
+    """Where a comparison is kept, its plan, and where MLflow has its parent run: the address, and the key."""
 
     path: Path
     plan: Plan
+    tracking_uri: str = ""
     tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)
 
     def write(self) -> None:
@@ -181,6 +186,8 @@ class ComparisonFolder:
             "command": "gridsim-compare",
             "gridsim": version("gridsim"),
             "plan": dataclasses.asdict(self.plan),
+            # MLflow gets this file, and with it no password.
+            "tracking_uri": self.tracking_uri if self.tracking_uri == shown(self.tracking_uri) else "",
             "tracking_key": self.tracking_key,
         }
         checkpoint.write_atomic(self.path / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())
@@ -201,7 +208,8 @@ def open_comparison(folder: Path) -> ComparisonFolder:
         }
         plan = Plan(**values)
         plan.check()
-        return ComparisonFolder(folder.resolve(), plan, uuid.UUID(content["tracking_key"]).hex)
+        uri, key = str(content.get("tracking_uri", "")), uuid.UUID(content["tracking_key"]).hex
+        return ComparisonFolder(folder.resolve(), plan, uri, key)
     except GridSimError as error:
         raise ExperimentError(f"{path}: {error}") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:

@@ -27,7 +27,7 @@ from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CheckpointError
 from cluster.runs.run import ELITES, HISTORY, PAGE, SUMMARY, RunError, RunFolder, lock, write_summary
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
-from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.address import TrackingError, check_uri, shown
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
@@ -159,8 +159,11 @@ def train(
                 reporter.stopping()
             warming.stop()
             maps.close()
-            if session and (lost := session.tracker.close(status)):
-                reporter.unsent(lost, status == "FINISHED")
+            if session:
+                if lost := session.tracker.close(status):
+                    reporter.unsent(lost, status == "FINISHED")
+                else:
+                    session.tell_of_mlflow()
 
 
 @contextlib.contextmanager
@@ -219,6 +222,7 @@ class Session:
     _state: State = field(init=False)  # after the last whole step
     _saved_steps: int = 0  # steps that are in the folder
     _saved_at: float = -math.inf
+    _away: bool = False  # whether MLflow is, and that was told
 
     def __post_init__(self) -> None:
         self.learning = learning = new_learning(self.run.settings, self.pool, self.maps, self.initial)
@@ -249,10 +253,20 @@ class Session:
                 learning.add_wall_clock(row, self._wall_s(), learning.history[-2] if learning.steps > 1 else None)
                 self._state = learning.state()
                 self.reporter.row(learning.steps, row)
+                self.tell_of_mlflow()
             self.save()
         except BaseException:
             self.save()
             raise
+
+    def tell_of_mlflow(self) -> None:
+        """Say in one line that MLflow is away, and in another one that it is back."""
+        error, where = self.tracker.error, shown(self.tracker.uri)
+        if error and not self._away:
+            self.reporter.warn(f"MLflow at {where} takes nothing for now: {error}; the run goes on, and sends it later")
+        elif self._away and not error:
+            self.reporter.warn(f"MLflow at {where} is back, and has what it missed")
+        self._away = bool(error)
 
     def _wall_s(self) -> float:
         """Seconds that the run has taken, in this process and before."""

@@ -27,15 +27,19 @@ class TrackingError(GridSimError):
     """MLflow cannot be used; the message is one line for the user."""
 
 
-def check_uri(uri: str | None = None) -> str:
+def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     """The tracking address made absolute and probed, without MLflow.
 
-    None stands for MLFLOW_TRACKING_URI and, where that is not set, for `sqlite:///mlflow.db` in the working directory.
+    None stands for the address that a resumed run was begun with. Its server may be away: that stops no run, and the
+    tracker says so. Without one it is MLFLOW_TRACKING_URI, or else `sqlite:///mlflow.db` in the working directory.
     Raises TrackingError for a server that does not answer, a database that cannot be written, a folder (MLflow 3
     stores nothing in folders) and anything unknown.
     """
-    uri = uri or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
+    resumed = not uri and bool(begun_with)
+    uri = uri or begun_with or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
     scheme = uri.partition("://")[0].partition("+")[0].lower() if "://" in uri else ""
+    if resumed and scheme in ("http", "https", *_DATABASES):
+        return uri
     if scheme == "sqlite":
         return _check_sqlite(uri)
     if scheme in ("http", "https"):

@@ -5,10 +5,15 @@ import os
 import subprocess
 from pathlib import Path
 
+DIRTY = "-dirty"
+
 
 @functools.cache
 def git_commit() -> str:
-    """The commit that this code was checked out from; `unknown` outside git (an installed copy, no git, no commit)."""
+    """The commit that this code was checked out from, with DIRTY behind it where a tracked file was changed since.
+
+    `unknown` outside git: an installed copy, no git, no commit.
+    """
     here = Path(__file__).resolve()
     # A hook's GIT_DIR would lead to another repository.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
@@ -21,6 +26,7 @@ def git_commit() -> str:
     try:
         # Installed into a .venv inside another repository, this file is not tracked there.
         git("ls-files", "--error-unmatch", here.name)
-        return git("rev-parse", "HEAD") or "unknown"
+        changed = git("--no-optional-locks", "status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + (DIRTY if changed else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from cluster.tracking.address import TrackingError, shown, sqlite_path
-from cluster.tracking.commit import git_commit
+from cluster.tracking.commit import DIRTY, git_commit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -168,7 +168,7 @@ class LoggedRun:
         started = int(1000.0 * (time.time() if identity.started is None else identity.started))
         natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]  # mlflow.user, mlflow.source.*
         if commit != "unknown":
-            natural["mlflow.source.git.commit"] = commit
+            natural["mlflow.source.git.commit"] = commit.removesuffix(DIRTY)  # a commit and nothing else
         tags = {**natural, **self._tags(), **_note_tags(identity.note)}
         return self._client.create_run(self.experiment_id, started, tags, identity.name)
 

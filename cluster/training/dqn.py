@@ -128,7 +128,7 @@ class Dqn(Learning):
         progress = self.on_progress
         tell = (lambda done, total: progress("collect", done, total)) if progress else None
         brought = self.pool.collect(task, tell, self._train)
-        self._report_lost("collect", brought)
+        self._report("collect", brought)
         check_any_left(brought.lost, "collect")
         self.replay.add(brought.experience)
         results = brought.results[~brought.lost]

@@ -109,7 +109,7 @@ class Learning(ABC):
         elites: the network of each step, float32 [genes].
         validation_steps: car-steps of these that validation took.
         lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
-        warn: called with one line for each of these.
+        warn: called with one line for each of these, and for each worker that is replaced because it is silent.
     """
 
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
@@ -226,11 +226,11 @@ class Learning(ABC):
         outcome = self.pool.evaluate(task, members.recipes, tell, asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
-        self._report_lost(stage, outcome)
+        self._report(stage, outcome)
         return outcome
 
-    def _report_lost(self, stage: str, brought: Outcome | Collected) -> None:
-        self.lost_chunks += len(brought.warnings)
+    def _report(self, stage: str, brought: Outcome | Collected) -> None:
+        self.lost_chunks += int(brought.lost.sum())
         for text in brought.warnings:
             self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
 

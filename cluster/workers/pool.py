@@ -70,7 +70,7 @@ class Call:
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
         broadcast_bytes: put into the object store: the task and the maps that were new to it.
-        warnings: a line for each row that was lost.
+        warnings: a line for each row that was lost, and for each worker that was replaced because it was silent.
     """
 
     results: np.ndarray

@@ -140,6 +140,20 @@ class RayPool(WorkerPool):
     ) -> None:  # fmt: skip
         started = time.perf_counter()
         self._wait_for_ray()
+        import ray
+
+        try:
+            self._share_out(task, recipes, asked, call, on_progress, meanwhile)
+        except ray.exceptions.RayError as error:  # Ray itself is in trouble: a worker's end is seen to where it shows
+            raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
+        self._measure(task, asked, call)
+        call.wall_s = time.perf_counter() - started
+
+    def _share_out(
+        self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,
+        on_progress: Progress | None, meanwhile: Meanwhile | None,
+    ) -> None:  # fmt: skip
+        """Have the workers do all that is asked for."""
         collecting = isinstance(task, CollectTask)
         metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in asked]
         parcels = cut(task, asked, self._asked * (FINER if collecting else 1), metre_s)
@@ -154,7 +168,9 @@ class RayPool(WorkerPool):
             for slot in self._slots:
                 silent_s = now - slot.heard if slot.pid and slot.due else 0.0
                 if silent_s > self._patience_s and not self._ready([slot.due], 0.0):
-                    self._bury(slot, job, f"it did not answer for {silent_s:.0f} s")
+                    silence = f"did not answer for {silent_s:.0f} s"
+                    call.warnings.append(f"a worker {silence} (--patience) and is replaced")
+                    self._bury(slot, job, f"it {silence}")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.due]
             for number, parcel in dispatch.give(idle):
                 self._send(self._slots[number], parcel, job)
@@ -172,8 +188,6 @@ class RayPool(WorkerPool):
                 why = ray_session.capacity() + self._last_failure
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
-        self._measure(task, asked, call)
-        call.wall_s = time.perf_counter() - started
 
     def _measure(self, task: Task | CollectTask, asked: Sequence[Chunk], call: Outcome | Collected) -> None:
         """Remember what a metre took."""
@@ -325,17 +339,21 @@ class RayPool(WorkerPool):
         """A worker is up and is to be prepared, or it is prepared, or it could not start."""
         import ray
 
+        preparing = slot.serial > 0
         try:
             slot.pid = ray.get(slot.hello)
         except ray.exceptions.RayError as error:
-            if not ray_session.is_to_blame(error):
+            reason, blamed = ray_session.reason(error), ray_session.is_to_blame(error)
+            if preparing:  # it has no parcel yet, and so no member is blamed
+                self._bury(slot, job, reason, blamed)
+                return
+            if not blamed:
                 return self._replace(slot)
             if ray_session.failed_as_it_began(error) and not self.pids():
-                raise PoolError(f"no worker can be started: {ray_session.reason(error)}{self._logs}") from error
-            self._last_failure = f"; the last one: {ray_session.reason(error)}{self._logs}"
+                raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
+            self._last_failure = f"; the last one: {reason}{self._logs}"
             self._replace(slot)
         else:
             self._last_failure = ""
             slot.heard = time.monotonic()
-            prepared = slot.serial > 0
-            slot.hello = None if prepared else slot.actor.prepare.remote(*self._update(slot, job))
+            slot.hello = None if preparing else slot.actor.prepare.remote(*self._update(slot, job))

@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import secrets
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -166,17 +167,22 @@ def _be_quiet() -> None:
 def _lean_head() -> Iterator[None]:
     """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
 
-    Ray has no settings for that, so this replaces private names, and sets variables for its processes, meanwhile.
+    They get process groups of their own: a signal to our whole group would end them half started, and `ray.init` then
+    waits for a minute. Ray has no settings for either, so this replaces private names, and sets variables for its
+    processes, meanwhile.
     """
     with contextlib.ExitStack() as undo:
         for name in OWN_ENVIRONMENT.keys() - os.environ.keys():
             os.environ[name] = OWN_ENVIRONMENT[name]
             undo.callback(os.environ.pop, name)
         with contextlib.suppress(ImportError, AttributeError, TypeError):  # a version of Ray without these names
-            node, parameter = _private("node").Node, _private("parameter")
+            node, parameter, services = _private("node").Node, _private("parameter"), _private("services")
             lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
             lean()
-            for owner, name, value in ((node, "start_api_server", _no_api_server), (parameter, "RayParams", lean)):
+            replaced = [(node, "start_api_server", _no_api_server), (parameter, "RayParams", lean)]
+            if sys.platform == "linux":  # elsewhere Ray ends its processes by our group
+                replaced.append((services, "ConsolePopen", partial(services.ConsolePopen, process_group=0)))
+            for owner, name, value in replaced:
                 undo.callback(setattr, owner, name, getattr(owner, name))
                 setattr(owner, name, value)
         yield

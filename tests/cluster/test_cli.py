@@ -146,15 +146,16 @@ def test_init_begins_with_a_champion(reference, tmp_path):
 
 
 @pytest.mark.e2e
+@pytest.mark.parametrize("send", [os.kill, os.killpg])  # the second as timeout, Slurm and terminals do
 @pytest.mark.parametrize(("sign", "after_s"), [(signal.SIGTERM, 0.0), (signal.SIGTERM, 1.5), (signal.SIGINT, 0.5)])
-def test_stopped_while_ray_starts_it_ends_soon_and_leaves_nothing(tmp_path, sign, after_s):
+def test_stopped_while_ray_starts_it_ends_soon_and_leaves_nothing(tmp_path, send, sign, after_s):
     with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
         process = start("gridsim-evolve", "--workers", "2", *SMALL, cwd=tmp_path, RAY_TMPDIR=short)
         wait_until(lambda: list(Path(short).glob("ray/session_2*")))
         time.sleep(after_s)
         children = descendants(process.pid)
         began = time.monotonic()
-        process.send_signal(sign)
+        send(process.pid, sign)
         _, err = process.communicate(timeout=60)
         assert time.monotonic() - began < 15  # 0.2 s where nothing else is going on
         assert process.returncode == 130, err

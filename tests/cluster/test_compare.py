@@ -1,6 +1,7 @@
 """The command gridsim-compare: wrong use, what is never trained again, a kill and Ctrl-C."""
 
 import csv
+import dataclasses
 import functools
 import json
 import os
@@ -90,6 +91,39 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))
     assert len(rows) == 8
     assert {row["velocity_error_percent"] for row in rows} == {"2.5"}
+
+
+def test_a_finished_run_that_is_damaged_counts_as_failed_and_stops_no_other(tmp_path, monkeypatch, capsys):
+    folder = ComparisonFolder(tmp_path / "c", dataclasses.replace(PLAN, seeds=1))
+    damaged, *others, new = folder.plan.cells(folder.path)
+    for cell in (damaged, *others):
+        make_run(cell.folder, settings=cell.settings)
+    folder.write()
+    (damaged.folder / "champion.npz").write_text("PK")
+    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
+    monkeypatch.chdir(tmp_path)
+    code, out, err = call(compare_main, monkeypatch, capsys, "--resume", "c", "--workers", 0)
+    assert code == 1
+    assert f"gridsim-compare: {damaged.name} failed: {damaged.folder}/champion.npz" in err
+    assert "gridsim-compare: error: 1 of 4 runs failed" in err
+    assert f"run 4/4  {new.name}: success 50%" in out
+    assert "| curved | evolution | missing |" in (folder.path / "table.md").read_text()
+
+
+def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, monkeypatch, capsys):
+    away = f"http://127.0.0.1:{tracked.free_port()}"
+    folder = ComparisonFolder(tmp_path / "c", Plan(("curved",), ("evolution",), 1, budget="1k"), away)
+    folder.path.mkdir()
+    folder.write()
+    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    code, _, err = call(compare_main, monkeypatch, capsys, "--resume", folder.path, "--workers", 0)
+    assert code == 0
+    nested, unsent = err.splitlines()
+    assert nested.endswith(f"its runs are not nested in MLflow: {away}: Connection refused")
+    assert unsent.startswith(f"gridsim-compare: warning: not logged to MLflow at {away}: ")
 
 
 SMALL = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--population", "32",

@@ -8,6 +8,7 @@ import contextlib
 import functools
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -74,6 +75,8 @@ def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> No
         outcome = pool.evaluate(make_task(), make_recipes(512))
         assert outcome.results.tobytes() == wanted
         assert 1 <= outcome.retries <= 2
+        (said,) = outcome.warnings
+        assert re.fullmatch(r"a worker did not answer for [5-9] s \(--patience\) and is replaced", said)
         pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
         assert pid not in pool.pids()
         pool._patience_s = 60.0

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
+import ray
 from commands import wait_until
 from driving import to_bytes
 from test_pool import (
@@ -29,6 +30,7 @@ from test_pool import (
     never_built,
 )
 
+from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import CollectTask, Task, Worker
@@ -178,6 +180,21 @@ def test_a_worker_that_dies_of_a_first_task_before_it_has_a_member_blames_none(p
     assert outcome.retries <= 4, "of the two that were killed with two chunks each"
 
 
+@pytest.mark.parametrize("what", ["kill", "raise"])
+def test_workers_that_cannot_be_prepared_are_given_up(
+    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    monkeypatch.setattr(ray_pool, "MAX_DEATHS", 6)
+    order = folder / f"{what}-{NOBODY}"
+    order.write_text("9")
+    for pid in pool.pids():
+        os.kill(pid, signal.SIGKILL)
+    with pytest.raises(PoolError, match=r"^workers die whatever they are given, 7 in a row; the last time "):
+        pool.evaluate(make_task(), make_recipes(512))
+    order.unlink()
+    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
+
+
 def test_a_member_that_always_kills_is_lost_alone(pool: RayPool, folder: Path) -> None:
     (folder / "kill-300").write_text("100")
     progress: list[tuple[int, int]] = []
@@ -219,6 +236,17 @@ def test_an_exception_ends_the_run_in_one_line(pool: RayPool, folder: Path, what
         pool.evaluate(make_task(), make_recipes(512)) if what == "members" else pool.collect(make_collect_task(400))
     assert re.fullmatch(line, str(caught.value))
     (folder / "raise-100").unlink()
+    assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
+
+
+def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wait(*_: object, **__: object) -> None:
+        raise ray.exceptions.RaySystemError("the store\nis gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ray, "wait", wait)
+        with pytest.raises(PoolError, match=r"^Ray failed: .*is gone \(logs: .*/logs\)$"):
+            pool.evaluate(make_task(), make_recipes(512))
     assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
 
 

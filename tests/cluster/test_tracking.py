@@ -13,6 +13,7 @@ import pytest
 from tracked import PARAMS, TAGS, begin, client, row, runs, steps, tracker, with_path
 
 import cluster.tracking.commit
+from cluster.tracking import mlflow_run
 from cluster.tracking.address import check_uri
 from cluster.tracking.commit import git_commit
 
@@ -209,3 +210,11 @@ def test_git_commit(tmp_path, monkeypatch):
     assert told(tmp_path / "repository", GIT_DIR="/nowhere") == commit
     assert told(tmp_path / "repository", PATH="/nowhere") == "unknown"
     assert told(tmp_path / "repository/.venv/site-packages") == "unknown"
+    (tmp_path / "repository/cluster/__init__.py").write_text("changed = True\n")
+    assert told(tmp_path / "repository") == f"{commit}-dirty"
+
+
+def test_a_dirty_tree_is_in_our_tag_alone(uri, monkeypatch):
+    monkeypatch.setattr(mlflow_run, "git_commit", lambda: "c0ffee-dirty")
+    tags = client(uri).get_run(begin(uri, 1)).data.tags
+    assert (tags["git_commit"], tags["mlflow.source.git.commit"]) == ("c0ffee-dirty", "c0ffee")

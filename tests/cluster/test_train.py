@@ -1,8 +1,12 @@
 """A run's lifecycle: how it ends in MLflow, and what its caller is shown."""
 
-import pytest
-from tracked import client, steps
+import dataclasses
 
+import pytest
+from commands import call
+from tracked import client, free_port, steps
+
+from cluster.commands.cli import evolve_main
 from cluster.runs import train
 from cluster.runs.run import new_run, open_run, read_config
 from cluster.runs.settings import EvolveSettings
@@ -15,7 +19,10 @@ class Notes(train.Reporter):
     """Keeps what it is shown."""
 
     def __init__(self):
-        self.seen = []
+        self.seen, self.told = [], []
+
+    def warn(self, text):
+        self.told.append((len(self.seen), text))
 
     def row(self, steps, row):
         self.seen.append(steps)
@@ -75,3 +82,40 @@ def test_what_could_not_be_sent_is_said(tmp_path, monkeypatch):
     (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
     train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0), uri, "driving", notes)
     assert notes.seen == [1, 2, "finished"]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_run_is_resumed_while_its_server_is_away(tmp_path, monkeypatch, capsys):
+    away = f"http://127.0.0.1:{free_port()}"
+    monkeypatch.setattr(train.Session, "finish", end(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0), away, "driving", Notes())
+    flags = ["--resume", tmp_path / "r", "--generations", 3, "--workers", 0]
+    code, _, err = call(evolve_main, monkeypatch, capsys, *flags)
+    assert code == 130
+    said = f"warning: not logged to MLflow at {away}: 3 rows (step 0 to 2), the status KILLED: Connection refused"
+    *begun, warning = [line for line in err.splitlines() if "warning" in line]
+    assert warning == f"gridsim-evolve: {said}"
+    assert len(begun) <= 1, "told of already while it went on"
+    saved = open_run(tmp_path / "r").saved
+    assert saved is not None
+    assert len(saved[0]["history"]) == 3
+
+
+def test_an_outage_of_mlflow_is_told_of_once_and_its_end(tmp_path, monkeypatch):
+    class Tracker:
+        uri, run_id, errors = "http://me:secret@host", None, iter([None, "refused", "refused", None, None, None])
+        error = property(lambda self: next(self.errors))
+
+        def log_row(self, *_):
+            pass
+
+        def close(self, status):
+            return None
+
+    monkeypatch.setattr(train.Session, "finish", end(None))
+    monkeypatch.setattr(train, "make_tracker", lambda *_, **__: Tracker())
+    settings, notes = dataclasses.replace(SETTINGS, generations=5), Notes()
+    train.train(new_run(tmp_path, "r", settings), train.Workers(0, None, 0.0), "", "driving", notes)
+    away = "MLflow at http://host takes nothing for now: refused; the run goes on, and sends it later"
+    assert notes.told == [(2, away), (4, "MLflow at http://host is back, and has what it missed")]

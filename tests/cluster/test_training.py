@@ -291,7 +291,7 @@ class Losing(SerialPool):
         rows = np.arange(len(recipes))[self.rows.get(kind, slice(0, 0))]
         outcome.lost[rows] = True
         outcome.results[rows] = np.zeros((), outcome.results.dtype)
-        outcome.warnings = [f"member {row} is lost" for row in rows]
+        outcome.warnings = ["a worker is replaced", *(f"member {row} is lost" for row in rows)]
         lost = breed(task.parents, recipes[rows], task.key, PolicySpec.parse(task.policy), task.mutation)
         self.genomes = np.concatenate([self.genomes, lost])
         return outcome
