@@ -235,7 +235,7 @@ def update_gap(network, drivers, car, other, is_ego):
     right = max(-car[SHIFT], _ZERO)
     if not done:
         near = min(car[HORIZON], car[GAP])  # only obstacles nearer than the nearest so far matter
-        furthest = _F(1e9) if is_ego and meets_ego(network, car, other) else right
+        furthest = _F(1e9) if is_ego and meets_ego(network, drivers, car, other) else right
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, furthest)
     if at < car[GAP]:
         car[GAP], car[LEAD_SPEED] = at, along
@@ -416,7 +416,7 @@ def _move(network, drivers, car, ego):
     before, after = car[SPEED], max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
     car[ALONG] += _HALF * (before + after) * drivers.dt
     car[SPEED] = after
-    place = -room_to_right(network, car) if meets_ego(network, car, ego) else _ZERO
+    place = -room_to_right(network, car) if meets_ego(network, drivers, car, ego) else _ZERO
     shift = car[SHIFT]
     if shift != place or car[SWAY] != _ZERO:
         way = _HALF * (before + after) * drivers.dt
