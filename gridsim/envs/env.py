@@ -381,7 +381,8 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         # may last as long as the wrapper lets it, and `info["end"]` is to tell when time is up.
         maker, simulator = sys._getframe(1), self.cars.simulator
         if maker.f_code is gymnasium.make.__code__:
-            asked = maker.f_locals["max_episode_steps"] or maker.f_locals["env_spec"].max_episode_steps
+            named = maker.f_locals  # in a later Gymnasium perhaps by other names: then the wrapper alone has the limit
+            asked = named.get("max_episode_steps") or getattr(named.get("env_spec"), "max_episode_steps", None)
             if asked is not None and asked > 0:
                 simulator.max_steps = asked
         self._spec = spec and dataclasses.replace(spec, max_episode_steps=simulator.max_steps)

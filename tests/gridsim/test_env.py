@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 from driving import SENSING, drive
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeAwareObservation
@@ -320,6 +321,20 @@ def test_the_time_limit_of_make_is_the_environments_own(mode: str, steps: int) -
         assert not any(trunc or info["end"] for _, trunc, info in seen[:-1])
         terminated, truncated, info = seen[-1]
         assert (terminated, truncated, info["end"]) == (False, True, End.TIME)
+
+
+def test_a_make_with_other_names_inside_leaves_the_configurations_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of Gymnasium's own are read by the environment, and are no promise of Gymnasium's."""
+
+    def make(id: str, limit: int) -> gymnasium.Env:
+        env = GridSimEnv(maps=1)
+        env.spec = EnvSpec(id, max_episode_steps=limit)
+        return env
+
+    monkeypatch.setattr(gymnasium, "make", make)
+    made = make(IDS[2], 7)
+    assert made.spec is not None
+    assert made.spec.max_episode_steps == 4000
 
 
 # --- wrong use
