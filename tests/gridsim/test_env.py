@@ -134,6 +134,14 @@ def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: Maps) -> 
     )
 
 
+@pytest.mark.parametrize("seed", [np.int64(3), np.uint8(254), [np.int64(3), 4, 5]])
+def test_seeds_may_be_numpys_numbers(maps: Maps, seed: Any) -> None:
+    env = GridSimVectorEnv(3, maps=maps["seamless"])
+    plain = [int(number) for number in seed] if isinstance(seed, list) else int(seed)
+    expected, _ = env.reset(seed=plain)
+    np.testing.assert_array_equal(env.reset(seed=seed)[0], expected)
+
+
 # --- observations and rewards
 
 
@@ -441,3 +449,8 @@ def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> No
     with pytest.raises(ValueError, match=re.escape(text)) as error:
         GridSimVectorEnv(**arguments)
     assert "\n" not in str(error.value)
+
+
+def test_a_single_environment_has_no_autoreset_mode() -> None:
+    with pytest.raises(ValueError, match="^autoreset_mode is for vector environments[^\n]*$"):
+        gymnasium.make(IDS[2], autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP)
