@@ -393,6 +393,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             best, gain = _I(target), advantage
     if best >= 0:
         along, onward, beyond = car[ALONG], car[NEXT], car[SECOND_NEXT]
+        nearest, lead_speed = car[GAP], car[LEAD_SPEED]
         apart = _lanes_apart(network, lane, along, best)
         car[SHIFT] = -apart if best == network.left[lane] else apart
         car[ALONG] = along / network.steps[lane] * network.steps[best]
@@ -408,6 +409,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             update_gap(network, drivers, car, ego, True)
         if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe:
             car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO
+            car[GAP], car[LEAD_SPEED] = nearest, lead_speed
 
 
 @leaf
