@@ -23,6 +23,7 @@ from gridsim.traffic.behaviour import drivers, flow, idm
 from gridsim.traffic.world import (
     ALONG,
     COS,
+    DRAWS,
     FIELDS,
     JUNCTION_BEHIND,
     LANE,
@@ -392,6 +393,19 @@ def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
     world[[0, 2, 3], LANE_TIMER] = 9.0
     flow(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
     assert world[1, LANE] == 0
+
+
+def test_a_change_that_is_refused_leaves_no_trace(abreast):
+    """Moving over, it would touch the car ahead: it is as if its turn to decide had not come."""
+    world = cars_on(abreast, (1, 212.0, 0.0, 0.4), (1, 200.0, 15.0, 1.0))
+    world[:, LANE_TIMER] = 9.0
+    asked = world.copy()
+    asked[1, LANE_TIMER] = 0.0
+    flow(abreast, D, world, NOBODY)
+    flow(abreast, D, asked, NOBODY)
+    assert asked[1, DRAWS] == world[1, DRAWS] + 2  # it was about to change
+    same = np.setdiff1d(np.arange(FIELDS), [DRAWS, LANE_TIMER])
+    np.testing.assert_array_equal(asked[:, same], world[:, same])
 
 
 @pytest.mark.parametrize(
