@@ -471,5 +471,5 @@ def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> No
 
 
 def test_a_single_environment_has_no_autoreset_mode() -> None:
-    with pytest.raises(ValueError, match="^autoreset_mode is for vector environments[^\n]*$"):
+    with pytest.raises(ValueError, match=r"^autoreset_mode is for vector environments[^\n]*$"):
         gymnasium.make(IDS[2], autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP)
