@@ -81,7 +81,7 @@ def test_sb3_renders_a_window_and_pictures():
     window.reset()
     assert window.render() is window.render("human") is None
     assert pygame.display.get_surface() is not None
-    with pytest.raises(NotImplementedError, match="call .cars.look"):
+    with pytest.raises(NotImplementedError, match=r"call \.cars\.look"):
         window.env_method("look")
     window.close()
     pictures = SB3VecEnv("GridSim/Curved-v0", num_envs=2, maps=1, render_mode="rgb_array")
