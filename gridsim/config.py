@@ -44,7 +44,6 @@ JUNCTION_MARGIN = _F(0.5)  # m past what a lane crosses, until which a car's rea
 
 # How traffic meets the ego car.
 MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
-MEETING_OVER = _F(-4.0)  # m ahead (so behind) from which on the ego car has passed
 SAME_WAY_COSINE = _F(0.3)  # of the angle between headings above which both go the same way, or merge
 FORESIGHT = _F(3.0)  # s for which a car predicts the ego car's motion
 FORESIGHT_STEP = _F(0.25)  # s between predicted positions, at least
@@ -181,6 +180,9 @@ def constants(config: SimConfig) -> Constants:
             raise ValueError(f"{name} must be above 0, not {value}")
     if sensors.rays < 2 or not 0.0 < sensors.field_of_view <= 240.0 or sensors.range > 63.0:
         raise ValueError("the sensor needs 2 rays or more, a field of view within 240 degrees and a range within 63 m")
+    apart = vehicle.length + config.traffic.jam
+    if not min(config.traffic.spawn_gap, config.traffic.spawn_gap_ego) >= apart:
+        raise ValueError(f"spawn_gap and spawn_gap_ego must be a car's length and jam, {apart:g} m, or more")
     if not 0.0 < vehicle.rear_axle < vehicle.wheelbase:
         raise ValueError("the centre of mass must lie between the axles")
     view = math.radians(sensors.field_of_view)

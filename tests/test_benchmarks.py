@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
-#: A script and how it is run here; what `--json` must print.
+#: A script (and its mode) and how it is run here; what `--json` must print.
 RUNS = {
     "peers.py": ([], None),
     "scaling.py": (
@@ -22,21 +22,22 @@ RUNS = {
     "soak.py": (["--generations", "12", "--workers", "1", "--json"], {"growth", "mib_before", "mib_after"}),
     "throughput.py": (["--runs", "1", "--json"], {"rollout_rays", "vector_env_grid", "breed_512x1000_ms"}),
     "traffic.py": (["--hours", "0.01", "--seeds", "1", "--scenario", "curved", "--json"], set()),
+    "traffic.py --ego": (["3", "--seeds", "1", "--scenario", "curved", "--json"], {"curved_off_road"}),
 }  # fmt: skip
 PARTS = {"ceilings.py", "simulation.py"}  # of scaling.py
 
 
 def test_every_script_is_run_here() -> None:
-    assert {"results.py", *RUNS} | PARTS == {path.name for path in FOLDER.glob("*.py")}
+    assert {"results.py", *(run.split()[0] for run in RUNS)} | PARTS == {path.name for path in FOLDER.glob("*.py")}
 
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", RUNS)
 def test_script_runs(name: str, tmp_path: Path) -> None:
     arguments, figures = RUNS[name]
-    done = subprocess.run(
-        [sys.executable, str(FOLDER / name), *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=300
-    )
+    script, *mode = name.split()
+    command = [sys.executable, str(FOLDER / script), *mode, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     # A peer has to be named; and in so few generations memory still grows.
     allowed = {"peers.py": {2}, "soak.py": {0, 1}}.get(name, {0})
     assert done.returncode in allowed, done.stderr

@@ -164,7 +164,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return {**vars(self), "_views": {}, "_window": None}
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | np.integer | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode for every car, or for those of `reset_mask`.
 
@@ -232,13 +232,14 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             info = self._begin_anew(observations, info, ends != 0)
         return observations, rewards, terminations, truncations, info
 
-    def _seed(self, seed: int | Sequence[int | None] | None, which: np.ndarray) -> None:
+    def _seed(self, seed: int | np.integer | Sequence[int | None] | None, which: np.ndarray) -> None:
         """Seed cars `which`, or let them go on to their next episodes."""
         n, episodes = self.num_envs, self._episodes
         seeds: Sequence[int | None]
-        if seed is None or isinstance(seed, int):
-            super().reset(seed=seed)
-            seeds = [None if seed is None else seed + i for i in range(n)]
+        if seed is None or isinstance(seed, (int, np.integer)):
+            first = None if seed is None else int(seed)
+            super().reset(seed=first)
+            seeds = [None if first is None else first + i for i in range(n)]
         else:
             seeds = seed
             if len(seeds) != n or not all(s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in seeds):
@@ -362,6 +363,8 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
     def __init__(
         self, scenario: str = "seamless", *, render_mode: Literal["rgb_array", "human"] | None = None, **options: Any
     ):
+        if "autoreset_mode" in options:
+            raise ValueError("autoreset_mode is for vector environments; a single one is reset by its caller")
         options["autoreset_mode"] = AutoresetMode.DISABLED
         self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
         self.render_mode = render_mode
@@ -381,7 +384,8 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         # may last as long as the wrapper lets it, and `info["end"]` is to tell when time is up.
         maker, simulator = sys._getframe(1), self.cars.simulator
         if maker.f_code is gymnasium.make.__code__:
-            asked = maker.f_locals["max_episode_steps"] or maker.f_locals["env_spec"].max_episode_steps
+            named = maker.f_locals  # in a later Gymnasium perhaps by other names: then the wrapper alone has the limit
+            asked = named.get("max_episode_steps") or getattr(named.get("env_spec"), "max_episode_steps", None)
             if asked is not None and asked > 0:
                 simulator.max_steps = asked
         self._spec = spec and dataclasses.replace(spec, max_episode_steps=simulator.max_steps)

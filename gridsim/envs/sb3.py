@@ -27,10 +27,18 @@ class SB3VecEnv(VecEnv):
         super().__init__(num_envs, self.cars.single_observation_space, self.cars.single_action_space)
 
     def reset(self) -> Any:
-        """Begin an episode of each car; seeds are those of `seed`. Returns: observations."""
+        """Begin an episode of each car, by what `seed` and `set_options` were given since the last one.
+
+        Returns: observations. Raises: ValueError with one line for options that make no sense, or that some cars lack.
+        """
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
-        observations, _ = self.cars.reset(seed=seeds)
+        names = self._options[0].keys()
+        if any(own.keys() != names for own in self._options):
+            raise ValueError("set_options must name the same options for every car")
+        options = {name: [own[name] for own in self._options] for name in names}
+        observations, _ = self.cars.reset(seed=seeds, options=options)
         self._reset_seeds()
+        self._reset_options()
         self._rewards, self._steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=int)
         return observations
 
@@ -76,7 +84,10 @@ class SB3VecEnv(VecEnv):
         setattr(self.cars, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Refuse: there are no environments of one car each. Raises: NotImplementedError."""
+        """Only `render`, which SB3 calls for a window. Raises: NotImplementedError, since no car is an environment."""
+        if method_name == "render":
+            pictures = self.cars.render() or [None] * self.num_envs
+            return [pictures[i] for i in self._get_indices(indices)]
         raise NotImplementedError(f"cars are no environments of their own; call .cars.{method_name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:

@@ -235,7 +235,7 @@ def update_gap(network, drivers, car, other, is_ego):
     right = max(-car[SHIFT], _ZERO)
     if not done:
         near = min(car[HORIZON], car[GAP])  # only obstacles nearer than the nearest so far matter
-        furthest = _F(1e9) if is_ego and meets_ego(network, car, other) else right
+        furthest = _F(1e9) if is_ego and meets_ego(network, drivers, car, other) else right
         at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, furthest)
     if at < car[GAP]:
         car[GAP], car[LEAD_SPEED] = at, along
@@ -393,6 +393,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             best, gain = _I(target), advantage
     if best >= 0:
         along, onward, beyond = car[ALONG], car[NEXT], car[SECOND_NEXT]
+        nearest, lead_speed = car[GAP], car[LEAD_SPEED]
         apart = _lanes_apart(network, lane, along, best)
         car[SHIFT] = -apart if best == network.left[lane] else apart
         car[ALONG] = along / network.steps[lane] * network.steps[best]
@@ -408,6 +409,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             update_gap(network, drivers, car, ego, True)
         if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe:
             car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO
+            car[GAP], car[LEAD_SPEED] = nearest, lead_speed
 
 
 @leaf
@@ -416,7 +418,7 @@ def _move(network, drivers, car, ego):
     before, after = car[SPEED], max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
     car[ALONG] += _HALF * (before + after) * drivers.dt
     car[SPEED] = after
-    place = -room_to_right(network, car) if meets_ego(network, car, ego) else _ZERO
+    place = -room_to_right(network, car) if meets_ego(network, drivers, car, ego) else _ZERO
     shift = car[SHIFT]
     if shift != place or car[SWAY] != _ZERO:
         way = _HALF * (before + after) * drivers.dt

@@ -13,7 +13,6 @@ from gridsim.config import (
     FORESIGHT,
     FORESIGHT_STEP,
     MEETING_DISTANCE,
-    MEETING_OVER,
     SAME_WAY_COSINE,
 )
 from gridsim.jit import leaf, njit
@@ -32,13 +31,14 @@ def is_there(ego):
 
 
 @leaf
-def meets_ego(network, car, ego):
-    """Whether the ego car is near, ahead, and oncoming or crossing, or was when the car moved over for it."""
+def meets_ego(network, drivers, car, ego):
+    """Whether the ego car is near, not a length behind, and oncoming or crossing, or was when the car moved over."""
     same_way = car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO
     if same_way or not is_there(ego):
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
-    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > MEETING_OVER
+    behind = _F(-2.0) * drivers.half_length
+    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > behind
 
 
 @leaf

@@ -11,6 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from gridsim.envs import sb3
+from gridsim.envs.env import RENDER_SIZE
 from gridsim.envs.sb3 import SB3VecEnv
 
 
@@ -47,6 +48,49 @@ def test_its_learners_learn_on_rays_and_pictures():
     assert DQN("MlpPolicy", few, buffer_size=1000, learning_starts=50).learn(200).num_timesteps >= 200
     pictures = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="image")
     assert PPO("CnnPolicy", pictures, n_steps=8, batch_size=16, n_epochs=1).learn(64).num_timesteps == 64
+    grids = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="grid", frames=2, max_episode_steps=5)
+    assert PPO("MultiInputPolicy", grids, n_steps=8, batch_size=16, n_epochs=1).learn(64).num_timesteps == 64
+    few = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="grid", max_episode_steps=5)
+    assert DQN("MultiInputPolicy", few, buffer_size=100, learning_starts=50).learn(80).num_timesteps >= 80
+
+
+def test_options_are_the_next_resets():
+    cars = SB3VecEnv("GridSim/Curved-v0", num_envs=2, maps=1)
+    own = gymnasium.make_vec("GridSim/Curved-v0", 2, maps=1)
+    for options, theirs in (
+        ({"map_seed": 1}, {"map_seed": 1}),
+        ([{"map_seed": 1}, {"map_seed": 2}], {"map_seed": [1, 2]}),
+        ({}, {}),
+    ):
+        cars.seed(3)
+        cars.set_options(options)
+        np.testing.assert_array_equal(cars.reset(), own.reset(seed=3, options=theirs)[0])
+        cars.seed(3)
+        np.testing.assert_array_equal(cars.reset(), own.reset(seed=3)[0])  # they are used once
+    for wrong in ([{"map_seed": 1}, {}], {"map": 1}):
+        cars.set_options(wrong)
+        with pytest.raises(ValueError, match=r"^[^\n]*option[^\n]*$"):
+            cars.reset()
+
+
+@pytest.mark.usefixtures("dummy")
+def test_sb3_renders_a_window_and_pictures():
+    import pygame
+
+    window = SB3VecEnv("GridSim/Curved-v0", num_envs=2, maps=1, render_mode="human")
+    window.reset()
+    assert window.render() is window.render("human") is None
+    assert pygame.display.get_surface() is not None
+    with pytest.raises(NotImplementedError, match=r"call \.cars\.look"):
+        window.env_method("look")
+    window.close()
+    pictures = SB3VecEnv("GridSim/Curved-v0", num_envs=2, maps=1, render_mode="rgb_array")
+    pictures.reset()
+    both = pictures.get_images()
+    np.testing.assert_array_equal(pictures.env_method("render", indices=1), both[1:])
+    shown = pictures.render()
+    assert shown is not None
+    assert shown.shape == (2 * RENDER_SIZE[1], RENDER_SIZE[0], 3)
 
 
 def test_the_modules_example_runs():

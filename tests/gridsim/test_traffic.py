@@ -23,6 +23,7 @@ from gridsim.traffic.behaviour import drivers, flow, idm
 from gridsim.traffic.world import (
     ALONG,
     COS,
+    DRAWS,
     FIELDS,
     JUNCTION_BEHIND,
     LANE,
@@ -122,7 +123,7 @@ def _watch(network, drivers, constants, world, ego, steps, history):
                 if world[i, LANE] >= 0.0 and world[j, LANE] >= 0.0:
                     dx = wrapped(world[j, X] - world[i, X], network.width)
                     dy = wrapped(world[j, Y] - world[i, Y], network.height)
-                    if abs(dx) + abs(dy) < 8.0 and boxes_touch(
+                    if dx * dx + dy * dy < constants.contact * constants.contact and boxes_touch(
                         constants, dx, dy, world[i, COS], world[i, SIN], world[j, COS], world[j, SIN]
                     ):
                         overlaps += 1
@@ -217,23 +218,26 @@ def narrow():
     return network_of(paths, 1024.0, 64.0, 8.5, beside=lambda points: 4.0 - np.abs(points[:, 1] - 32.0))
 
 
+@pytest.mark.parametrize("length", [4.0, 6.0])
 @pytest.mark.parametrize("lane", [0, 1])
-def test_who_meets_the_ego_car_keeps_to_the_right_and_passes(narrow, lane):
+def test_who_meets_the_ego_car_keeps_to_the_right_and_passes(narrow, lane, length):
     """The ego car comes along the middle of the road, on a car's own half."""
+    config = SimConfig(vehicle=VehicleConfig(length=length))
+    others, k = drivers(config), constants(config)
     world = cars_on(narrow, (lane, 400.0, 8.0, 1.0))
     ahead = 1.0 - 2.0 * lane
     car = ego(world[0, X] + 80.0 * ahead, 32.0, math.pi * (1 - lane), 6.0)
     right, speeds = [], []
     for _ in range(300):
-        flow(narrow, D, world, car)
+        flow(narrow, others, world, car)
         car[X] -= 6.0 * DT * ahead
         dx = wrapped(F(car[X] - world[0, X]), narrow.width)
-        assert not boxes_touch(K, dx, car[Y] - world[0, Y], world[0, COS], world[0, SIN], car[COS], car[SIN])
+        assert not boxes_touch(k, dx, car[Y] - world[0, Y], world[0, COS], world[0, SIN], car[COS], car[SIN])
         right.append((abs(float(world[0, Y]) - 32.0) - 1.75, abs(dx)))
         speeds.append(world[0, SPEED])
     aside, apart = np.array(right).T
     assert aside[apart > 36.0] == pytest.approx(0.0, abs=0.2)
-    assert aside[apart < CONFIG.vehicle.length] == pytest.approx(CONFIG.traffic.give_way, abs=1e-3)
+    assert aside[apart < length] == pytest.approx(CONFIG.traffic.give_way, abs=1e-3)
     assert aside[-1] == 0.0
     assert min(speeds) > 7.0  # no car has to wait
     assert np.abs(np.diff(aside)).max() < CONFIG.traffic.lane_change_speed * DT + 1e-3
@@ -391,21 +395,43 @@ def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
     assert world[1, LANE] == 0
 
 
-@pytest.mark.parametrize(("scenario", "width"), [*((name, 2.0) for name in REGISTRY), ("city", 2.2), ("seamless", 3.0)])
-def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario, width):
+def test_a_change_that_is_refused_leaves_no_trace(abreast):
+    """Moving over, it would touch the car ahead: it is as if its turn to decide had not come."""
+    world = cars_on(abreast, (1, 212.0, 0.0, 0.4), (1, 200.0, 15.0, 1.0))
+    world[:, LANE_TIMER] = 9.0
+    asked = world.copy()
+    asked[1, LANE_TIMER] = 0.0
+    flow(abreast, D, world, NOBODY)
+    flow(abreast, D, asked, NOBODY)
+    assert asked[1, DRAWS] == world[1, DRAWS] + 2  # it was about to change
+    same = np.setdiff1d(np.arange(FIELDS), [DRAWS, LANE_TIMER])
+    np.testing.assert_array_equal(asked[:, same], world[:, same])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "length", "width"),
+    [
+        *((name, *size) for name in REGISTRY for size in ((4.0, 2.0), (6.0, 2.2))),
+        ("city", 4.0, 2.2),
+        ("seamless", 4.0, 3.0),
+    ],
+)
+def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario, length, width):
     """Six starts among 24 cars, two minutes each; on the highway cars behind it change lanes."""
-    config = SimConfig(vehicle=VehicleConfig(width=width))
+    config = SimConfig(vehicle=VehicleConfig(length=length, width=width))
+    k = constants(config)
     for seed in (3, 5, 6, 8, 10, 12):
         here = build(scenario, HELD_OUT_SEED + seed, config)
         start = sample_starts(here, 1, np.random.default_rng(seed))
         world = spawn(here.network, start, 24, np.array([seed], dtype=np.uint64), config)[0]
-        stands = ego(start[0, 0] % here.network.width, start[0, 1] % here.network.height, start[0, 2])
+        sides = np.array([here.network.width, here.network.height])
+        stands = ego(*start[0, :2] % sides, start[0, 2])
         history = watch(here.network, world, 120, stands, config)
         cars = history[history[..., LANE] >= 0]
-        dx, dy = stands[X] - cars[:, X], stands[Y] - cars[:, Y]
-        for near in cars[dx**2 + dy**2 < 36.0]:
-            away = stands[[X, Y]] - near[[X, Y]]
-            assert not boxes_touch(constants(config), *away, near[COS], near[SIN], stands[COS], stands[SIN])
+        away = (stands[[X, Y]] - cars[:, [X, Y]] + sides / 2) % sides - sides / 2
+        close = np.hypot(*away.T) < k.contact
+        for near, between in zip(cars[close], away[close], strict=True):
+            assert not boxes_touch(k, *between, near[COS], near[SIN], stands[COS], stands[SIN])
         poses = np.column_stack([cars[:, X], cars[:, Y], np.arctan2(cars[:, SIN], cars[:, COS])])
         assert not crashes(here.road, poses, config).any()
 

@@ -167,6 +167,7 @@ def test_the_heading_stays_a_unit_vector():
         SimConfig(sensors=SensorConfig(field_of_view=361.0)),
         SimConfig(sensors=SensorConfig(range=0.0)),
         SimConfig(episode=EpisodeConfig(control_period=0.0)),
+        SimConfig(vehicle=VehicleConfig(length=12.5)),  # longer than the gaps at the start of an episode
     ],
 )
 def test_numbers_that_make_no_sense_are_refused_in_one_line(config):
