@@ -6,7 +6,7 @@ in DIR as a JSON file for each command; it is measured again only after a change
 interrupted measurement goes on where it was. --write puts the tables of which all rows are there into docs/results.md,
 with the commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, other, speed, comparison; all by default, in an hour and a half on two cores.
+Tables: seeds, roads, other, speed, learners, comparison; all by default, in an hour and a half on two cores.
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
         **alone("gridsim-evolve --recombination two", "gridsim-evolve --scenario curved --observation grid"),
     },
     "speed": alone("benchmarks/throughput.py --json", "benchmarks/scaling.py --json"),
+    "learners": alone("benchmarks/learners.py --json"),
     "comparison": alone("gridsim-compare --learners evolution dqn --seeds 5"),
 }
 HEAD = (
@@ -220,9 +221,9 @@ def commit() -> str:
 
 def quick() -> dict[str, dict[str, list[str]]]:
     """The first command of each table, on a small scale."""
-    small = {"gridsim-evolve": "--car-steps 1000", "gridsim-compare": "--quick"}
+    small = {"benchmarks/throughput.py": "--runs 1", "gridsim-evolve": "--car-steps 1000"}
     firsts = {table: next(iter(rows.values()))[0] for table, rows in TABLES.items()}
-    return {table: alone(f"{first} {small.get(first.split()[0], '--runs 1')}") for table, first in firsts.items()}
+    return {table: alone(f"{first} {small.get(first.split()[0], '--quick')}") for table, first in firsts.items()}
 
 
 def main() -> None:

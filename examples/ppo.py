@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -19,8 +20,8 @@ from torch import nn
 
 import gridsim  # noqa: F401, registers the environments
 
-CARS, STEPS = 1024, 32  # of a batch
-EPOCHS, MINIBATCH = 4, 8192
+STEPS = 32  # of each car, in a batch
+EPOCHS, MINIBATCHES = 4, 4
 LEARNING_RATE, DISCOUNT, LAMBDA = 1e-3, 0.99, 0.95
 CLIP, ENTROPY, VALUE = 0.2, 0.003, 0.5
 
@@ -44,14 +45,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="curved", help="curved, seamless, highway, roundabout or city")
     parser.add_argument("--traffic", type=int, default=0, help="other cars")
+    parser.add_argument("--cars", type=int, default=1024, help="that drive at once")
     parser.add_argument("--minutes", type=float, default=3.0, help="how long to learn")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
+    cars = options.cars
     torch.manual_seed(options.seed)
     torch.set_num_threads(1)  # for networks as small as these, threads cost more than they gain
 
-    env = gymnasium.make_vec(
-        f"GridSim/{options.scenario.capitalize()}-v0", num_envs=CARS, steering=True, traffic=options.traffic,
+    env: Any = gymnasium.make_vec(
+        f"GridSim/{options.scenario.capitalize()}-v0", num_envs=cars, steering=True, traffic=options.traffic,
         autoreset_mode=AutoresetMode.SAME_STEP,
     )  # fmt: skip
     inputs, actions = env.single_observation_space.shape[0], env.single_action_space.n
@@ -65,9 +68,9 @@ def main() -> None:
         optimiser.param_groups[0]["lr"] = LEARNING_RATE * (1.0 - share)
 
         # Collect a batch.
-        o_t = torch.empty(STEPS, CARS, inputs)
-        a_t = torch.empty(STEPS, CARS, dtype=torch.long)
-        logp_t, r_t, v_t, go_on_t, v_after_t = (torch.zeros(STEPS, CARS) for _ in range(5))
+        o_t = torch.empty(STEPS, cars, inputs)
+        a_t = torch.empty(STEPS, cars, dtype=torch.long)
+        logp_t, r_t, v_t, go_on_t, v_after_t = (torch.zeros(STEPS, cars) for _ in range(5))
         with torch.no_grad():
             for t in range(STEPS):
                 o_t[t] = torch.as_tensor(observation)
@@ -82,19 +85,19 @@ def main() -> None:
                 over = terminated | truncated
                 if over.any():
                     succeeded += info["final_info"]["is_success"][over].tolist()
-            advantage, ahead = torch.empty(STEPS, CARS), torch.zeros(CARS)
+            advantage, ahead = torch.empty(STEPS, cars), torch.zeros(cars)
             v_tp1 = critic(torch.as_tensor(observation)).squeeze(-1)
             for t in reversed(range(STEPS)):
                 delta = r_t[t] + DISCOUNT * (go_on_t[t] * v_tp1 + v_after_t[t]) - v_t[t]
                 advantage[t] = ahead = delta + DISCOUNT * LAMBDA * go_on_t[t] * ahead
                 v_tp1 = v_t[t]
-        car_steps += STEPS * CARS
+        car_steps += STEPS * cars
 
         # Learn from it.
         o, a, logp, adv = o_t.flatten(0, 1), a_t.flatten(), logp_t.flatten(), advantage.flatten()
         returns = adv + v_t.flatten()
         for _ in range(EPOCHS):
-            for chosen in torch.randperm(STEPS * CARS).split(MINIBATCH):
+            for chosen in torch.randperm(STEPS * cars).split(STEPS * cars // MINIBATCHES):
                 policy = torch.distributions.Categorical(logits=actor(o[chosen]))
                 ratio = (policy.log_prob(a[chosen]) - logp[chosen]).exp()
                 gain = (adv[chosen] - adv[chosen].mean()) / (adv[chosen].std() + 1e-8)
@@ -105,7 +108,7 @@ def main() -> None:
                 loss.backward()
                 nn.utils.clip_grad_norm_(parameters, 0.5)
                 optimiser.step()
-        latest = succeeded[-CARS:]
+        latest = succeeded[-cars:]
         print(
             f"{car_steps / 1e6:6.2f} million car-steps  {car_steps / (time.perf_counter() - started):9,.0f} a second  "
             f"reward {r_t.mean():6.3f}  success of the last {len(latest)} episodes {np.mean(latest or [0]):6.1%}",

@@ -10,6 +10,10 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 #: A script (and its mode) and how it is run here; what `--json` must print.
 RUNS = {
+    "learners.py": (
+        ["--quick", "--json"],
+        {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},
+    ),
     "peers.py": ([], None),
     "scaling.py": (
         ["--quick", "--json"],

@@ -1,4 +1,4 @@
-"""Every command of README.md's code blocks is run by a test: here with small arguments, or where `ELSEWHERE` says."""
+"""What the pages show runs: README.md's commands, small ones here and others `ELSEWHERE`, and all Python examples."""
 
 import re
 import subprocess
@@ -38,23 +38,54 @@ ELSEWHERE = {
     "ray start --address <first>:6379": "tests/conftest.py::node",
     "gridsim-evolve --address auto": "tests/cluster/test_cluster.py::test_a_cable_out_for_10_s",
 }
+# What makes the Python examples of README.md and docs/ small, and names runs that are there.
+IN_PYTHON = {
+    "<name>": "first",
+    "<other>": "other",
+    "gridsim-seamless": "gridsim-curved",
+    "workers=2": "workers=0",
+    "generations=20": "generations=1, population=16",
+    "episodes=64": "episodes=4",
+    "num_envs=1024": "num_envs=8",
+    "num_envs=256": "num_envs=8",
+    "batch_size=4096": "batch_size=64",
+    "1_000_000": "512",
+    "popsize=100": "popsize=4",
+    ".run(50)": ".run(1)",
+}
 
 
-def commands(readme: str) -> set[str]:
+def code(page: Path, language: str) -> str:
+    """All of its blocks in a language."""
+    return "\n".join(re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL))
+
+
+def commands(readme: Path) -> set[str]:
     """The lines of its shell blocks, without comments."""
-    lines = "\n".join(re.findall(r"```sh\n(.*?)```", readme, flags=re.DOTALL)).splitlines()
+    lines = code(readme, "sh").splitlines()
     return {line.partition("#")[0].strip() for line in lines} - {""}
 
 
+def examples(root: Path) -> dict[str, str]:
+    """Of each page with Python its blocks, as one program: later ones use earlier names."""
+    pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    return {page.name: text for page in pages if (text := code(page, "python"))}
+
+
 def test_every_command_of_the_readme_is_run_by_a_test(root: Path) -> None:
-    assert commands((root / "README.md").read_text(encoding="utf-8")) == {*HERE, *ELSEWHERE}
+    assert commands(root / "README.md") == {*HERE, *ELSEWHERE}
     for test in ELSEWHERE.values():
         file, name = test.split("::")
         assert re.search(rf"def {name}", (root / file).read_text(encoding="utf-8")), test
 
 
+def test_what_makes_examples_small_is_in_some_page(root: Path) -> None:
+    everything = "".join(examples(root).values())
+    assert [text for text in IN_PYTHON if text not in everything] == []
+
+
 @pytest.mark.e2e
-def test_the_commands_of_the_readme_run(root: Path, tmp_path: Path) -> None:
+def test_the_commands_of_the_readme_run_and_then_the_examples_of_all_pages(root: Path, tmp_path: Path) -> None:
     make = f"make -f {root}/Makefile -o {sys.prefix}/.installed VENV={sys.prefix} "
     for command, small in HERE.items():
         line = command.replace("<name>", "first").replace("<other>", "other").replace(".venv/bin", str(BIN))
@@ -64,3 +95,9 @@ def test_the_commands_of_the_readme_run(root: Path, tmp_path: Path) -> None:
             line = f"{line} {small}"
         done = subprocess.run(line, shell=True, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    for page, program in examples(root).items():
+        for text, small in IN_PYTHON.items():
+            program = program.replace(text, small)
+        python = [sys.executable, "-c", program]
+        done = subprocess.run(python, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, f"{page}\n{done.stdout}\n{done.stderr}"
