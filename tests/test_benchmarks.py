@@ -10,6 +10,7 @@ import pytest
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 #: A script (and its mode) and how it is run here; what `--json` must print.
 RUNS = {
+    "ablations.py": (["as it is", "--seeds", "1", "--millions", "0.05"], None),
     "learners.py": (
         ["--quick", "--json"],
         {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},
