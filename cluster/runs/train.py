@@ -41,7 +41,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
 
-ELITES_SHOWN = 12  # on the page, beside the champion
+ELITES_SHOWN = 24  # on the page, beside the champion, at most; the earlier, the denser: there one sees learning
 NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
@@ -322,7 +322,7 @@ class Session:
         title = f"{label(settings.scenario)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
         pictures.trajectory(road_map, drive.cars, path / "trajectory.png", title)
         shown = [page.Shown("champion", "champion", drive)]
-        for k in np.unique(np.linspace(0, learning.steps - 1, ELITES_SHOWN).astype(int))[::-1].tolist():
+        for k in (np.unique(np.geomspace(1, learning.steps, ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():
             elite = dataclasses.replace(champion, genome=learning.elites[k])
             drive = film.record(elite, road_map, start, learning.sim.episode.time_limit, world)
             shown.insert(0, page.Shown(f"elite of {learning.step_name} {k}", str(k), drive, stride=2))
