@@ -114,7 +114,10 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     given: dict[str, Any] = {} if default is None else {"default": default}
     asked: type = kind
     if groups := getattr(kind, "groups", None):  # a field for each, which --help shows by itself
-        shown = [(name, part, field(default=select(part, default or kind()))) for name, part in groups.items()]
+        # Without a default: that of settings is resolved, as a policy is by the traffic, before flags are known.
+        shown: list[Any] = list(groups.items())
+        if default is not None:
+            shown = [(name, part, field(default=select(part, default))) for name, part in shown]
         asked, given = dataclasses.make_dataclass(kind.__name__, shown), {}
     printed = io.StringIO()
     # Without a terminal tyro draws no box and uses no colours: its error is read below.

@@ -60,6 +60,11 @@ def test_help_has_an_example_and_says_in_words_what_happens_by_default(prog, mon
     assert {name for name, default in defaults.items() if default in ("-1", "0", "0.0", "''", "None")} <= {"seed"}
 
 
+def test_what_is_not_given_follows_from_what_is():
+    flags = parse(EvolveFlags, "gridsim-evolve", ["--traffic", "2", "--generations", "5"])
+    assert (flags.policy, flags.population, flags.car_steps) == ("mlp:64+motion+steering", 128, 0)
+
+
 def refused(prog, line, capsys):
     with pytest.raises(SystemExit) as ended:
         parse(FLAGS[prog], prog, shlex.split(line))
