@@ -156,7 +156,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     assert said[0].startswith(
         f"gridsim-evolve: error: there has been no worker for {PATIENCE_S} s (--patience): Ray has"
     )
-    assert err.splitlines()[1:] == [f"continue with: {BIN}/gridsim-evolve --resume runs/h"]
+    assert said[1:] == [f"continue with: {BIN}/gridsim-evolve --resume runs/h"]
     done = finish("gridsim-evolve", "--workers", "0", "--resume", "runs/h", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert same_run(run, reference)
