@@ -113,8 +113,8 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone, tyro.conf.OmitArgPrefixes)
     given: dict[str, Any] = {} if default is None else {"default": default}
     asked: type = kind
-    if groups := getattr(kind, "groups", None):  # a field for each, which --help shows by itself
-        # Without a default: that of settings is resolved, as a policy is by the traffic, before flags are known.
+    if groups := getattr(kind, "groups", None):  # tyro shows each field of this type as a group
+        # A new run's groups have no default: in settings made before the flags are known, the policy is chosen already.
         shown: list[Any] = list(groups.items())
         if default is not None:
             shown = [(name, part, field(default=select(part, default))) for name, part in shown]

@@ -158,8 +158,8 @@ class EvolveSettings(RunSettings):
     counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
 
     policy: Annotated[str, IN_WORDS] = ""
-    """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the
-    cars that rays hit approach, +steering to see its own steering angle; by default mlp:64+steering, in traffic
+    """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
+    +steering to see its own steering angle; by default mlp:64+steering, in traffic
     mlp:64+motion+steering (the paper's is mlp:6,7). On the grid cnn: with the channels of two convolutions, the units
     of a dense layer and the number of frames, by default cnn:8,16,32@1."""
     population: Annotated[int, IN_WORDS] = 0
