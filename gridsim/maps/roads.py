@@ -208,12 +208,8 @@ def _ray_starts(nodes, row_of, ray_range):
     Returns: ranges as bytes [table's rows, HEADING_BINS].
     """
     k, scale = CELLS_PER_M // START_CELLS_PER_M, _F(CELLS_PER_M)
-    columns, mask_x, mask_y, flat = (
-        _I(nodes.shape[1]),
-        _I(nodes.shape[1] - 1),
-        _I(nodes.shape[0] - 1),
-        nodes.reshape(-1),
-    )
+    columns, flat = _I(nodes.shape[1]), nodes.reshape(-1)
+    mask_x, mask_y = _I(nodes.shape[1] - 1), _I(nodes.shape[0] - 1)
     radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
     spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
     margin = _F(0.2)  # m; the march ends below it

@@ -171,6 +171,7 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
             (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
             (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
             (0 <= traffic <= MAX_TRAFFIC, f"traffic must be 0 to {MAX_TRAFFIC} cars"),
+            (0 <= seed < 1 << 63, "map_seed must be 0 or more, and fit 63 bits"),
             (len(roads) == 1, "traffic, scenario and map_seed must be the same in all rows"),
         ):
             if not fits:

@@ -113,6 +113,7 @@ DAMAGES = {
     "not a number": (lambda text: _edit(text, 3, "x_m", "nan"), "line 5: "),
     "action 8": (lambda text: _edit(text, 3, "action", "8"), "action must be 0 to 7"),
     "skipped episode": (lambda text: _edit(text, 3, "episode", "2"), "episode"),
+    "a seed of 64 bits": (lambda text: _edit(text, 0, "map_seed", str(1 << 63)), "map_seed must be"),
     "two maps": (lambda text: _edit(text, 3, "map_seed", "4"), "same in all rows"),
     "unknown scenario": (lambda text: text.replace("seamless", "moon"), "unknown scenario"),
     "no text": (lambda text: b"\xff\xfe\x00binary", "can't decode"),
