@@ -41,7 +41,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
 
-ELITES_SHOWN = 24  # on the page, beside the champion, at most; the earlier, the denser: there one sees learning
+ELITES_SHOWN = 24  # on the page beside the champion, at most; most of them early ones, which show the learning
 NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
 
 
@@ -163,7 +163,7 @@ def train(
                 if lost := session.tracker.close(status):
                     reporter.unsent(lost, status == "FINISHED")
                 else:
-                    session.tell_of_mlflow()
+                    session.report_outage()
 
 
 @contextlib.contextmanager
@@ -222,7 +222,7 @@ class Session:
     _state: State = field(init=False)  # after the last whole step
     _saved_steps: int = 0  # steps that are in the folder
     _saved_at: float = -math.inf
-    _away: bool = False  # whether MLflow is, and that was told
+    _away: bool = False  # whether an outage of MLflow was reported
 
     def __post_init__(self) -> None:
         self.learning = learning = new_learning(self.run.settings, self.pool, self.maps, self.initial)
@@ -253,19 +253,19 @@ class Session:
                 learning.add_wall_clock(row, self._wall_s(), learning.history[-2] if learning.steps > 1 else None)
                 self._state = learning.state()
                 self.reporter.row(learning.steps, row)
-                self.tell_of_mlflow()
+                self.report_outage()
             self.save()
         except BaseException:
             self.save()
             raise
 
-    def tell_of_mlflow(self) -> None:
-        """Say in one line that MLflow is away, and in another one that it is back."""
+    def report_outage(self) -> None:
+        """Warn once when MLflow cannot be reached, and once when it is back."""
         error, where = self.tracker.error, shown(self.tracker.uri)
         if error and not self._away:
-            self.reporter.warn(f"MLflow at {where} takes nothing for now: {error}; the run goes on, and sends it later")
+            self.reporter.warn(f"MLflow at {where} cannot be used: {error}; the run continues and sends its rows later")
         elif self._away and not error:
-            self.reporter.warn(f"MLflow at {where} is back, and has what it missed")
+            self.reporter.warn(f"MLflow at {where} is back, and has all rows")
         self._away = bool(error)
 
     def _wall_s(self) -> float:

@@ -278,7 +278,7 @@ def _note_tags(text: str) -> dict[str, str]:
 
 def preload() -> None:
     """Import what `write_model` needs, which takes three seconds, so that a run's end need not wait for it."""
-    with contextlib.suppress(Exception):  # `write_model` meets it again
+    with contextlib.suppress(Exception):  # `write_model` raises it again
         import mlflow.pytorch  # noqa: F401
         import torch._dynamo  # noqa: F401  # as torch.export does when it is called
 

@@ -144,7 +144,7 @@ class RayPool(WorkerPool):
 
         try:
             self._share_out(task, recipes, asked, call, on_progress, meanwhile)
-        except ray.exceptions.RayError as error:  # Ray itself is in trouble: a worker's end is seen to where it shows
+        except ray.exceptions.RayError as error:  # Ray itself failed; deaths of workers are handled above
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
         self._measure(task, asked, call)
         call.wall_s = time.perf_counter() - started

@@ -152,7 +152,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
             os.killpg(process.pid, signal.SIGKILL)
     assert process.returncode == 1
     assert answers(address), "the run left, the cluster stays"
-    # A worker that its host took along may first be told of as one that does not answer.
+    # The dead host's worker may first be reported as silent.
     said = [line for line in err.splitlines() if "a worker did not answer for" not in line]
     assert said[0].startswith(
         f"gridsim-evolve: error: there has been no worker for {PATIENCE_S} s (--patience): Ray has"

@@ -110,13 +110,13 @@ def check_complete(served, name):
 
 def away(served):
     """What a run says while its server is away, if it gets to it."""
-    return rf"{COMMAND}: warning: MLflow at {served.uri} takes nothing for now: [^\n]*, and sends it later\n"
+    return rf"{COMMAND}: warning: MLflow at {served.uri} cannot be used: [^\n]* and sends its rows later\n"
 
 
 def test_a_run_outlives_an_outage_and_loses_nothing(served):
     _out, err = served.said["during"]
     assert served.codes["during"] == 0
-    assert re.fullmatch(rf"({away(served)}[^\n]* is back, and has what it missed\n)?", err)
+    assert re.fullmatch(rf"({away(served)}[^\n]* is back, and has all rows\n)?", err)
     run = check_complete(served, "during")
     assert len({summary(served.cwd / "runs" / name)["champion_sha256"] for name in ("during", "after")}) == 1
     assert run.info.run_name == "during"

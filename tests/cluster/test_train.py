@@ -117,5 +117,5 @@ def test_an_outage_of_mlflow_is_told_of_once_and_its_end(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "make_tracker", lambda *_, **__: Tracker())
     settings, notes = dataclasses.replace(SETTINGS, generations=5), Notes()
     train.train(new_run(tmp_path, "r", settings), train.Workers(0, None, 0.0), "", "driving", notes)
-    away = "MLflow at http://host takes nothing for now: refused; the run goes on, and sends it later"
-    assert notes.told == [(2, away), (4, "MLflow at http://host is back, and has what it missed")]
+    away = "MLflow at http://host cannot be used: refused; the run continues and sends its rows later"
+    assert notes.told == [(2, away), (4, "MLflow at http://host is back, and has all rows")]
