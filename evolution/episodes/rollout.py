@@ -33,7 +33,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import Road, freeze
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.sensing.rays import SIMD_RAYS, fan
+from gridsim.sensing.rays import fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
@@ -110,7 +110,6 @@ class Workspace(NamedTuple):
 
     car: np.ndarray  # float32 [FIELDS]
     visits: np.ndarray  # float32 [cells]
-    beams: np.ndarray  # float32 [3, SIMD_RAYS]
     ranges: np.ndarray  # float32 [rays]
     scratch: np.ndarray  # float32, of the network
     ring: np.ndarray  # float32 [n, FIELDS], the last n states: that of step k in row k % n
@@ -138,7 +137,6 @@ def make_workspace(simulation, layers, rows, cars):
     return Workspace(
         np.empty(FIELDS, dtype=np.float32),
         np.empty(visit_cells(simulation.road), dtype=np.float32),
-        np.empty((3, SIMD_RAYS), dtype=np.float32),
         np.empty(simulation.rays, dtype=np.float32),
         np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, FIELDS), dtype=np.float32),
@@ -163,7 +161,7 @@ class Recorder(NamedTuple):
 @leaf
 def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
-    look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.beams, workspace.ranges, closing)
+    look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.ranges, closing)
     if grid_buffers is None:
         encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
     else:

@@ -297,8 +297,9 @@ def forward(packed, layers, scratch):
             bias = at + unit
             _dense_8(scratch, source, 0, 1, 0, 1, 0, n, packed, bias + width, width, bias, scratch, target + unit, 0)
         if k < last:
-            for j in range(width):
-                scratch[target + j] = squash(scratch[target + j])
+            first = _U(target)  # unsigned: a check whether an index is negative would prevent vectorisation
+            for j in range(_U(width)):
+                scratch[first + j] = squash(scratch[first + j])
         at += (n + 1) * width
         source = target
     return source

@@ -117,7 +117,7 @@ def start_from(car, start):
 
 
 @leaf
-def look(road, constants, fan, car, world, beams, ranges, closing):
+def look(road, constants, fan, car, world, ranges, closing):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
     Here and below, a world of None means no traffic: Numba then leaves the traffic code out. closing is as in
@@ -125,7 +125,7 @@ def look(road, constants, fan, car, world, beams, ranges, closing):
     """
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
-    sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], beams, ranges)
+    sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], ranges)
     if world is not None:
         velocity = (_ZERO, _ZERO)
         if closing is not None:

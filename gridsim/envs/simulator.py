@@ -16,7 +16,7 @@ from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.rays import SIMD_RAYS, fan
+from gridsim.sensing.rays import fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 from gridsim.traffic.world import spawn
@@ -46,14 +46,13 @@ class State(NamedTuple):
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
-    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
         road = road_of(physics.atlas, row)
         for k in order[first:last]:
             i = which[k]
             world = None if worlds is None else worlds[i]
             place(road, starts[k], cars[i], visits[i])
-            look(road, physics.constants, physics.fan, cars[i], world, beams, ranges[k], closing[i])
+            look(road, physics.constants, physics.fan, cars[i], world, ranges[k], closing[i])
 
 
 @njit(nogil=True)
@@ -65,7 +64,6 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
     """
     constants, drivers = physics.constants, physics.drivers
     ranges, closing, speeds, progress = seen
-    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     for row, first, last in runs:
         road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
         for i in order[first:last]:
@@ -82,7 +80,7 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                     flow(network, drivers, world, car)
                 ends[i] = control(road, constants, car, visits[i], world, acceleration, steering, target, max_steps)
             progress[i] = car[DISTANCE] - before
-            look(road, constants, physics.fan, car, world, beams, ranges[i], closing[i])
+            look(road, constants, physics.fan, car, world, ranges[i], closing[i])
             speeds[i] = car[SPEED]
 
 
@@ -272,11 +270,10 @@ def views(
     """
     k = constants(config)
     rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    beams = np.empty((3, SIMD_RAYS), dtype=np.float32)
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     closing = np.zeros_like(ranges)
     for car, world, seen, speeds in zip(cars, worlds, ranges, closing, strict=True):
-        look(scenario.road, k, rays, car, world, beams, seen, speeds)
+        look(scenario.road, k, rays, car, world, seen, speeds)
     return ranges, closing
 
 

@@ -19,7 +19,7 @@ from gridsim.jit import leaf
 from gridsim.maps.roads import CELLS_PER_M, HEADING_BINS, HEADING_WRAP, START_CELLS_PER_M, START_UNITS
 from gridsim.sensing.simd import AMONG_THIN_WALLS, PLAIN, SIMD_RAYS, vector_march
 
-_F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
+_F, _I, _U = np.float32, np.int32, np.uint32
 _SCALE = _F(CELLS_PER_M)
 _BINS_PER_RADIAN = _F(HEADING_BINS / (2.0 * math.pi))
 _PER_START = _U(CELLS_PER_M // START_CELLS_PER_M)
@@ -41,11 +41,10 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
 
 
 @leaf
-def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
+def sense(road, fan, first, reach, x, y, cosine, sine, ranges):
     """Ranges of all rays from a point, in m.
 
-    Args: fan of `fan()`, first ray's angle from the heading (rad), reach m, position m, heading as cosine and sine;
-    beams float32 [3, SIMD_RAYS], overwritten.
+    Args: fan of `fan()`, first ray's angle from the heading (rad), reach m, position m, heading as cosine and sine.
     Writes: ranges float32 [rays], in [0, reach].
     """
     px0, py0 = x * _SCALE, y * _SCALE
@@ -59,20 +58,12 @@ def sense(road, fan, first, reach, x, y, cosine, sine, beams, ranges):
     bin0 -= math.floor(bin0 * _F(1.0 / HEADING_BINS)) * _F(HEADING_BINS)
     base = max(row, _I(0)) * _STRIDE
     known = _F(1.0 / START_UNITS) if row >= 0 else _F(0.0)
-    rays = ranges.shape[0]
-    # Unsigned indices: Numba's check whether signed ones are negative would prevent vectorisation.
-    zero, one, two, lanes = _N(0), _N(1), _N(2), _N(SIMD_RAYS)
     for block in range(0, fan.shape[1], SIMD_RAYS):
-        at = _N(block)
-        for r in range(lanes):
-            beams[zero, r] = cosine * fan[zero, at + r] - sine * fan[one, at + r]
-        for r in range(lanes):
-            beams[one, r] = sine * fan[zero, at + r] + cosine * fan[one, at + r]
-        for r in range(lanes):
-            beams[two, r] = _F(road.start[_N(base) + _N(_I(bin0 + fan[two, at + r]))]) * known
-        if road.thin:
-            _march_among_thin_walls(road.field, columns, road.rows, px0, py0, reach, beams)
+        # fmt: off
+        if road.thin:  # two calls, because a variable that holds either function would not be inlined
+            _march_among_thin_walls(road.field, columns, road.rows, px0, py0, reach, cosine, sine,
+                                    fan, block, road.start, base, bin0, known, ranges)
         else:
-            _march(road.field, columns, road.rows, px0, py0, reach, beams)
-        for r in range(min(rays - block, SIMD_RAYS)):
-            ranges[block + r] = beams[2, r]
+            _march(road.field, columns, road.rows, px0, py0, reach, cosine, sine,
+                   fan, block, road.start, base, bin0, known, ranges)
+        # fmt: on

@@ -36,16 +36,20 @@ AMONG_THIN_WALLS = (24, _F(0.9), True)
 def vector_march(how: tuple[int, np.float32, bool]) -> Any:
     """Build the intrinsic that moves each of SIMD_RAYS rays from its start range to the edge of the road.
 
-    Its arguments: packed field with its sides; origin in cells; reach m; beams float32 [3, SIMD_RAYS]: direction x,
-    direction y and range: on entry the start, on return the result, in [0, reach]. It runs until the last ray has
-    arrived. `how` is PLAIN or AMONG_THIN_WALLS. Where steps are not checked for blind parts, no code for that is
-    emitted.
+    Its arguments: packed field with its sides; origin in cells; reach m; the heading as cosine and sine; fan of
+    `rays.fan` and its first ray that is meant; the ray start table, where in it the origin's row begins, the bin of the
+    fan's first ray, and metres per unit, or 0 where the origin has no row; ranges float32 [rays], of which those from
+    that ray on are written, in [0, reach]. It runs until the last ray has arrived. `how` is PLAIN or AMONG_THIN_WALLS.
+    Where steps are not checked for blind parts, no code for that is emitted.
     """
     steps, leap, look_back = how
 
     @intrinsic
-    def march(typingctx, field, columns, rows, px0, py0, reach, beams):
-        signature = types.void(field, types.uint32, types.uint32, types.float32, types.float32, types.float32, beams)
+    def march(
+        typingctx, field, columns, rows, px0, py0, reach, cosine, sine, fan, ray, start, row_at, bin0, unit, ranges
+    ):  # fmt: skip
+        f, u, n = types.float32, types.uint32, types.int64
+        signature = types.void(field, u, u, f, f, f, f, f, fan, n, start, n, f, f, ranges)
 
         def codegen(context, builder, sig, args):
             f32, i32 = ir.FloatType(), ir.IntType(32)
@@ -76,8 +80,17 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
             def most(a, b):
                 return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
-            field_data = context.make_array(sig.args[0])(context, builder, args[0]).data
-            beams_data = context.make_array(sig.args[6])(context, builder, args[6]).data
+            def array(k: int) -> Any:
+                return context.make_array(sig.args[k])(context, builder, args[k])
+
+            def gather(values: ir.Value, index: ir.Value, vector: ir.VectorType) -> ir.Value:
+                found: ir.Value = ir.Constant(vector, ir.Undefined)
+                for lane in (ir.Constant(i32, k) for k in range(SIMD_RAYS)):
+                    at = builder.zext(builder.extract_element(index, lane), ir.IntType(64))
+                    found = builder.insert_element(found, builder.load(builder.gep(values, [at])), lane)
+                return found
+
+            field_data = array(0).data
             columns, rows = args[1], args[2]
             one = ir.Constant(i32, 1)
             mask_x, mask_y = splat(builder.sub(columns, one), vi), splat(builder.sub(rows, one), vi)
@@ -87,13 +100,21 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
                 builder.module, ir.FunctionType(vf, [vf]), f"llvm.floor.v{SIMD_RAYS}f32"
             )
 
-            def beam(k: int) -> ir.Value:
-                at = builder.gep(beams_data, [ir.Constant(i32, k * SIMD_RAYS)])
-                return builder.bitcast(at, vf.as_pointer())
+            fan, ray = array(8), args[9]
+            lanes_in_fan = cgutils.unpack_tuple(builder, fan.shape)[1]
 
-            dx, dy = (builder.load(beam(k), align=4) for k in (0, 1))
+            def of_fan(k: int) -> ir.Value:
+                at = builder.add(builder.mul(lanes_in_fan, ir.Constant(lanes_in_fan.type, k)), ray)
+                return builder.load(builder.bitcast(builder.gep(fan.data, [at]), vf.as_pointer()), align=4)
+
+            cosine, sine = splat(args[6], vf), splat(args[7], vf)
+            dx = sub(mul(cosine, of_fan(0)), mul(sine, of_fan(1)))
+            dy = add(mul(sine, of_fan(0)), mul(cosine, of_fan(1)))
             sx, sy = mul(dx, const(_SCALE)), mul(dy, const(_SCALE))
-            first = builder.load(beam(2), align=4)
+            bins = builder.fptosi(add(splat(args[12], vf), of_fan(2)), vi)
+            row_data = builder.gep(array(10).data, [args[11]])
+            bounds = gather(row_data, bins, ir.VectorType(ir.IntType(8), SIMD_RAYS))
+            first = mul(builder.uitofp(bounds, vf), splat(args[13], vf))
 
             before = builder.block
             loop, done = builder.append_basic_block("march"), builder.append_basic_block("marched")
@@ -110,11 +131,7 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
             column = builder.and_(builder.fptosi(fx, vi), mask_x)
             row = builder.and_(builder.fptosi(fy, vi), mask_y)
             index = builder.add(builder.mul(row, columns_v), column)
-            word: ir.Value = ir.Constant(vi, ir.Undefined)
-            for lane in range(SIMD_RAYS):
-                at = builder.extract_element(index, ir.Constant(i32, lane))
-                value = builder.load(builder.gep(field_data, [builder.zext(at, ir.IntType(64))]))
-                word = builder.insert_element(word, value, ir.Constant(i32, lane))
+            word = gather(field_data, index, vi)
 
             def byte(shift: int) -> ir.Value:
                 part = builder.lshr(word, ir.Constant(vi, [shift] * SIMD_RAYS))
@@ -158,7 +175,16 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
             builder.position_at_end(done)
             if look_back:
                 t_next = least(t_next, add(safe_next, const(_GAP)))
-            builder.store(least(most(t_next, const(0.0)), limit), beam(2), align=4)
+            found = cgutils.alloca_once(builder, vf)
+            builder.store(least(most(t_next, const(0.0)), limit), found)
+            ranges = array(14)
+            left = builder.sub(cgutils.unpack_tuple(builder, ranges.shape)[0], ray)
+            lanes = ir.Constant(left.type, SIMD_RAYS)
+            count = builder.select(builder.icmp_signed("<", left, lanes), left, lanes)
+            single = builder.bitcast(found, f32.as_pointer())
+            with cgutils.for_range(builder, count, intp=left.type) as here:
+                value = builder.load(builder.gep(single, [here.index]))
+                builder.store(value, builder.gep(ranges.data, [builder.add(ray, here.index)]))
             return context.get_dummy_value()
 
         return signature, codegen

@@ -11,7 +11,6 @@ from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
 from gridsim.sensing.rays import fan, sense
-from gridsim.sensing.simd import SIMD_RAYS
 
 F = np.float32
 K = constants(SimConfig())
@@ -25,10 +24,9 @@ MAPS = (0, 1, 2, 3)
 def look(road, points, headings, k=K, count=31):
     """Kernel ranges [n, rays] from points [n, 2] with headings [n]."""
     table = fan(count, k.ray_first, k.ray_step)
-    beams = np.empty((3, SIMD_RAYS), dtype=F)
     ranges = np.full((len(points), count), np.nan, dtype=F)
     for (x, y), heading, row in zip(points, headings, ranges, strict=True):
-        sense(road, table, k.ray_first, k.ray_range, F(x), F(y), F(np.cos(heading)), F(np.sin(heading)), beams, row)
+        sense(road, table, k.ray_first, k.ray_range, F(x), F(y), F(np.cos(heading)), F(np.sin(heading)), row)
     return ranges
 
 

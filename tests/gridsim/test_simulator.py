@@ -32,7 +32,7 @@ from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
-from gridsim.sensing.rays import SIMD_RAYS, fan
+from gridsim.sensing.rays import fan
 
 F = np.float32
 CONFIG = SimConfig()
@@ -59,13 +59,13 @@ def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
     """Drive until the episode ends; `choose` is called with (step, ranges, car) and returns an action."""
     start = np.asarray(start, dtype=F)
     car, visits = np.zeros(FIELDS, dtype=F), np.zeros(int(road.width) // 4 * int(road.height) // 4, dtype=F)
-    beams, ranges = np.empty((3, SIMD_RAYS), dtype=F), np.empty(31, dtype=F)
+    ranges = np.empty(31, dtype=F)
     place(road, start, car, visits)
     actions: list[int] = []
     states: list[np.ndarray] = []
     end = 0
     while end == 0:
-        look(road, k, RAYS, car, None, beams, ranges, None)
+        look(road, k, RAYS, car, None, ranges, None)
         actions.append(int(choose(len(actions), ranges, car)))
         pedal, wheel = map(F, act(k, actions[-1], car[SPEED], car[STEERING]))
         end = control(road, k, car, visits, None, pedal, wheel, F(target), max_steps)
