@@ -97,6 +97,7 @@ def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness:
             learning.score = fitness
         while not learning.done():
             row = learning.step()
+            learning.elites.clear()  # nobody asks for them
             if on_step:
                 on_step(learning.steps, row)
         learning.validate_last()

@@ -38,7 +38,7 @@ from cluster.commands.progress import Progress
 from cluster.comparison.errors import series
 from cluster.report.pictures import errors_table, held_out_table
 from cluster.runs.champion import evaluate, load_champion
-from cluster.runs.checkpoint import CHECKPOINT, CONFIG, CheckpointError
+from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
 from cluster.runs.run import RunFolder, is_finished, lock, new_run, open_run, read_config
 from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
@@ -237,7 +237,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     resumable = (run.path / CHECKPOINT).is_file()
     if not resumable:
         with contextlib.suppress(OSError):
-            (run.path / CONFIG).unlink(missing_ok=True)
+            for name in (CONFIG, STEPS):
+                (run.path / name).unlink(missing_ok=True)
             for path in new_folders:
                 path.rmdir()
     if code == FAILED:

@@ -23,12 +23,11 @@ from rich.progress import track
 from cluster.commands.common import FAILED, RoadFlags, UsageError, command_path, fail, main, parse, wrong_use
 from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
-from cluster.runs import checkpoint
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
 from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.run import CHECKPOINT, CONFIG, ELITES, RunError, read_config
+from cluster.runs.run import CHECKPOINT, CONFIG, RunError, read_config
 from cluster.runs.settings import IN_WORDS, MAX_TRAFFIC
-from evolution.networks.policy import PolicySpec
+from cluster.runs.steps import read_elites
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
@@ -158,11 +157,7 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     Raises: RunError, CheckpointError, UsageError.
     """
     settings, _ = read_config(run / CONFIG)
-    path, name = (run / CHECKPOINT, "elites") if checkpoint_time(run) else (run / ELITES, "genomes")
-    genomes = checkpoint.load(path)[0].get(name)
-    genes = PolicySpec.parse(settings.policy).size
-    if genomes is None or genomes.dtype != np.float32 or genomes.shape[1:] != (genes,) or not len(genomes):
-        raise CheckpointError(f"{path}: its elites are no {settings.policy}")
+    genomes = read_elites(run, settings.policy)
     step = settings.counts[0]  # generation, or evaluation
     number = len(genomes) - 1 if generation is None else generation
     if not 0 <= number < len(genomes):

@@ -18,7 +18,7 @@ import numpy as np
 
 from gridsim.errors import GridSimError
 
-CONFIG, CHECKPOINT, CHAMPION = "config.json", "checkpoint.npz", "champion.npz"
+CONFIG, CHECKPOINT, STEPS, CHAMPION = "config.json", "checkpoint.npz", "steps.part", "champion.npz"
 """Files of a run's folder."""
 
 VERSION = 1
@@ -76,7 +76,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
             raise ValueError("it holds no GridSim data")
         version, meta = header["version"], header["meta"]
     except Exception as error:
-        raise CheckpointError(f"{path}: not a GridSim file ({_one_line(error)})") from error
+        raise CheckpointError(f"{path}: not a GridSim file ({one_line(error)})") from error
     if version != VERSION:
         raise CheckpointError(f"{path}: written in format {repr(version)[:20]}; this GridSim reads format {VERSION}")
     return arrays, meta
@@ -99,7 +99,7 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
         os.replace(temporary, path)
     except OSError as error:
         kept = "; the one before it is kept" if path.exists() else ""
-        raise CheckpointError(f"{path}: cannot be written: {_one_line(error)}{kept}") from error
+        raise CheckpointError(f"{path}: cannot be written: {one_line(error)}{kept}") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
@@ -114,10 +114,10 @@ def _read(path: Path) -> bytes:
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {_one_line(error)}") from error
+        raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
 
 
-def _one_line(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """The error in a few words."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return text.splitlines()[0][:120]

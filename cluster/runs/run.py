@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, CONFIG, CheckpointError
+from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
 from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict
 from cluster.tracking import description
 from gridsim.config import SimConfig
@@ -192,8 +192,9 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
 
 
 def is_finished(run: RunFolder) -> bool:
-    """Whether there is nothing left to do: learned to the end, and all files are there."""
-    return run.saved is not None and (run.path / SUMMARY).is_file() and run.settings.ended(run.saved[1])
+    """Whether there is nothing left to do: learned to the end, and all files are there, of no shorter run."""
+    concluded = (run.path / SUMMARY).is_file() and not (run.path / STEPS).exists()
+    return run.saved is not None and concluded and run.settings.ended(run.saved[1])
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

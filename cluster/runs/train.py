@@ -1,14 +1,16 @@
 """A training run, new or resumed, from its start to its end, for commands and comparisons alike.
 
-A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: the
-checkpoint (which holds the history), history.csv made from it, the MLflow rows, in this order. Whatever kills the
-process, the folder holds a whole step, of a second ago or the one before, and a resumed run gives the same champion.
+A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: their
+elites and rows of the history (`runs/steps.py`), the checkpoint that counts them, history.csv, the MLflow rows, in this
+order. Whatever kills the process, the folder holds a whole step, of a second ago or the one before, and a resumed run
+gives the same champion.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 import signal
@@ -21,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from cluster.runs import checkpoint
+from cluster.runs import checkpoint, steps
 from cluster.runs.champion import Champion, load_champion
-from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CheckpointError
+from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError
 from cluster.runs.run import ELITES, HISTORY, PAGE, SUMMARY, RunError, RunFolder, lock, write_summary
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
@@ -219,8 +221,9 @@ class Session:
     summary: dict[str, Any] = field(default_factory=dict)
     learning: Learning = field(init=False)
     tracker: Tracker = field(init=False)
-    _state: State = field(init=False)  # after the last whole step
+    _state: State = field(init=False)  # after the last whole step, with the rows of the history that are not saved
     _saved_steps: int = 0  # steps that are in the folder
+    _sha256: Any = field(default_factory=hashlib.sha256)  # of their records
     _saved_at: float = -math.inf
     _away: bool = False  # whether an outage of MLflow was reported
 
@@ -230,11 +233,16 @@ class Session:
         learning.meanwhile, learning.out_of_time = self._save_now_and_then, self._out_of_time
         self._digest = self.run.digest()
         if self.run.saved is not None:
+            arrays, meta = self.run.saved
             try:
-                learning.restore(*self.run.saved)
+                saved = steps.resume(self.run.path, arrays, meta, learning.spec.size)
+                learning.restore(arrays | {"history": saved["row"]}, meta)
+            except CheckpointError:
+                raise
             except (KeyError, IndexError, TypeError, ValueError) as error:
                 path = self.run.path / CHECKPOINT
                 raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
+            self._sha256.update(saved.tobytes())
         self.tracker = make_tracker(
             self.run, self.uri, self.experiment, self.parent_id, started=time.time() - self._wall_s()
         )
@@ -243,7 +251,8 @@ class Session:
         """Learn to the end, saving once a second and at the end."""
         learning = self.learning
         log_rows(self.tracker, learning.history)
-        self._state, self._saved_steps = learning.state(), learning.steps
+        self._saved_steps = learning.steps
+        self._state = learning.state(self._saved_steps)
         if learning.history:
             self._write_history()  # it may lack the last row: it is written after the checkpoint
         try:
@@ -251,7 +260,7 @@ class Session:
                 row = learning.step()
                 self.maps.ahead(HELD_OUT_SEEDS, later=True)  # `finish` needs them
                 learning.add_wall_clock(row, self._wall_s(), learning.history[-2] if learning.steps > 1 else None)
-                self._state = learning.state()
+                self._state = learning.state(self._saved_steps)
                 self.reporter.row(learning.steps, row)
                 self.report_outage()
             self.save()
@@ -282,17 +291,24 @@ class Session:
     def save(self) -> None:
         """Write the last whole step's checkpoint, then history.csv from it, and log its rows, unless that is done.
 
-        Raises: CheckpointError; the files before are kept.
+        Interrupted anywhere, it can be called again. Raises: CheckpointError; the files before are kept.
         """
         learning, (arrays, meta), saved = self.learning, self._state, self._saved_steps
-        steps = len(arrays["history"])
-        if steps > saved:
+        done, path = meta[learning.step_name], self.run.path
+        if done > saved:
+            new = steps.records(arrays["history"], [learning.elites[k] for k in range(saved, done)])
+            steps.append(path / STEPS, saved, new)
+            sha256 = self._sha256.copy()
+            sha256.update(new.tobytes())
             tracking = {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key}
             meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, "tracking": tracking}
-            checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
-            self._saved_steps, self._saved_at = steps, now()
+            meta |= {"steps": done, "steps_sha256": sha256.hexdigest()}
+            checkpoint.save(path / CHECKPOINT, {k: v for k, v in arrays.items() if k != "history"}, meta)
+            self._saved_steps, self._sha256, self._saved_at = done, sha256, now()
+            for k in range(saved, done):
+                del learning.elites[k]
             self._write_history()
-            log_rows(self.tracker, learning.history[saved:steps], saved)
+            log_rows(self.tracker, learning.history[saved:done], saved)
 
     def _write_history(self) -> None:
         content = self.learning.history_csv(self._saved_steps)
@@ -310,7 +326,8 @@ class Session:
             learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic
         )
         champion.save(path / CHAMPION)
-        checkpoint.save(path / ELITES, {"genomes": np.array(learning.elites)}, {"policy": settings.policy})
+        elites = steps.read_elites(path, settings.policy)
+        checkpoint.save(path / ELITES, {"genomes": elites}, {"policy": settings.policy})
         episodes = held_out_episodes(self.maps, settings.traffic)
         seed = episodes.maps[int(episodes.rows[0]["map"])]
         road_map, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
@@ -323,7 +340,7 @@ class Session:
         pictures.trajectory(road_map, drive.cars, path / "trajectory.png", title)
         shown = [page.Shown("champion", "champion", drive)]
         for k in (np.unique(np.geomspace(1, learning.steps, ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():
-            elite = dataclasses.replace(champion, genome=learning.elites[k])
+            elite = dataclasses.replace(champion, genome=elites[k])
             drive = film.record(elite, road_map, start, learning.sim.episode.time_limit, world)
             shown.insert(0, page.Shown(f"elite of {learning.step_name} {k}", str(k), drive, stride=2))
         page.write_page(path / PAGE, f"GridSim: {self.run.name}, {title}", shown, learning.sim)
@@ -348,19 +365,22 @@ class Session:
             **{f"best_{name}": best[name] for name in ("car_steps", "wall_s")},
             "held_out": figures,
         }
-        write_summary(path, self.summary)
-        self._drop_replay()
+        self._conclude()
         self.reporter.note("logging to MLflow")
         log_end(self.tracker, self.run, learning.steps - 1, self.summary, description.describe(self.run, self.summary))
 
-    def _drop_replay(self) -> None:
-        """Take a DQN's replay, most of its checkpoint, out of what is kept of a run that has ended."""
-        path = self.run.path / CHECKPOINT
-        with contextlib.suppress(CheckpointError):  # then it stays
-            arrays, meta = checkpoint.load(path)
-            if meta.pop("replay", None):
-                kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
-                checkpoint.save(path, kept, meta)
+    def _conclude(self) -> None:
+        """Mark the run as finished. Its checkpoint gets the history, and loses a DQN's replay, most of it.
+
+        So the file of the steps, whose elites are in elites.npz by now, is not needed any more.
+        """
+        path = self.run.path
+        arrays, meta = checkpoint.load(path / CHECKPOINT)
+        kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
+        meta.pop("replay", None)
+        checkpoint.save(path / CHECKPOINT, kept | {"history": self.learning.table()}, meta)
+        write_summary(path, self.summary)
+        (path / STEPS).unlink(missing_ok=True)
 
 
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import DqnSettings
-from cluster.training.trainer import Learning, check_any_left, mean_speed, named, unmodified
+from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named, unmodified
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
 from evolution.dqn.replay import Replay
@@ -160,12 +160,12 @@ class Dqn(Learning):
         return self._owed >= 1.0
 
     def candidate(self) -> np.ndarray | None:
-        return self.elites[-1] if self.elites else None
+        return self.tried  # each evaluation tries its network
 
     def _evaluate_network(self) -> dict[str, float]:
         """Validate the averaged network. Returns its figures."""
         network = _finite(self.learner.average, self.learner.updates)
-        self.elites.append(network)
+        self.elites[self.steps] = network
         driven = self._evaluate(
             "validate", unmodified(network[None]), self.curriculum.validation(), self.curriculum.goal_limits(),
             meanwhile=self._train,
@@ -224,8 +224,8 @@ class Dqn(Learning):
             f"{row['speed_mps/best']:.1f} m/s  loss {row['loss']:.3f}  {row['updates'] / 1e3:.0f} k updates"
         )
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        arrays, meta = super().state()
+    def state(self, first: int = 0) -> State:
+        arrays, meta = super().state(first)
         learner, replay = self.learner.state(), self.replay.state()
         arrays |= {f"learner_{name}": array for name, array in learner[0].items()}
         arrays |= {f"replay_{name}": array for name, array in replay[0].items()}

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cluster.runs.settings import EvolveSettings
-from cluster.training.trainer import Learning, check_any_left, mean_speed, named
+from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import targets
@@ -97,10 +97,10 @@ class Evolution(Learning):
 
         if leader is None:  # of the first generation it is the best member
             best = int(score.argmax())
-            self.elites.append(self.search.genomes(np.array([best]))[0])
+            self.elites[self.steps] = self.search.genomes(np.array([best]))[0]
             led, led_score = results[best], float(score[best])
         else:
-            self.elites.append(leader)
+            self.elites[self.steps] = leader
             led = driven.results[leading][0]
             led_score = float(self._score(led[None], curriculum.leader_limits().target)[0])
             columns = leading.columns
@@ -162,8 +162,8 @@ class Evolution(Learning):
             f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"
         )
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        arrays, meta = super().state()
+    def state(self, first: int = 0) -> State:
+        arrays, meta = super().state(first)
         curriculum = self.curriculum
         searched, numbers = self.search.state()
         arrays |= {f"search_{name}": array for name, array in searched.items()}

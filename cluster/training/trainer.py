@@ -7,8 +7,7 @@ worker returned it.
 
 from __future__ import annotations
 
-import csv
-import io
+import itertools
 import threading
 import time
 import warnings
@@ -106,7 +105,7 @@ class Learning(ABC):
         maps: builds maps.
         initial: a genome to start from, float32 [genes].
         history: a row of figures for each step (`columns`).
-        elites: the network of each step, float32 [genes].
+        elites: the network of each step that is not saved yet, by the step, float32 [genes].
         validation_steps: car-steps of these that validation took.
         lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
         warn: called with one line for each of these, and for each worker that is replaced because it is silent.
@@ -125,7 +124,7 @@ class Learning(ABC):
     tried: np.ndarray | None = None  # the last candidate that was validated, float32 [genes]
     solved: bool = False
     history: list[dict[str, float]] = field(default_factory=list)
-    elites: list[np.ndarray] = field(default_factory=list)
+    elites: dict[int, np.ndarray] = field(default_factory=dict)
     car_steps: int = 0
     validation_steps: int = 0
     lost_chunks: int = 0
@@ -144,6 +143,7 @@ class Learning(ABC):
             s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period, s.traffic
         )
         self.outcomes: list[Outcome] = []  # of the last step, for statistics
+        self._lines: list[str] = []  # of history.csv
 
     # ------------------------------------------------------------------------------------------------------ the loop
 
@@ -258,13 +258,11 @@ class Learning(ABC):
 
     # ------------------------------------------------------------------------------------------------------- state
 
-    def state(self) -> State:
-        """All that an exact resume needs: arrays and plain numbers."""
-        rows = [[row[name] for name in self.columns] for row in self.history]
+    def state(self, first: int = 0) -> State:
+        """All that an exact resume needs, arrays and plain numbers; of the history the rows from step `first` on."""
         champion = self.champion
         arrays: dict[str, np.ndarray] = {
-            "history": np.array(rows, dtype=np.float64).reshape(-1, len(self.columns)),
-            "elites": np.array(self.elites, dtype=np.float32).reshape(-1, self.spec.size),
+            "history": self.table(first),
             "tried": genes_of(self.tried),
             "champion": genes_of(champion.genome if champion else None),
         }
@@ -283,20 +281,22 @@ class Learning(ABC):
         self.car_steps, self.solved = meta["car_steps"], meta["solved"]
         self.lost_chunks, self.validation_steps = meta["lost_chunks"], meta["validation_steps"]
         self.history = [dict(zip(self.columns, row, strict=True)) for row in arrays["history"].tolist()]
-        self.elites = list(arrays["elites"])
+        self.elites, self._lines = {}, []
         self.tried = arrays["tried"] if arrays["tried"].size else None
         if meta["champion"]:
             self.champion = Champion(arrays["champion"], *meta["champion"])
         self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
 
+    def table(self, first: int = 0) -> np.ndarray:
+        """The history from step `first` on, float64 [steps, columns]."""
+        rows = [[row[name] for name in self.columns] for row in self.history[first:]]
+        return np.array(rows, dtype=np.float64).reshape(-1, len(self.columns))
+
     def history_csv(self, steps: int) -> bytes:
-        """history.csv: a row for each of the first steps."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([self.step_name, *self.columns])
-        for k, row in enumerate(self.history[:steps]):
-            writer.writerow([k, *(repr(row[name]) for name in self.columns)])
-        return text.getvalue().encode()
+        """history.csv: a row for each of the first steps. Each is written out once: thousands take tens of ms."""
+        for k in range(len(self._lines), steps):
+            self._lines.append(",".join([str(k), *(repr(self.history[k][name]) for name in self.columns)]))
+        return "\n".join([",".join([self.step_name, *self.columns]), *self._lines[:steps], ""]).encode()
 
 
 def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -19,7 +19,7 @@ from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, dqn_main,
 from cluster.commands.compare import CompareFlags, compare_main
 from cluster.comparison.plan import ComparisonFolder, Plan
 from cluster.runs.champion import Champion
-from cluster.runs.checkpoint import save
+from cluster.runs.checkpoint import load, save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import EvolveSettings
 from evolution.networks.policy import PolicySpec
@@ -98,6 +98,9 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
     for name in ("config.json", "champion.npz", "elites.npz", "curves.png", "trajectory.png", "drive.html"):
         assert stored[name] == (folder / name).read_bytes() > b""
     assert (folder / "checkpoint.npz").is_file()
+    assert not (folder / "steps.part").exists()
+    assert "steps.part" not in stored
+    assert "elites" not in load(folder / "checkpoint.npz")[0]
     with np.load(folder / "champion.npz", allow_pickle=False) as arrays:
         assert arrays["genome"].dtype == np.float32
     figures = summary(folder)
@@ -127,6 +130,7 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
     done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert len(rows(run)) == 6
+    assert (run / "elites.npz").read_bytes() == (reference / "runs/ref/elites.npz").read_bytes()
     assert duration_s(run) == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "compare: make ui, or" in done.stdout
     assert "chosen: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout

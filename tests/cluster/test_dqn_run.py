@@ -40,6 +40,7 @@ def reference(tmp_path_factory, empty_database):
 def same(run, reference):
     """Whether two runs did and found the same: the champion, and every network on the way to it."""
     assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
+    assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
     mine, theirs = load(run / "checkpoint.npz")[0], load(reference / "checkpoint.npz")[0]
     assert {name for name in theirs if not np.array_equal(mine[name], theirs[name])} <= {"history"}  # it has the clock
     for row, other in zip(rows(run), rows(reference), strict=True):
@@ -77,8 +78,8 @@ def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, t
 
 
 def test_run_keeps_the_contracts(reference):
-    for name in ("config.json", "checkpoint.npz", "champion.npz", "history.csv", "summary.json", "curves.png",
-                 "trajectory.png", "drive.html"):  # fmt: skip
+    for name in ("config.json", "checkpoint.npz", "champion.npz", "elites.npz", "history.csv", "summary.json",
+                 "curves.png", "trajectory.png", "drive.html"):  # fmt: skip
         assert (reference / name).stat().st_size > 0
     found = summary(reference)
     assert found["evaluations"] == len(rows(reference)) >= 5

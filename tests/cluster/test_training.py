@@ -1,15 +1,16 @@
 """The generation loop among traffic: its episodes, the champion, resuming, lost members, the user's fitness."""
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
 from commands import rows
 
 from cluster.runs.checkpoint import load, save
-from cluster.runs.run import RunError, RunFolder, open_run
+from cluster.runs.run import new_run, open_run
 from cluster.runs.settings import EvolveSettings
-from cluster.runs.train import Session
+from cluster.runs.train import Reporter, Session
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Champion, Maps
 from cluster.workers.pool import PoolError, SerialPool
@@ -21,6 +22,7 @@ from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 from gridsim.traffic.world import FIELDS, LANE
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
@@ -53,13 +55,23 @@ def go_on(evolution):
 
 @pytest.fixture(scope="module")
 def halfway(maps, tmp_path_factory):
-    """The file of a run after two of three generations: there is a leader from the second on."""
-    evolution = begin(maps)
-    go_on(evolution)
-    go_on(evolution)
-    path = tmp_path_factory.mktemp("run") / "checkpoint.npz"
-    save(path, *evolution.state())
-    return path
+    """The folder of a run that was stopped after two of three generations: there is a leader from the second on."""
+    run = new_run(tmp_path_factory.mktemp("runs"), "halfway", SETTINGS)
+    run.path.mkdir()
+    run.write_config()
+    session = in_folder(run, maps)
+    session.reporter = StopsAfterTwo()
+    with pytest.raises(KeyboardInterrupt):
+        session.learn()
+    return run.path
+
+
+class StopsAfterTwo(Reporter):
+    """Ctrl-C comes after two generations."""
+
+    def row(self, steps, row):
+        if steps == 2:
+            raise KeyboardInterrupt
 
 
 def state_of(evolution):
@@ -82,6 +94,8 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
         while resumed.generation < 3:
             go_on(resumed)
         assert state_of(resumed) == state_of(straight)
+        for step, elite in resumed.elites.items():
+            assert elite.tobytes() == straight.elites[step].tobytes()
     for run in (straight, resumed):
         run.validate_last()
     assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
@@ -161,7 +175,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     assert not outcome.results[groups[0], : len(episodes.rows)][:, others]["steps"].any()  # nor anybody else's
     if leader is None:
         assert len(recipes) == 50
-        assert evolution.elites[-1].tobytes() == genomes[score.argmax()].tobytes()
+        assert evolution.elites[after].tobytes() == genomes[score.argmax()].tobytes()
         assert row["fitness/best"] == score.max()
     else:
         first = len(episodes.rows)
@@ -171,7 +185,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert alone.results[0].tobytes() == led.tobytes()
         assert alone.rewound.tobytes() == outcome.rewound[first : first + len(led)].tobytes()
         assert alone.worlds.tobytes() == outcome.worlds[first : first + len(led)].tobytes()
-        assert evolution.elites[-1].tobytes() == leader.tobytes()
+        assert evolution.elites[after].tobytes() == leader.tobytes()
         assert row["distance_m/best"] == led["distance"].mean()
         assert row["fitness/best"] == evolution._score(alone.results, long.target)[0]
         assert row["fitness/mean"] == score.mean()
@@ -215,26 +229,23 @@ def test_training_is_among_more_cars_than_validation(maps):
     assert there[:, : SETTINGS.traffic].mean() > 0.95
 
 
-@pytest.mark.parametrize("name", ["elites", "search_path", "crashes", "tried", "search", "generation", "champion"])
+@pytest.mark.parametrize(
+    "name", ["steps_sha256", "search_path", "crashes", "tried", "search", "generation", "champion"]
+)
 def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, halfway, tmp_path, name):
     path = run_folder(halfway, tmp_path)
     arrays, meta = load(path / "checkpoint.npz")
     arrays.pop(name, None)
     meta.pop(name, None)
     save(path / "checkpoint.npz", arrays, meta)
-    with pytest.raises(RunError, match=r"another version|not those of a run") as error:
+    with pytest.raises(GridSimError, match=r"another version|not those of a run|it has not the steps") as error:
         go_on_in(path, maps)
     assert "\n" not in str(error.value)
 
 
-def run_folder(halfway, path, **changed):
+def run_folder(halfway, path):
     """A run that was stopped after two of three generations."""
-    run = RunFolder(path, SETTINGS)
-    run.write_config()
-    arrays, meta = load(halfway)
-    meta |= {"digest": run.digest(), "tracking": {"uri": "sqlite:///m.db", "run_id": None, "key": "k"}, **changed}
-    save(path / "checkpoint.npz", arrays, meta)
-    return path
+    return shutil.copytree(halfway, path / "run")
 
 
 class InterruptedOnce(Session):
@@ -250,31 +261,36 @@ class InterruptedOnce(Session):
 
 
 def go_on_in(path, maps, session=Session):
-    """A stopped run, to be continued from its folder, with a short validation."""
-    run = open_run(path)
-    resumed = session(run, SerialPool(maps.build), maps, f"sqlite:///{path}/m.db", "test")
-    curriculum = resumed.learning.curriculum
+    """A stopped run, to be continued from its folder."""
+    return in_folder(open_run(path), maps, session)
+
+
+def in_folder(run, maps, session=Session):
+    """A run in its folder, with a short validation."""
+    made = session(run, SerialPool(maps.build), maps, f"sqlite:///{run.path.parent}/m.db", "test")
+    curriculum = made.learning.curriculum
     curriculum.config = dataclasses.replace(curriculum.config, validation=8)
-    return resumed
+    return made
 
 
 def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, halfway, tmp_path):
-    resumed = go_on_in(run_folder(halfway, tmp_path), maps, InterruptedOnce)
+    path = run_folder(halfway, tmp_path)
+    resumed = go_on_in(path, maps, InterruptedOnce)
     with pytest.raises(KeyboardInterrupt):
         resumed.learn()
     assert resumed.interrupted
-    assert load(tmp_path / "checkpoint.npz")[1]["generation"] == 3
-    assert len(rows(tmp_path)) == 3
+    assert load(path / "checkpoint.npz")[1]["generation"] == 3
+    assert len(rows(path)) == 3
 
 
 def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
     """As a kill between the last checkpoint and its history leaves it, when nothing is left to evolve."""
-    resumed = go_on_in(run_folder(halfway, tmp_path), maps)
-    resumed.learn()
-    whole = (tmp_path / "history.csv").read_bytes()
-    (tmp_path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
-    go_on_in(tmp_path, maps).learn()
-    assert (tmp_path / "history.csv").read_bytes() == whole
+    path = run_folder(halfway, tmp_path)
+    go_on_in(path, maps).learn()
+    whole = (path / "history.csv").read_bytes()
+    (path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
+    go_on_in(path, maps).learn()
+    assert (path / "history.csv").read_bytes() == whole
 
 
 class Losing(SerialPool):
@@ -310,7 +326,7 @@ def test_lost_members_cannot_win_whatever_the_fitness(maps, settings, last):
     """They are no elites, no parents (where tournaments of lost ones alone are rare) and no candidates."""
     evolution = losing(maps, settings, evolve=slice(3, last))
     go_on(evolution)
-    kept = [evolution.candidate(), *evolution.elites]
+    kept = [evolution.candidate(), *evolution.elites.values()]
     kept += list(getattr(evolution.search, "parents", []))
     assert len(evolution.pool.genomes) == last - 3 == evolution.lost_chunks
     assert not {genome.tobytes() for genome in evolution.pool.genomes} & {genome.tobytes() for genome in kept}

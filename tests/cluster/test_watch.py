@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import time
+from hashlib import sha256
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -14,7 +15,7 @@ from commands import call, refused
 from cluster.commands import watch
 from cluster.commands.watch import checkpoint_time, elite, watch_main
 from cluster.report.film import Recording, VideoError, frames, picture, record, write_video
-from cluster.runs import checkpoint
+from cluster.runs import checkpoint, steps
 from cluster.runs.champion import load_champion
 from cluster.runs.checkpoint import CheckpointError
 from cluster.runs.run import RunFolder
@@ -161,8 +162,16 @@ def going(tmp_path):
     RunFolder(tmp_path / "run", settings).path.mkdir()
     RunFolder(tmp_path / "run", settings).write_config()
     elites = np.random.default_rng(0).standard_normal((4, PolicySpec.parse("mlp:6,7").size)).astype(np.float32)
-    checkpoint.save(tmp_path / "run/checkpoint.npz", {"elites": elites}, {})
+    save_steps(tmp_path / "run", 0, elites)
     return tmp_path / "run"
+
+
+def save_steps(run, first, elites):
+    """Append steps with these elites, and count them."""
+    steps.append(run / "steps.part", first, steps.records(np.zeros((len(elites), 2)), elites))
+    digest = sha256((run / "steps.part").read_bytes()).hexdigest()
+    meta = {"columns": ["a", "b"], "steps": first + len(elites), "steps_sha256": digest}
+    checkpoint.save(run / "checkpoint.npz", {}, meta)
 
 
 def test_follow_takes_the_newest_elite_while_the_run_goes_on(going, dummy, monkeypatch, capsys):
@@ -178,17 +187,16 @@ def test_follow_takes_the_newest_elite_while_the_run_goes_on(going, dummy, monke
 
 
 def test_newest_elite_is_read_anew(going):
-    arrays, meta = checkpoint.load(going / "checkpoint.npz")
-    elites = arrays["elites"]
+    elites = steps.read_elites(going, "mlp:6,7")
     first, name = elite(going, None)
     assert name == "elite of generation 3"
     assert (first.genome == elites[3]).all()
     assert first.sim == SimConfig()
     before = checkpoint_time(going)
-    checkpoint.save(going / "checkpoint.npz", {"elites": np.concatenate([elites, elites[:1]])}, meta)
+    save_steps(going, 4, elites[:1])
     assert checkpoint_time(going) != before
     assert (elite(going, None)[0].genome == elites[0]).all()
-    (going / "checkpoint.npz").unlink()
+    (going / "steps.part").unlink()
     checkpoint.save(going / "elites.npz", {"genomes": elites}, {})  # which a run leaves at its end
     assert (elite(going, 2)[0].genome == elites[2]).all()
     checkpoint.save(going / "elites.npz", {"genomes": elites[:, :5]}, {})

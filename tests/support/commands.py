@@ -85,6 +85,7 @@ def same_run(run, reference):
     assert mine["champion_sha256"] == theirs["champion_sha256"]
     assert mine["car_steps"] == theirs["car_steps"]
     assert mine["lost_chunks"] == 0
+    assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
     for row, other in zip(rows(run), rows(reference), strict=True):
         for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
             assert row[name] == other[name]
