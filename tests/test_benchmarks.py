@@ -24,7 +24,10 @@ RUNS = {
             "real_efficiency_2", "simulated_efficiency_2",
         },
     ),
-    "soak.py": (["--generations", "12", "--workers", "1", "--json"], {"growth", "mib_before", "mib_after"}),
+    "soak.py": (
+        ["--generations", "12", "--workers", "1", "--policy", "mlp:64,64", "--json"],
+        {"growth", "own_growth", "mib_before", "mib_after"},
+    ),
     "throughput.py": (["--runs", "1", "--json"], {"rollout_rays", "vector_env_grid", "breed_512x1000_ms"}),
     "traffic.py": (["--hours", "0.01", "--seeds", "1", "--scenario", "curved", "--json"], set()),
     "traffic.py --ego": (["3", "--seeds", "1", "--scenario", "curved", "--json"], {"curved_off_road"}),
