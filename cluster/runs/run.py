@@ -192,7 +192,7 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
 
 
 def is_finished(run: RunFolder) -> bool:
-    """Whether there is nothing left to do: learned to the end, and all files are there, of no shorter run."""
+    """Whether nothing is left to do: learned to the end, and all files are there; an extended run has steps.part."""
     concluded = (run.path / SUMMARY).is_file() and not (run.path / STEPS).exists()
     return run.saved is not None and concluded and run.settings.ended(run.saved[1])
 

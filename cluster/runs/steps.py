@@ -93,5 +93,5 @@ def _read(file: BinaryIO, meta: Mapping[str, Any], genes: int) -> np.ndarray:
     kind = _record(len(meta.get("columns", ())), genes)
     content = file.read(kind.itemsize * meta.get("steps", 0))
     if hashlib.sha256(content).hexdigest() != meta.get("steps_sha256"):
-        raise CheckpointError(f"{file.name}: damaged or edited: it has not the steps that {CHECKPOINT} counts")
+        raise CheckpointError(f"{file.name}: damaged or edited: it lacks steps that {CHECKPOINT} counts")
     return np.frombuffer(content, kind)

@@ -7,7 +7,6 @@ worker returned it.
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 import warnings
