@@ -91,6 +91,40 @@ def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path):
     assert not set(shell) - {"HOME"} & set(names)
 
 
+KEEP = """
+import ray
+class Kept:
+    def word(self):
+        return "still here"
+ray.init(namespace="mine", log_to_driver=False)
+ray.get(ray.remote(Kept).options(name="kept", lifetime="detached").remote().word.remote())
+"""
+ASK = "import ray; ray.init(namespace='mine', log_to_driver=False); print(ray.get(ray.get_actor('kept').word.remote()))"
+
+
+@pytest.mark.e2e
+def test_a_users_own_ray_outlives_tests_that_start_and_end_others(cluster, root, tmp_path):
+    """They are started in the shell of a user whose Ray has a token, and who has an MLflow server somewhere."""
+    token = tmp_path / ".ray/auth_token"
+    token.parent.mkdir()
+    token.write_text("ab" * 32)
+    token.chmod(0o600)
+    address, _ = cluster(1, HOME=str(tmp_path), RAY_AUTH_MODE="token")
+    shell = {"HOME": str(tmp_path), "RAY_ADDRESS": address, "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
+    kept = finish("python", "-c", KEEP, cwd=tmp_path, **shell)
+    assert kept.returncode == 0, kept.stderr
+    tests = (
+        "tests/cluster/test_ray_pool.py::test_any_number_of_workers_gives_the_serial_pools_bits",
+        "tests/cluster/test_cli.py::test_ctrl_c_saves_and_leaves_nothing_behind",
+    )
+    server = {"MLFLOW_TRACKING_URI": "http://127.0.0.1:1", "MLFLOW_EXPERIMENT_NAME": "mine"}
+    done = finish("pytest", *tests, cwd=root, timeout=500, **shell, **server)
+    assert done.returncode == 0, done.stdout
+    asked = finish("python", "-c", ASK, cwd=tmp_path, **shell)
+    assert (asked.returncode, asked.stdout) == (0, "still here\n"), asked.stderr
+    assert token.read_text() == "ab" * 32
+
+
 @pytest.mark.e2e
 def test_run_folder_and_mlflow_keep_their_contracts(reference):
     folder = reference / "runs/ref"
