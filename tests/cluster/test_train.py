@@ -99,7 +99,7 @@ def test_a_run_is_resumed_while_its_server_is_away(tmp_path, monkeypatch, capsys
     assert len(begun) <= 1, "told of already while it went on"
     saved = open_run(tmp_path / "r").saved
     assert saved is not None
-    assert len(saved[0]["history"]) == 3
+    assert saved[1]["steps"] == 3
 
 
 def test_an_outage_of_mlflow_is_told_of_once_and_its_end(tmp_path, monkeypatch):

@@ -238,7 +238,7 @@ def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, halfway, tmp_p
     arrays.pop(name, None)
     meta.pop(name, None)
     save(path / "checkpoint.npz", arrays, meta)
-    with pytest.raises(GridSimError, match=r"another version|not those of a run|it has not the steps") as error:
+    with pytest.raises(GridSimError, match=r"another version|not those of a run|it lacks steps") as error:
         go_on_in(path, maps)
     assert "\n" not in str(error.value)
 
