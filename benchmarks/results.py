@@ -31,7 +31,7 @@ PAGE = ROOT / "docs" / "results.md"
 PRODUCT = ("gridsim", "evolution", "cluster")
 BIN = Path(sys.executable).parent
 EPISODES = 512  # held-out drives of each champion
-SEEDS, SEEDS_IN_TRAFFIC = 5, 3
+SEEDS, SEEDS_IN_TRAFFIC = 8, 3
 GOOD = 0.95  # of validation
 ROADS = (
     ("highway", 0), ("curved", 0), ("roundabout", 0), ("city", 0),
@@ -51,7 +51,7 @@ def alone(*commands: str) -> dict[str, list[str]]:
 
 # Tables, their rows, and the commands that a row is the median of.
 TABLES: dict[str, dict[str, list[str]]] = {
-    "seeds": alone(*(f"gridsim-evolve --seed {seed}" for seed in range(5))),
+    "seeds": alone(*(f"gridsim-evolve --seed {seed}" for seed in range(SEEDS))),
     "roads": {
         label: commands
         for road, cars in ROADS

@@ -15,7 +15,8 @@ from gridsim.errors import GridSimError
 from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
 from gridsim.maps.generators.highway import highway_layout
-from gridsim.maps.generators.seamless import roundabout_layout, seamless_layout
+from gridsim.maps.generators.roundabout import roundabout_layout
+from gridsim.maps.generators.seamless import seamless_layout
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Lanes, Strips, clearance_nodes, clearances, make_road

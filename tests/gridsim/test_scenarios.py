@@ -18,7 +18,7 @@ from gridsim.car.vehicle import Action
 from gridsim.config import CROSSING_GAP
 from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
-from gridsim.maps.generators.seamless import FEWEST_ROUNDABOUTS
+from gridsim.maps.generators import roundabout
 from gridsim.maps.lanes import Path, beside, lay_lanes
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
@@ -315,7 +315,7 @@ def test_roundabouts_are_many_and_nothing_else_is_a_junction():
     for seed in range(40):
         m = lay("roundabout", seed)
         rings = m.strips.arcs[np.abs(m.strips.arcs[:, 4]) > 6.0]
-        assert len(rings) >= FEWEST_ROUNDABOUTS
+        assert len(rings) >= roundabout.FEWEST
         for i in np.flatnonzero((m.lanes.successors >= 0).sum(axis=1) > 1):
             for j in m.lanes.successors[i][m.lanes.successors[i] >= 0]:
                 away = wrapped(lane(m.lanes, j).mean(axis=0) - rings[:, :2], m.sides)

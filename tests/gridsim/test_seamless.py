@@ -5,7 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from gridsim.maps.generators.seamless import TILE, TILES, seamless_layout, tile_graph
+from gridsim.maps.generators.seamless import seamless_layout
+from gridsim.maps.generators.tiles import TILE, TILES, tile_graph
 
 GRAPHS, LAID = 300, 60  # seeds of which graphs are looked at, and lanes and strips
 

@@ -1,0 +1,72 @@
+"""Roundabouts in a network of tiles, and the road of which each junction is one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.maps.generators.squares import DIRECTIONS, Layout, Pieces, rotated
+from gridsim.maps.generators.tiles import HALF_ROAD, LANE_WIDTH, TILE, TILES, tile_graph
+from gridsim.maps.roads import Lanes, Strips
+
+RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
+HALF_RING = 4.5  # m, half width of the ring, wide enough for a lorry to turn
+FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
+HALF_FLARE = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those arcs, whose outer edge continues the arm's
+FEWEST = 6  # on a map
+
+
+def _flare() -> tuple[float, float, float]:
+    """The arc by which an arm's lane joins the ring: (x, y of its centre for the eastern arm, ring angle in rad).
+
+    It is tangent to the lane's centre line and, from outside, to the ring's.
+    """
+    y = LANE_WIDTH / 2 + FLARE
+    x = math.sqrt((RADIUS + FLARE) ** 2 - y**2)
+    return x, y, math.atan2(y, x)
+
+
+def _around(turn: int, half: float, _offset: float) -> Pieces:
+    """Pieces of the lane through a roundabout, counter-clockwise; arguments as of `squares.through_square`."""
+    x, _, angle = _flare()
+    straight = (half - x, 0.0)
+    flare = ((math.pi / 2 - angle) * FLARE, -1.0 / FLARE)
+    ring = ((turn * math.pi / 2 - 2 * angle) * RADIUS, 1.0 / RADIUS)
+    return (straight, flare, ring, flare, straight)
+
+
+def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
+    """The strips of a roundabout centred on (x, y)."""
+    flare_x, flare_y, angle = _flare()
+    layout.arcs.append([x, y, RADIUS, 0.0, 2 * math.pi, HALF_RING])
+    for arm in arms:
+        dx, dy = DIRECTIONS[arm]
+        inner = RADIUS - HALF_RING + HALF_ROAD + 0.25  # its round end must not cover the island
+        layout.line(dx * TILE / 2 + x, dy * TILE / 2 + y, dx * inner + x, dy * inner + y)
+        for side in (1.0, -1.0):  # way in, way out
+            (cx, cy), first = rotated(flare_x, side * flare_y, arm), arm * math.pi / 2 - side * math.pi / 2
+            layout.arcs.append([cx + x, cy + y, FLARE, first, side * (angle - math.pi / 2), HALF_FLARE])
+
+
+def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
+    """A network in which each T and crossing is a roundabout: (strips, lanes, width m, height m)."""
+    while True:
+        edges = tile_graph(rng)
+        if (edges.sum(axis=1) > 2).sum() >= FEWEST:
+            return lay_tiles(rng, edges, 1.0)
+
+
+def lay_tiles(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[Strips, Lanes, float, float]:
+    """The map of a graph; `share` of the T and crossing tiles are roundabouts."""
+    layout = Layout(HALF_ROAD, LANE_WIDTH)
+    for tile in range(len(edges)):
+        arms = [int(d) for d in np.flatnonzero(edges[tile])]
+        x, y = (tile % TILES + 0.5) * TILE, (tile // TILES + 0.5) * TILE
+        if rng.random() < share and len(arms) > 2:
+            _roundabout(layout, x, y, arms)
+            layout.connect(x, y, TILE / 2, arms, _around)
+        else:
+            layout.join(x, y, TILE / 2, arms)
+            layout.connect(x, y, TILE / 2, arms)
+    return layout.finish(TILE * TILES)
