@@ -10,10 +10,10 @@ import numpy as np
 
 _F = np.float32
 
-FILE_SPEEDS = (5.0, 12.0)  # m/s, the speed interval of a map from a file that names none
+FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none
 START_SPEED = 0.0  # m/s; at rest, so that a car that never accelerates or brakes does not get far
 SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
-REENTRY = _F(12.0)  # m driven; a return to a cell of ground within it still counts as the same visit
+REENTRY = _F(12.0)  # m driven; returning to a cell within this distance still counts as the same visit
 
 # The reward of Trasnea et al. (2019).
 PROGRESS_SHARE = 0.15  # weight of the distance, and also of the speed
@@ -23,28 +23,27 @@ CRASH_REWARD = -1.0
 # Lanes. Own choices, unless a source is named.
 CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
 
-# Traffic, beside `TrafficConfig`. These are float32 because kernels read them as globals. Own choices, unless a source
-# is named.
-TRAFFIC_PACE = 0.5  # share of the sum of the speed interval's ends that is traffic's speed on a straight: the middle
+# Traffic, beside `TrafficConfig`; float32 because kernels read them as globals. Own choices, unless a source is named.
+TRAFFIC_PACE = 0.5  # traffic's speed on a straight, as a share of lower + upper speed: the middle of the interval
 SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of the lane's: least, and range above it
 SPAWN_SPEED = _F(0.5)  # of the desired speed, at the start of an episode
 LANE_CHANGE_PERIOD = _F(10.0)  # control steps between two decisions whether to change lanes
-LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a change of lanes
-NEIGHBOUR_WIDENING = _F(0.004)  # m for each square metre of distance, added to the ego car's lane, since roads bend
-LOOK_AHEAD = _F(8.0)  # m that a car looks ahead at standstill, beyond the jam distance ...
-LOOK_AHEAD_TIME = _F(1.5)  # s, and the way it drives in that time, beside its comfortable braking distance
+LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
+NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance; margin for judging which lane the ego car is on, since roads bend
+LOOK_AHEAD = _F(8.0)  # m that a car at standstill looks ahead, beyond the jam distance ...
+LOOK_AHEAD_TIME = _F(1.5)  # s; ... plus the distance driven in this time and the comfortable braking distance
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
-# m before a junction's line at which a car waits; if longer, its rear might be in a junction behind
+# m from a waiting car's front to the junction's line; if longer, its rear might be in the junction behind
 STOP_LINE_GAP = _F(0.25)
-SWERVE_RADIUS = _F(16.0)  # m, of the arcs by which a car moves sideways, at least; as tight as bends are
-STEEPEST_SWERVE = _F(0.2)  # m sideways for each m of way, at most
-LANE_CHANGE_ALONE = _F(20.0)  # m within which no two cars change to or from the same lane at a time
+SWERVE_RADIUS = _F(16.0)  # m, least radius of the arcs by which a car moves sideways; bends are as tight
+STEEPEST_SWERVE = _F(0.2)  # m sideways per m driven, at most
+LANE_CHANGE_ALONE = _F(20.0)  # m within which no two cars change to or from the same lane at once
 WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
 JUNCTION_MARGIN = _F(0.5)  # m past what a lane crosses, until which a car's rear still blocks it
 
 # How traffic meets the ego car.
 MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
-SAME_WAY_COSINE = _F(0.3)  # of the angle between headings above which both go the same way, or merge
+SAME_WAY_COSINE = _F(0.3)  # of the angle between headings; above it, both cars go the same way or merge
 FORESIGHT = _F(3.0)  # s for which a car predicts the ego car's motion
 FORESIGHT_STEP = _F(0.25)  # s between predicted positions, at least
 EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predicted collision
@@ -53,8 +52,8 @@ EMERGENCY_BRAKING = _F(6.0)  # m/s2 with which a car would stop before a predict
 CROSSING_TIME = _F(7.0)  # s to clear a junction from a standstill (critical gaps of drivers are 6 to 7 s)
 EGO_CLEARANCE = _F(7.0)  # m around the ego car in which no car enters a junction
 EGO_BEHIND = _F(2.5)  # m to the side within which the ego car, if it is behind, follows a car
-EGO_INSIDE = _F(0.5)  # m from a lane's centre line within which the ego car's side is when it blocks the lane
-EGO_SECTOR_COSINE = _F(0.6)  # of the angle from its heading within which the ego car may be soon
+EGO_INSIDE = _F(0.5)  # m; the ego car blocks a lane if its side is this close to the lane's centre line
+EGO_SECTOR_COSINE = _F(0.6)  # of the angle from the ego car's heading within which it may soon be
 
 
 @dataclass(frozen=True)
@@ -113,13 +112,13 @@ class TrafficConfig:
     jam: float = 2.0  # m, bumper to bumper at standstill, s0 of IDM
     lateral: float = 3.0  # m/s2, lateral acceleration in bends
     politeness: float = 0.2  # p of MOBIL
-    threshold: float = 0.2  # m/s2 that a change of lanes must gain
-    safe_braking: float = 3.0  # m/s2 of braking that a change of lanes may force on the car behind
+    threshold: float = 0.2  # m/s2 that a lane change must gain
+    safe_braking: float = 3.0  # m/s2 of braking that a lane change may force on the car behind
     lane_change_speed: float = 1.25  # m/s sideways, at most
-    verge: float = 0.3  # m from the side of a car that moves to the right to the road's edge, at least
+    verge: float = 0.3  # m, least distance from the road's edge to the side of a car that has moved to the right
     give_way: float = 0.9  # m that a car moves to the right for oncoming cars, at most
-    taper: float = 0.1  # m to the right for each m of way, while it does
-    beside: float = 0.35  # m between the sides of cars on two lanes that cross, below which they may touch
+    taper: float = 0.1  # m to the right per m driven while giving way
+    beside: float = 0.35  # m between the sides of cars on crossing lanes, below which they may touch
     spawn_gap: float = 14.0  # m between two cars at the start of an episode, at least
     spawn_gap_ego: float = 22.0  # m between a car and the ego car at the start, at least
     courtesy: float = 10.0  # m; waiting behind a standing car within this distance is not idleness
@@ -182,11 +181,11 @@ def constants(config: SimConfig) -> Constants:
         raise ValueError("the sensor needs 2 rays or more, a field of view within 240 degrees and a range within 63 m")
     apart = vehicle.length + config.traffic.jam
     if not min(config.traffic.spawn_gap, config.traffic.spawn_gap_ego) >= apart:
-        raise ValueError(f"spawn_gap and spawn_gap_ego must be a car's length and jam, {apart:g} m, or more")
+        raise ValueError(f"spawn_gap and spawn_gap_ego must be at least a car's length plus jam, {apart:g} m")
     if not 0.0 < vehicle.rear_axle < vehicle.wheelbase:
         raise ValueError("the centre of mass must lie between the axles")
     view = math.radians(sensors.field_of_view)
-    # In a control step two cars approach each other by `approach` at most; waiting behind a car counts within courtesy.
+    # Two cars approach each other by at most `approach` in a control step; within courtesy, waiting is not idleness.
     approach = 2.0 * vehicle.speed_limit * episode.control_period
     near = math.hypot(vehicle.length + config.traffic.courtesy, vehicle.width) + approach
     f = np.float32

@@ -1,7 +1,7 @@
-"""The base of all errors that are meant for the user."""
+"""The base class of all errors meant for the user."""
 
 from __future__ import annotations
 
 
 class GridSimError(ValueError):
-    """Something that the user can mend; the message is one line that says what. Commands print it and end."""
+    """A problem that the user can fix; the message is one line that says what to fix. Commands print it and exit."""

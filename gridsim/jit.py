@@ -58,10 +58,9 @@ FAST_MATH = {"contract", "arcp", "nsz", "reassoc"}
 
 
 class CacheLocator(UserProvidedCacheLocator):
-    """Finds cached kernels by their path within the package; Numba uses the absolute path.
+    """Finds cached kernels by their path within the package, not by the absolute path as Numba does.
 
-    So a copy of the same sources elsewhere finds the same kernels. Ray unpacks shipped code into a new folder at each
-    start of a cluster.
+    So a copy of the same sources elsewhere finds them: Ray unpacks code into a new folder each time a cluster starts.
     """
 
     @classmethod

@@ -110,7 +110,7 @@ def place(road, start, car, visits):
 
 @leaf
 def start_from(car, start):
-    """The inverse of `place`: the start float32 [5] of an episode that begins where a car is."""
+    """The inverse of `place`: write a car's pose to start float32 [5]."""
     start[0], start[1] = car[X], car[Y]
     start[2] = math.atan2(car[SIN], car[COS])
     start[3], start[4] = car[SPEED], car[STEERING]

@@ -5,8 +5,8 @@ Equations, with l_r the distance from the centre of mass to the rear axle and L 
     x' = v cos(psi + beta),  y' = v sin(psi + beta),  psi' = v / l_r * sin(beta),  v' = a
 The path's curvature is sin(beta) / l_r, but at most grip / v^2: a car that is too fast for its tyres runs wide.
 
-The steering angle changes at the beginning of a control period and holds throughout it. A steering wheel that turns
-evenly within the period is half a period ahead of that: 0.8 m aside after 80 m of changing bends.
+The steering angle changes at the beginning of a control period and then holds. A wheel that turns evenly within the
+period would differ by half a period: 0.8 m to the side after 80 m of changing bends.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Action(IntEnum):
 
 @leaf
 def brake(constants, most, speed):
-    """Acceleration (m/s2) of braking by `most` m/s2, or less where the car would stop within the control period."""
+    """Acceleration (m/s2) when braking by `most` m/s2, or by less if the car would stop within the control period."""
     return -min(max(speed / constants.dt, -most), most)
 
 
