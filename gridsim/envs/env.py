@@ -1,22 +1,22 @@
-"""Gymnasium: the native vector environment, and the single environment, which is the same thing with one car.
+"""Gymnasium environments: the native vector environment, and a single environment that wraps it with one car.
 
 `import gridsim` registers an id for each scenario, `GridSim/Seamless-v0` and so on.
 
 Observation:
 
-* `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; with `motion`
-  between them how fast a car that a ray meets comes closer, float32 [rays], as a share of 30 m/s; with `steering` at
-  the end the steering angle as a share of 27 degrees.
+* `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts
+  between them the closing speed of the car that each ray hits, float32 [rays], as a share of 30 m/s; `steering` appends
+  the steering angle as a share of 27 degrees.
 * `grid`, a dictionary: `grid`, uint8 [frames, 80, 80], the occupancy grid of `gridsim.sensing.grid`, the newest last,
   and `speed`, float32 [1], as a share of 30 m/s.
-* `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as policies of convolutions take pictures.
+* `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
 
 Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
-clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. There is no penalty for idling, 15
-steps without progress: its last step is rewarded as any other, and the episode terminates.
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling, 15 steps without progress,
+terminates the episode without a penalty: its last step is rewarded like any other.
 
-An episode is a function of its car's seed and of its number alone: after `reset(seed=s)` car i meets the episodes that
-a single environment meets after `reset(seed=s + i)`, whatever the other cars do.
+An episode depends only on its car's seed and its number: after `reset(seed=s)`, car i drives the episodes that a single
+environment drives after `reset(seed=s + i)`, whatever the other cars do.
 """
 
 from __future__ import annotations
@@ -50,26 +50,26 @@ from gridsim.view.display import has_display
 if TYPE_CHECKING:
     from gridsim.view.render import Renderer, Window
 
-RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture a control period: true speed
+RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture per control period: real time
 
 _F, _U = np.float32, np.uint64
 _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
-#: bool [ends]: what terminates and what truncates an episode.
+#: bool [ends]: which ends terminate, and which truncate, an episode.
 TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])
 TRUNCATES = np.isin(list(End), [End.SUCCESS, End.TIME])
 
 
 class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
-    """Many cars at once, each in an episode of its own.
+    """Many cars at once, each in its own episode.
 
-    `autoreset_mode` says what comes after an episode's end: `NEXT_STEP`, the step after it begins the next one and does
-    not drive; `SAME_STEP`, the next one begins at once, and info has what the last one ended with as `final_obs`, an
-    array of objects, and `final_info`; `DISABLED`, the cars that have ended are reset by the caller before the next
-    step, `reset(options={"reset_mask": mask})`.
+    `autoreset_mode` says how the next episode begins. `NEXT_STEP`: in the step after the end, in which the car does not
+    drive. `SAME_STEP`: at once; info has the ended episode's last observations as `final_obs`, an array of objects, and
+    its last info as `final_info`. `DISABLED`: the caller resets the cars that have ended before the next step, by
+    `reset(options={"reset_mask": mask})`.
 
     info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of an
-    `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate: the road goes on, and
-    neither is observed.
+    `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes on
+    and the observation shows neither.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form
@@ -102,14 +102,14 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             num_envs: cars.
             scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
             maps: how many maps the episodes are drawn from, or the maps themselves.
-            map_seed: seed of the first of them; the others' follow.
-            traffic: other cars in each car's world; None is as many as the scenario has by default.
-            frames: grids that make an observation, 1 to 8.
+            map_seed: seed of the first map; the others' seeds follow.
+            traffic: other cars in each car's world; None means the scenario's default.
+            frames: grids in an observation, 1 to 8.
             render_mode: `rgb_array`, or `human`, a window that follows the first car; `metadata["render_modes"]` has
                 it only where there is a display.
-            max_episode_steps: time limit in control steps; None is the configuration's.
-            autoreset_mode: of `gymnasium.vector`, or its value, as in `SameStep`.
-        Raises: ValueError with one line where an argument makes no sense.
+            max_episode_steps: time limit in control steps; None means the configuration's.
+            autoreset_mode: an `AutoresetMode` of `gymnasium.vector`, or its value, such as `SameStep`.
+        Raises: ValueError with one line for an invalid argument.
         """
         check_name(scenario)
         for name, value, known in (
@@ -123,7 +123,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             raise ValueError(f"frames must be 1 to {MAX_FRAMES}, and more than 1 only for grids, not {frames}")
         for name, asked in (("motion", motion), ("steering", steering)):
             if asked and observation != "rays":
-                raise ValueError(f"{name} is seen beside rays; leave it out with observation={observation!r}")
+                raise ValueError(f"{name} is only for rays; leave it out with observation={observation!r}")
         if traffic and is_map_file(scenario):
             raise ValueError(f"{scenario} has no lanes for traffic; use traffic=0")
         if map_seed < 0:
@@ -154,13 +154,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        #: float32 [n, rays], m: the ranges that the last observations were made of.
+        #: float32 [n, rays], m: the ranges behind the last observations.
         self.ranges = np.zeros((num_envs, self.config.sensors.rays), dtype=np.float32)
         self._fastest = np.ones(num_envs, dtype=np.float32)  # m/s, upper speed of each car's scenario
         self._seeded = self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy draws pictures of its own, and opens a window of its own."""
+        """A copy has its own renderers and its own window."""
         return {**vars(self), "_views": {}, "_window": None}
 
     def reset(
@@ -172,9 +172,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             seed: car i is seeded with seed + i, or with seed[i]; without a seed a car goes on to its next episode.
             options: `map_seed`, one for all cars or one each: the map of these episodes; `start`, [5] or [n, 5]: x, y
                 (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars, once all have
-                been reset. What follows these episodes is drawn as ever.
-        Returns: (observations of all cars, info, whose masks say who has been reset).
-        Raises: ValueError with one line for an option that is unknown or makes no sense.
+                been reset. Later episodes are drawn as usual.
+        Returns: (observations of all cars, info, whose masks say which cars were reset).
+        Raises: ValueError with one line for an unknown or invalid option.
         """
         options = dict(options or {})
         map_seed, start, mask = (options.pop(name, None) for name in ("map_seed", "start", "reset_mask"))
@@ -201,11 +201,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
 
-        Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; of no effect where an episode begins.
-        Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n],
-        info).
-        Raises: gymnasium.error.ResetNeeded before the first reset, and where an episode has ended that nothing resets;
-        ValueError with one line for anything but an action for each car.
+        Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; ignored where an episode begins.
+        Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n], info).
+        Raises: gymnasium.error.ResetNeeded before the first reset, and after the end of an episode that only the caller
+        can reset; ValueError with one line for invalid actions.
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
@@ -256,7 +255,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 episodes.keys[i], episodes.numbers[i] = int(given) % (1 << 64), 0
 
     def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Begin the present episodes of cars `which`. Returns: ranges [k, rays] and speeds [k]."""
+        """Begin the current episodes of cars `which`. Returns: ranges [k, rays] and speeds [k]."""
         maps, starts, keys = self._episodes.draw(which, map_seed, start)
         ranges, speeds = self.simulator.reset(starts, maps, which, keys)
         self._fastest[which] = self._episodes.upper_speeds(maps)
@@ -281,13 +280,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Take in what cars `which` sense now; `begun` [n] says where an episode has begun."""
+        """Record what cars `which` sense now; `begun` [n]: whose episode has just begun."""
         self._observer.take(self.ranges[which], begun[which], which)
         if self.render_mode is not None:
             self._remember(begun)
 
     def _remember(self, begun: np.ndarray) -> None:
-        """Keep where cars are; where an episode has begun, where it was is forgotten. Shows the window."""
+        """Append the cars' positions to their paths, first cleared where an episode has `begun`; update the window."""
         for path, car, new in zip(self._paths, self.simulator.state.cars, begun, strict=True):
             if new:
                 path.clear()
@@ -299,13 +298,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 self._window = Window(RENDER_SIZE)
             if not self._window.closed:
                 self._window.show(self._picture(0), RENDER_FPS)
-                self._window.keys()  # a window whose events nobody takes is shown as one that hangs
-                if self._window.closed:  # by whoever watched: drive on unseen
+                self._window.keys()  # a window whose events are not read is shown as hung
+                if self._window.closed:  # by the user: drive on without it
                     self._window.close()
 
     def _picture(self, i: int) -> np.ndarray:
         """What car i's world looks like: uint8 [height, width, 3]."""
-        from gridsim.view.render import Renderer  # here, because nothing else needs pygame
+        from gridsim.view.render import Renderer  # here, because only pictures need it
 
         state = self.simulator.state
         m = int(state.maps[i])
@@ -323,7 +322,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """A picture uint8 [height, width, 3] of each car's world with `rgb_array`; a window is drawn by step and reset.
+        """With `rgb_array`, a picture uint8 [height, width, 3] of each car's world; `human` is drawn by step and reset.
 
         Raises: gymnasium.error.ResetNeeded before the first reset.
         """
@@ -343,7 +342,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self._window = None
 
     def _info(self) -> dict[str, Any]:
-        """Distance, speed, success and end of every car, in Gymnasium's form: each with a mask of whose it is."""
+        """Distance, speed, success and end of every car; in Gymnasium's form, each with a mask of cars."""
         cars, ends = self.simulator.state.cars, self.simulator.state.ends.copy()
         info = {
             "distance_m": cars[:, DISTANCE].copy(),
@@ -356,7 +355,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
 
 class GridSimEnv(gymnasium.Env[Any, Any]):
-    """One car: a `GridSimVectorEnv` of one without its automatic resets; arguments, spaces, reward and info are its."""
+    """One car, as a `GridSimVectorEnv` of one: the same arguments, spaces, reward and info, no automatic resets."""
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012, Gymnasium's own form
 
@@ -380,11 +379,11 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        # gymnasium.make keeps `max_episode_steps` to itself and its TimeLimit wrapper; it sets this before. An episode
-        # may last as long as the wrapper lets it, and `info["end"]` is to tell when time is up.
+        # gymnasium.make gives `max_episode_steps` only to its TimeLimit wrapper, after it sets this. The simulator gets
+        # the same limit, so that `info["end"]` tells when time is up.
         maker, simulator = sys._getframe(1), self.cars.simulator
         if maker.f_code is gymnasium.make.__code__:
-            named = maker.f_locals  # in a later Gymnasium perhaps by other names: then the wrapper alone has the limit
+            named = maker.f_locals  # a later Gymnasium may name them otherwise: then only the wrapper has the limit
             asked = named.get("max_episode_steps") or getattr(named.get("env_spec"), "max_episode_steps", None)
             if asked is not None and asked > 0:
                 simulator.max_steps = asked
@@ -399,8 +398,8 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control period. Returns: (observation, reward, terminated, truncated, info).
 
-        Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError with one line for
-        anything but an action.
+        Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError with one line for an
+        invalid action.
         """
         if self.cars.simulator.state.ends[0] != End.RUNNING:
             raise ResetNeeded("step() was called after the episode's end; call reset() first")

@@ -1,4 +1,4 @@
-"""Which episodes cars meet: map, start and traffic follow from a car's seed and from the episode's number alone."""
+"""The episodes of cars: map, start and traffic depend only on a car's seed and the episode's number."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build, is_map_file, seed_of_map
 
 _U = np.uint64
-#: The maps that environments of this process were built for, as long as one of them has them.
+#: The maps of this process's environments, kept while one of them uses them.
 _SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDictionary()
 
 
 def shared_map(scenario: str, seed: int, config: SimConfig) -> Map:
-    """A map that all environments of this process share; one of a file, which may change, is read anew."""
+    """A map that all environments of this process share; a map file is read again, because it may change."""
     if is_map_file(scenario):
         return build(scenario, seed, config)
     found = _SHARED.get((scenario, seed, config))
@@ -32,7 +32,7 @@ def shared_map(scenario: str, seed: int, config: SimConfig) -> Map:
 
 @njit
 def _draw(keys, episodes, which, numbers, drawn):
-    """For cars `which` [k] in their episodes: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
+    """For the episodes of cars `which` [k]: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
     for k in range(which.shape[0]):
         i = which[k]
         episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)
@@ -45,15 +45,15 @@ class Episodes:
     """The episodes of a batch of cars.
 
     Attributes:
-        maps: those that are built; a simulator's scenarios.
+        maps: the maps built so far; a simulator's scenarios.
         keys: uint64 [n], each car's seed.
-        numbers: uint64 [n], of each car's episode since it was seeded.
+        numbers: uint64 [n], each car's current episode, counted from its seeding.
     """
 
     def __init__(self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, config: SimConfig):
-        """Episodes on `maps`, or on so many from `map_seed` on, which are built when first needed.
+        """Episodes on these `maps`, or on that many from `map_seed` on, which are built when first needed.
 
-        Raises: ValueError with one line where there is no map.
+        Raises: ValueError with one line if there is no map.
         """
         self.scenario, self.config = scenario, config
         if isinstance(maps, int) and is_map_file(scenario):
@@ -62,14 +62,14 @@ class Episodes:
         self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in maps]
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
-        self._index = {seed: k for k, seed in enumerate(self._seeds) if self.maps}  # of each map that is built
+        self._index = {seed: k for k, seed in enumerate(self._seeds) if self.maps}  # of the maps built so far
         self.keys = np.zeros(cars, dtype=np.uint64)
         self.numbers = np.zeros(cars, dtype=np.uint64)
 
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and traffic's keys [k] of the present episodes of cars `which`, drawn or given."""
+        """Maps [k], starts [k, 5] and traffic's keys [k] of the current episodes of cars `which`, drawn or given."""
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
@@ -92,17 +92,17 @@ class Episodes:
         return maps, starts, keys
 
     def upper_speeds(self, maps: np.ndarray) -> np.ndarray:
-        """Upper speed (m/s) of the scenario of each of maps [k]."""
+        """Upper speed (m/s) of each of maps [k]."""
         return np.array([s.road.speed_high for s in self.maps], dtype=np.float32)[maps]
 
     def keep_own_maps(self) -> None:
-        """Forget the maps that were asked for by a reset and are not among those that episodes are drawn from."""
+        """Forget maps that a reset asked for, unless episodes are drawn from them."""
         kept = [seed for seed in self._seeds if seed in self._index]
         self.maps[:] = [self.maps[self._index[seed]] for seed in kept]
         self._index = {seed: k for k, seed in enumerate(kept)}
 
     def _map(self, seed: int) -> int:
-        """Index among `maps` of the map of a seed, built where it is not there yet."""
+        """Index in `maps` of the map with a seed; built if missing."""
         seed = seed_of_map(self.scenario, seed)
         if seed not in self._index:
             self.maps.append(shared_map(self.scenario, seed, self.config))

@@ -18,7 +18,7 @@ Seen = np.ndarray | dict[str, np.ndarray]
 
 @njit
 def _observe(ranges, closing, speeds, reach, slowest, limit, observations):
-    """Observations [n, rays + 1], with closing speeds [n, rays] between if they are not None."""
+    """Observations [n, rays + 1], with closing speeds [n, rays] in between if they are not None."""
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
         for r in range(rays):
@@ -41,14 +41,14 @@ def rewards_of(ranges, speeds, progress, ends, fastest, begun, reach, dt):
 
 
 def row(observations: Seen, i: int) -> Seen:
-    """What car i sees of what all see."""
+    """Car i's part of all cars' observations."""
     return {name: part[i] for name, part in observations.items()} if isinstance(observations, dict) else observations[i]
 
 
 class Observer:
     """Turns what a simulator's cars sense into observations.
 
-    Attributes: space, of what one car sees.
+    Attributes: space, the observation space of one car.
     """
 
     def __init__(
@@ -74,12 +74,12 @@ class Observer:
 
     @property
     def table(self) -> GridTable | None:
-        """The grid's table, or None where rays are seen."""
-        # Not kept, because a copy of it could be written to: kernels would be compiled anew for it.
+        """The grid's table, or None if the observation is rays."""
+        # Not stored, because copies of it would be writable, and kernels would be compiled again for them.
         return None if self._observation == "rays" else grid_table(self.config)
 
     def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
-        """Let cars `which` [k] sense `ranges` [k, rays]: their newest frame, or the first where they have `begun`."""
+        """Add `ranges` [k, rays] as the newest frames of cars `which` [k], or as all frames where they have `begun`."""
         table = self.table
         if table is None or self._stack.shape[1] == 1:
             return
@@ -89,7 +89,7 @@ class Observer:
             self._stack[which] = stack
 
     def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
-        """What cars `which` [k] see with ranges [k, rays] and speeds [k], once they `take` these; the caller's own."""
+        """Observations of cars `which` from ranges [k, rays] and speeds [k], after `take`; the caller owns them."""
         table = self.table
         if table is None:
             return self._rays(ranges, speeds, which)

@@ -1,4 +1,4 @@
-"""GridSim's vector environment as Stable-Baselines3's VecEnv: its learners at the speed of the compiled loop.
+"""GridSim's vector environment as Stable-Baselines3's VecEnv: SB3's learners at the speed of the compiled loop.
 
 >>> from stable_baselines3 import PPO
 >>> from gridsim.envs.sb3 import SB3VecEnv
@@ -27,9 +27,9 @@ class SB3VecEnv(VecEnv):
         super().__init__(num_envs, self.cars.single_observation_space, self.cars.single_action_space)
 
     def reset(self) -> Any:
-        """Begin an episode of each car, by what `seed` and `set_options` were given since the last one.
+        """Begin an episode of each car, with the seeds and options set since the last reset.
 
-        Returns: observations. Raises: ValueError with one line for options that make no sense, or that some cars lack.
+        Returns: observations. Raises: ValueError with one line for invalid options, or if only some cars have them.
         """
         seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         names = self._options[0].keys()
@@ -84,12 +84,12 @@ class SB3VecEnv(VecEnv):
         setattr(self.cars, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Only `render`, which SB3 calls for a window. Raises: NotImplementedError, since no car is an environment."""
+        """Only `render`, which SB3 calls for a window. Raises: NotImplementedError otherwise."""
         if method_name == "render":
             pictures = self.cars.render() or [None] * self.num_envs
             return [pictures[i] for i in self._get_indices(indices)]
-        raise NotImplementedError(f"cars are no environments of their own; call .cars.{method_name}")
+        raise NotImplementedError(f"cars are not separate environments; call .cars.{method_name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """None is."""
+        """False for each car."""
         return [False for _ in self._get_indices(indices)]

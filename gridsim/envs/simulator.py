@@ -25,7 +25,7 @@ ACTIONS = len(Action)
 
 
 class Physics(NamedTuple):
-    """What is the same for all cars, as kernels read it; arrays are read-only."""
+    """What all cars share, as kernels read it; arrays are read-only."""
 
     atlas: Atlas
     constants: Constants
@@ -45,7 +45,7 @@ class State(NamedTuple):
 
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
-    """Put cars `which` [k] at `starts` [k, 5], on maps as `_control_all` says; `ranges` [k, rays] is what they see."""
+    """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; fills `ranges` [k, rays]."""
     for row, first, last in runs:
         road = road_of(physics.atlas, row)
         for k in order[first:last]:
@@ -59,7 +59,7 @@ def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges
 def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen):
     """One control period of every car; one whose episode has ended stands still.
 
-    Cars are taken in `order`; runs int64 [maps, 3] says which map of the atlas a stretch of it is on: row, from, to.
+    `order` lists the cars map by map; runs int64 [maps, 3]: a map's row in the atlas, and its cars' range in `order`.
     seen: ranges and closing speeds [n, rays], speeds [n] and progress [n], to be filled.
     """
     constants, drivers = physics.constants, physics.drivers
@@ -94,8 +94,8 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class Simulator:
     """A batch of cars on one or several maps, each in an episode of its own: arrays in, arrays out.
 
-    What a car does depends on its own map, start and actions alone, not on the batch it is in. Maps may be added to
-    `scenarios` at any time; a reset names them by index. Replace one only before all cars are reset.
+    A car's behaviour depends only on its own map, start and actions, not on the batch it is in. Maps may be added to
+    `scenarios` at any time; a reset refers to them by index. Replace one only before all cars are reset.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Simulator:
         """Make room for `cars` cars, each with a world of `traffic` other cars.
 
         `target` (m) and `max_steps` (control steps) are the configuration's unless given.
-        Raises: ValueError with one line where a number makes no sense.
+        Raises: ValueError with one line for an invalid number.
         """
         self.config = config or SimConfig()
         episode = self.config.episode
@@ -119,9 +119,9 @@ class Simulator:
         if cars < 1:
             raise ValueError(f"a simulator needs 1 car or more, not {cars}")
         if traffic < 0:
-            raise ValueError(f"there are 0 other cars or more, not {traffic}")
+            raise ValueError(f"traffic must be 0 cars or more, not {traffic}")
         if not self.target > 0.0 or self.max_steps < 1:
-            raise ValueError(f"an episode has a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
+            raise ValueError(f"an episode needs a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
         constants(self.config)  # raises for a wrong configuration
         self.scenarios = list(scenarios)
         rays = self.config.sensors.rays
@@ -132,15 +132,15 @@ class Simulator:
             ends=np.zeros(cars, dtype=np.uint8),
             worlds=np.zeros((cars, traffic, TRAFFIC_FIELDS), dtype=np.float32),
         )
-        #: float32 [n, rays]: m/s at which what each ray last met came closer over ground; 0 for the road's edge.
+        #: float32 [n, rays], m/s: closing speeds at the last step or reset, as in `boxes.cast_boxes`.
         self.closing = np.zeros((cars, rays), dtype=np.float32)
         self._physics: Physics | None = None  # made when a kernel first needs it
-        self._charted: list[Map] = []  # the maps in its atlas
+        self._charted: list[Map] = []  # the maps in the atlas
         self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
         self._groups = _by_map(self._rows)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without read-only arrays: their copies can be written to, and kernels would be compiled anew for these."""
+        """Without read-only arrays: their copies would be writable, and kernels would be compiled again for them."""
         return {**vars(self), "_physics": None}
 
     def __len__(self) -> int:
@@ -160,12 +160,12 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
-            keys: uint64 [k], or one for all, from which the traffic around each is spawned.
-            worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys, not checked.
+            keys: uint64 [k], or one for all, from which the traffic around each car is spawned.
+            worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys; only the shape is checked.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
-        Raises: ValueError with one line for a wrong shape, a number that is not finite, or a map that is not there.
-        Nothing is changed then.
+        Raises: ValueError with one line for a wrong shape, a number that is not finite, or a missing map. Nothing is
+        changed then.
         """
         n = len(self)
         cars = np.arange(n) if cars is None else np.asarray(cars, dtype=np.intp)
@@ -174,7 +174,7 @@ class Simulator:
         if starts.shape != (len(cars), 5) or not np.isfinite(starts).all():
             raise ValueError(f"starts must be {len(cars)} rows of finite x, y, heading, speed, steering")
         if maps.size and not 0 <= maps.min() <= maps.max() < len(self.scenarios):
-            raise ValueError(f"a start names a map that is not among the {len(self.scenarios)} there are")
+            raise ValueError(f"maps must be indices into the {len(self.scenarios)} scenarios")
         if cars.ndim != 1 or (cars.size and not 0 <= cars.min() <= cars.max() < n):
             raise ValueError(f"cars must be indices from 0 to {n - 1}")
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
@@ -226,9 +226,9 @@ class Simulator:
         return spawned
 
     def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:
-        """Rows int64 [k] in the atlas of maps [k]. It is made anew if one is missing, of these alone for `everyone`.
+        """Rows int64 [k] of maps [k] in the atlas, rebuilt if one is missing: of these alone if `everyone` is reset.
 
-        One car alone is always on an atlas of one map, which is no copy.
+        One car alone always has an atlas of one map, which is not copied.
         """
         wanted = {m: self.scenarios[m] for m in np.unique(maps).tolist()}
         kept = [] if len(self) == 1 else self._charted
@@ -244,8 +244,8 @@ class Simulator:
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
         Returns: (ranges float32 [n, rays] in m, speeds float32 [n] in m/s, progress float32 [n], m of new ground in
-        this step, ends uint8 [n], End); arrays of the caller's own.
-        Raises: ValueError with one line for anything but an action for each car; RuntimeError before the first reset.
+        this step, ends uint8 [n], End); the caller owns the arrays.
+        Raises: ValueError with one line for invalid actions; RuntimeError before the first reset.
         """
         n, state = len(self), self.state
         if self._rows.min() < 0:
@@ -261,9 +261,7 @@ class Simulator:
         return ranges, speeds, progress, state.ends.copy()
 
 
-def views(
-    scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:
     """What cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS].
 
     Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].

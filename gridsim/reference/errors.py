@@ -75,7 +75,7 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
 
 
 def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Series:
-    """A drive beside the reference driver's profile along its path, from its poses [n, 5] at the control steps.
+    """A drive and the reference driver's profile along its path, from the poses [n, 5] at the control steps.
 
     Poses are as `view.drive.poses_of` gives them. Reversing, and the same metres driven again, are left out, because a
     reference only drives forward. So is standing, where steering has no effect: a path from rest begins after the first
@@ -85,8 +85,8 @@ def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Se
     cars. Its curvature is that of the driven path over 10 m: an agent that weaves in longer waves slows the reference
     down too, so look at both errors.
 
-    Left out are the first 5 m, where the curvature is not known, and the end, from where the reference could not have
-    stopped any more, because what it would have had to brake for is not known.
+    The first 5 m are left out, because their curvature is not known. So is the end, from where the reference could no
+    longer have stopped: what it would have had to brake for is not known.
 
     Raises: ValueError if the car never moved forward.
     """

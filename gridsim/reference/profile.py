@@ -1,4 +1,4 @@
-"""The reference driver: the speed and the steering that a path asks for, alone on the road.
+"""The reference driver: the speed and steering that a path calls for on an empty road.
 
 Its speed is limited by curvature, by braking before bends and by accelerating after them. Its steering is the bicycle
 model's for the path's curvature.

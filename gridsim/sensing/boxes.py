@@ -20,8 +20,8 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
 
     Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading, and velocity (m/s) along the
     heading and to the left; world of `world`.
-    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the closing speed (m/s) along the ray of the
-    sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
+    Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the closing speed (m/s), along the ray, of
+    the sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
     """
     if closing is not None:
         closing[:] = _ZERO
@@ -29,7 +29,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
     radius = math.sqrt(length * length + breadth * breadth)
     last_ray = _I(ranges.shape[0] - 1)
     # A field of view below 180 degrees is the intersection of two half planes, along the first and the last ray. Boxes
-    # outside of it are skipped without computing an angle.
+    # outside it are skipped without computing an angle.
     narrow = fan[0, 0] > _ZERO
     margin, reach = _F(-1.01) * radius, constants.ray_range + radius
     for j in range(world.shape[0]):

@@ -28,7 +28,7 @@ _F, _I, _N = np.float32, np.int32, np.uint64
 
 CELLS = 80  # along each side
 CELL = 0.5  # m
-MAX_FRAMES = 8  # that an observation is made of
+MAX_FRAMES = 8  # in an observation
 #: Codes of a cell, as grey levels of a picture; networks see them divided by 255.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
 HALF_DIAGONAL = _F(CELL * math.sqrt(0.5))  # m

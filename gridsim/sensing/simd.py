@@ -25,10 +25,10 @@ _SLOPE = _F(CELLS_PER_M / FIELD_UNITS)
 _NEAR = _F(2.0)  # m of clearance below which Newton steps are taken
 _STRETCH = _F(1.5)  # length of a step above it, in clearances
 _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
-_SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance, and a leap longer than a stretched step
+_SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance, and at most a stretched step plus a leap
 _GAP = _F(0.95)  # m of a step that may be blind, among thin walls
-# How to march without and with thin walls: most steps, leap in m (not to jump over an island), whether steps are
-# checked for blind parts. PLAIN may pass walls of less than 3 m.
+# How to march without and with thin walls: maximum number of steps, leap in m (too short to jump over an island),
+# whether steps are checked for blind parts. PLAIN may pass walls of less than 3 m.
 PLAIN = (16, _F(2.0), False)
 AMONG_THIN_WALLS = (24, _F(0.9), True)
 
@@ -37,10 +37,10 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
     """Build the intrinsic that moves each of SIMD_RAYS rays from its start range to the edge of the road.
 
     Its arguments: packed field with its sides; origin in cells; reach m; the heading as cosine and sine; fan of
-    `rays.fan` and its first ray that is meant; the ray start table, where in it the origin's row begins, the bin of the
-    fan's first ray, and metres per unit, or 0 where the origin has no row; ranges float32 [rays], of which those from
-    that ray on are written, in [0, reach]. It runs until the last ray has arrived. `how` is PLAIN or AMONG_THIN_WALLS.
-    Where steps are not checked for blind parts, no code for that is emitted.
+    `rays.fan` and the index of the first ray to march; the ray start table, where in it the origin's row begins, the
+    bin of the fan's first ray, and metres per unit, or 0 if the origin has no row; ranges float32 [rays], written from
+    that ray on, in [0, reach]. It runs until the last ray has arrived. `how` is PLAIN or AMONG_THIN_WALLS. Where steps
+    are not checked for blind parts, no code for that is emitted.
     """
     steps, leap, look_back = how
 

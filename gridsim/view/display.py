@@ -10,5 +10,5 @@ _VARIABLES = ("SDL_VIDEODRIVER", "WAYLAND_DISPLAY", "DISPLAY")
 
 
 def has_display() -> bool:
-    """Whether a window may be opened, by the environment's variables; on other systems than Linux always."""
+    """Whether a window may be opened, by environment variables; always true on systems other than Linux."""
     return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in _VARIABLES)

@@ -27,7 +27,7 @@ from gridsim.view.render import Renderer, Window, interpolate
 COLUMNS = (
     "time_s",  # since the episode's start
     "x_m", "y_m", "heading_rad", "speed_mps", "steering_rad", "action",
-    "episode",  # which one of the file: a restart begins the next one
+    "episode",  # index in the file; a restart begins the next one
     "traffic",  # other cars
     "scenario", "map_seed",
 )  # fmt: skip
@@ -82,7 +82,7 @@ def poses_of(states: np.ndarray) -> np.ndarray:
 
 
 def action_for(keys: set[str], speed: float) -> Action:
-    """The action for the keys that are held (named as in "up"), at a speed in m/s.
+    """The action for the held keys (named as in "up"), at a speed in m/s.
 
     Braking has priority, left and right cancel each other, and down reverses once the car stands.
     """
@@ -148,7 +148,7 @@ def read_drive(path: str | os.PathLike[str]) -> Drive:
                 return _drive_of(reader)
             except (csv.Error, ValueError) as error:
                 place = f"{path}, line {max(reader.line_num, 1)}"
-                raise DriveError(f"{place}: no recorded drive, or not a whole one: {str(error)[:200]}") from error
+                raise DriveError(f"{place}: not a recorded drive, or incomplete: {str(error)[:200]}") from error
     except OSError as error:
         raise DriveError(f"{path}: cannot be read: {error.strerror or error}") from error
 
@@ -201,7 +201,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
         else:
             ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
             if ends[0] != End.RUNNING:
-                raise DriveError(f"replayed, the drive ends at row {k} of {n}: it was driven on another map")
+                raise DriveError(f"the replay ends at row {k} of {n}: the drive was recorded on another map")
         rows.append((simulator.state.cars[0].copy(), ranges[0].copy(), simulator.state.worlds[0].copy()))
     cars, views, worlds = (np.stack(column) for column in zip(*rows, strict=True))
     return np.where(begins[:, None], drive.poses, poses_of(cars)), cars, views, worlds

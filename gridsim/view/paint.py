@@ -39,7 +39,7 @@ SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, co
 def draw_ground(road, repeats, origin, step_x, step_y, pixels_per_m, image):
     """Ground and road.
 
-    Args: a `smoothed` road; whether it repeats beyond its sides, or there is wall; place of the first pixel's centre
+    Args: a `smoothed` road; whether it repeats beyond its sides (else wall); place of the first pixel's centre
     and steps to the next pixel to the right and below, float64 [2] in m.
     Writes: image uint8 [h, w, 3].
     """

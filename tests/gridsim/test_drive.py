@@ -107,9 +107,9 @@ def test_recorder_overwrites_nothing(scenario, recorded, tmp_path):
 
 
 DAMAGES = {
-    "cut off": (lambda text: text[: len(text) // 2 - 3], "not a whole one: "),
+    "cut off": (lambda text: text[: len(text) // 2 - 3], "or incomplete: "),
     "header only": (lambda text: text.splitlines()[0] + "\n", "no rows"),
-    "other table": (lambda text: "a,b\n1,2\n", "line 1: no recorded drive, or not a whole one: the first line must be"),
+    "other table": (lambda text: "a,b\n1,2\n", "line 1: not a recorded drive, or incomplete: the first line must be"),
     "not a number": (lambda text: _edit(text, 3, "x_m", "nan"), "line 5: "),
     "action 8": (lambda text: _edit(text, 3, "action", "8"), "action must be 0 to 7"),
     "skipped episode": (lambda text: _edit(text, 3, "episode", "2"), "episode"),
