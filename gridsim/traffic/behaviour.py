@@ -138,7 +138,7 @@ def horizon(drivers, speed):
 
 @leaf
 def _ahead(network, car, other):
-    """Way (m) from a car to another one ahead on its lane or on its next two lanes; else 1e9."""
+    """Distance (m) along the lanes from a car to another ahead on its lane or its next two lanes; else 1e9."""
     lane, along = other[LANE], other[ALONG]
     if lane == car[LANE] and along > car[ALONG]:
         return along - car[ALONG]
@@ -158,7 +158,7 @@ def _swerve(drivers, speed, shift, sway, place, way):
     bend = min(_ONE / SWERVE_RADIUS, drivers.lateral / max(speed * speed, _ONE))
     steepest = min(STEEPEST_SWERVE, drivers.shift / max(speed, _ONE))
     left = place - shift
-    # By this slope it arrives along the lane, with half the bend.
+    # With this slope it would end up parallel to the lane, using half the bend.
     wanted = math.copysign(min(math.sqrt(bend * abs(left)), steepest), left)
     after = min(max(wanted, sway - bend * way), sway + bend * way)
     moved = _HALF * (sway + after) * way
@@ -169,10 +169,10 @@ def _swerve(drivers, speed, shift, sway, place, way):
 
 @leaf
 def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
-    """Way (m) along a car's path to where a car at (x, y) with a heading blocks it; 1e9 if it does not.
+    """Distance (m) along a car's path to where a car at (x, y) with a heading blocks it; 1e9 if it does not.
 
-    Tests points of the path from the car's front up to `horizon` m. The path moves from the car's place to `furthest`
-    (m to the right), or as far as there is room; on a road with several lanes there is none, and it ends in the lane.
+    Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's place to `furthest`
+    m right of the lane, or as far as there is room; on a road with several lanes there is none: it returns to the lane.
     """
     shift, sway = car[SHIFT], car[SWAY]
     aside_by = furthest > _ZERO or shift != _ZERO
@@ -210,7 +210,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < _ZERO:
                     return travelled
-                hop = max(free, drivers.half_width + CAUTION)  # the path is free at least so far
+                hop = max(free, drivers.half_width + CAUTION)  # the path is free for at least this far
                 along += hop
                 travelled += hop
         along -= length
@@ -256,10 +256,9 @@ def _find_gaps(network, drivers, world, ego):
     """Find the nearest obstacle within each car's horizon: its GAP and LEAD_SPEED."""
     cars = world.shape[0]
     for i in range(cars):
-        speed = world[i, SPEED]
-        world[i, HORIZON] = horizon(drivers, speed)
+        world[i, HORIZON] = horizon(drivers, world[i, SPEED])
         world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
-    # Searched beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
+    # The search goes beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
     beyond = _F(2.0) * (drivers.half_length + CAUTION)
     ego_is_there = is_there(ego)
     for i in range(cars):
@@ -289,7 +288,7 @@ def _desired(network, car):
 
 @leaf
 def change_lanes(network, drivers, world, i, ego):
-    """At its turn, move car i to a neighbouring lane if that is safe and a gain."""
+    """When its timer has run out, move car i to a neighbouring lane if that is safe and a gain."""
     car = world[i]
     if car[LANE_TIMER] > _ZERO:
         car[LANE_TIMER] -= _ONE
@@ -302,7 +301,7 @@ def change_lanes(network, drivers, world, i, ego):
 
 @leaf
 def _way_between(network, lane, along, other):
-    """Way (m) from a place on a lane to a car on it, or on the piece after or before it; else 1e9."""
+    """Distance (m) from a place on a lane to a car on it, or on the lane after or before it; else 1e9."""
     there, place = _I(other[LANE]), other[ALONG]
     if there == lane:
         return place - along

@@ -8,13 +8,7 @@ import numpy as np
 
 from gridsim.car.ego import STEERING
 from gridsim.car.vehicle import advance, path_curvature
-from gridsim.config import (
-    EMERGENCY_BRAKING,
-    FORESIGHT,
-    FORESIGHT_STEP,
-    MEETING_DISTANCE,
-    SAME_WAY_COSINE,
-)
+from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, wrapped, wrapped_any
 from gridsim.sensing.boxes import boxes_touch
@@ -32,7 +26,7 @@ def is_there(ego):
 
 @leaf
 def meets_ego(network, drivers, car, ego):
-    """Whether the ego car is near, not a length behind, and oncoming or crossing, or was when the car moved over."""
+    """Whether the ego car is near, at most a length behind, and oncoming or crossing, or was when the car moved over."""
     same_way = car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO
     if same_way or not is_there(ego):
         return False
@@ -68,15 +62,15 @@ def shifted_right(network, k, other, right):
 
 @njit(_nrt=False)
 def way_to_ego_collision(network, drivers, car, ego):
-    """Way (m) along a car's path to its predicted collision with the ego car; 1e9 if it should drive on.
+    """Distance (m) along a car's path to its predicted collision with the ego car; 1e9 if it should drive on.
 
     Both are predicted at constant speed: the car along its lanes, keeping to the right, the ego car on its current arc.
     The car drives on if they do not touch within FORESIGHT, or if the ego car would hit its side or rear and it can no
-    longer stop before.
+    longer stop in time.
     Not inlined: calls, with all the network's arguments, are expensive but rare.
     """
     lane = _I(car[LANE])
-    length, begin = lane_length(network, lane), -car[ALONG]  # length of the lane, way to its beginning (m)
+    length, begin = lane_length(network, lane), -car[ALONG]  # length of the lane, distance to its beginning (m)
     contact = _F(2.0) * math.sqrt(drivers.half_length * drivers.half_length + drivers.half_width * drivers.half_width)
     x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
     curvature = path_curvature(drivers.ego, speed, ego[STEERING])

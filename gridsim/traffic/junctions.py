@@ -60,10 +60,8 @@ def _way_to_point(network, lane, x, y, within):
     """Way (m) along a lane to its first point within `within` m of (x, y); 1e9 if there is none."""
     first, k = network.offsets[lane], network.offsets[lane]
     while k < network.offsets[lane + 1]:
-        dx, dy = (
-            wrapped_any(network.points[k, 0] - x, network.width),
-            wrapped_any(network.points[k, 1] - y, network.height),
-        )
+        dx = wrapped_any(network.points[k, 0] - x, network.width)
+        dy = wrapped_any(network.points[k, 1] - y, network.height)
         apart = math.sqrt(dx * dx + dy * dy)
         if apart < within:
             return _F(k - first) * network.steps[lane]

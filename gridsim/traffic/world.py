@@ -18,7 +18,7 @@ from gridsim.maps.network import Network, wrapped
 _F, _I, _U = np.float32, np.int32, np.uint64
 _ZERO, _ONE = _F(0.0), _F(1.0)
 
-# Fields of a traffic car's state; X to SPEED are where the ego car's are.
+# Fields of a traffic car's state; X to SPEED have the same indices as the ego car's.
 X, Y = 0, 1  # m, centre of mass
 COS, SIN = 2, 3  # heading
 SPEED = 4  # m/s
@@ -36,7 +36,7 @@ HORIZON = 16  # m ahead that it looks in this step
 GAP = 17  # m from its middle to the nearest obstacle
 LEAD_SPEED = 18  # m/s, of that obstacle along its heading
 LANE_TIMER = 19  # control steps until its next decision on a change of lanes
-SWAY = 20  # m to the left of its lane for each m of way, while SHIFT changes
+SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
 FIELDS = 21
 
 
@@ -116,7 +116,7 @@ def _is_free(network, world, n, x, y, apart):
 
 @njit(nogil=True)
 def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
-    """Spawn a world [cars, FIELDS]: uniformly over the lanes from `first` on, apart from each other and the ego."""
+    """Spawn a world [cars, FIELDS], uniformly over the lanes from `first` m on, apart from each other and the ego."""
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
@@ -153,7 +153,7 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
         half = config.vehicle.length / 2
         lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
         junction = np.diff(network.crossing_offsets) > 0
-        behind = np.isin(np.arange(len(lengths)), network.successors[junction])  # a junction
+        behind = np.isin(np.arange(len(lengths)), network.successors[junction])  # preceded by a junction
         before = junction[network.successors[:, 0]]
         first = np.where(behind, half, 0.0)
         last = lengths - np.where(before, half + float(STOP_LINE_GAP), 0.0)
