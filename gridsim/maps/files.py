@@ -1,4 +1,4 @@
-"""Maps from files: a picture in which bright is road, or the YAML form of ROS's map_server with a picture.
+"""Maps from files: a picture in which bright pixels are road, or the YAML form of ROS's map_server with a picture.
 
 A picture is thresholded at its own resolution. The signed distance to the edge between road and wall is sampled at the
 nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture. World coordinates have
@@ -57,11 +57,11 @@ MAX_NODES = 1 << 24  # of the field
 MAX_TABLE = 1 << 28  # bytes of the table of start ranges
 RESOLUTION = (0.01, 1.0)  # m a pixel, from, to
 SHORTEST_SIDE = 16  # m
-MOST_BORDER = 0.5  # share of a picture's border that is road, from which on it is taken for inverted
+MOST_BORDER = 0.5  # share of road on a picture's border from which the picture is taken to be inverted
 
 
 class MapWarning(UserWarning):
-    """What is probably wrong with a map; the message is one line for the user."""
+    """A probable mistake in a map; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
@@ -123,12 +123,12 @@ def _shown(value: object) -> str:
     try:
         text = " ".join(reprlib.repr(value).split())
     except ValueError:  # a number of more digits than Python prints
-        return "what it is"
+        return "a value with too many digits"
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _bytes(path: Path) -> bytes:
-    """A file's bytes. Raises: GridSimError with one line if it is no file, too large or unreadable."""
+    """A file's bytes. Raises: GridSimError with one line if it is not a file, too large or unreadable."""
     limit = MAX_YAML if path.suffix.lower() in YAMLS else MAX_IMAGE
     try:
         status = path.stat()
@@ -296,8 +296,8 @@ def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit
     length = road_length(nodes)
     if length <= 1.05 * revisit:  # 5 % for the error of the estimate
         warnings.warn(
-            f"{stem} has about {length:.0f} m of road. What is driven again within {revisit:g} m counts "
-            "nothing: cars end idle in their second lap. Make the road longer, or its resolution larger",
+            f"{stem} has about {length:.0f} m of road. Ground driven again within {revisit:g} m does not count: "
+            "cars end idle in their second lap. Make the road longer, or its resolution larger",
             MapWarning,
             stacklevel=1,
         )

@@ -13,16 +13,7 @@ from gridsim.config import START_SPEED, SimConfig
 from gridsim.jit import njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network, make_network
-from gridsim.maps.roads import (
-    CELLS_PER_M,
-    HEADING_BINS,
-    HEADING_WRAP,
-    START_CELLS_PER_M,
-    Lanes,
-    Road,
-    Strips,
-    freeze,
-)
+from gridsim.maps.roads import CELLS_PER_M, HEADING_BINS, HEADING_WRAP, START_CELLS_PER_M, Lanes, Road, Strips, freeze
 
 
 @dataclass(frozen=True)
@@ -30,7 +21,7 @@ class Map:
     """One map."""
 
     name: str  # its scenario's, or a file's path
-    seed: int  # that it was built from
+    seed: int  # from which it was built
     road: Road
     lanes: Lanes  # for starts, traffic and drivers
     strips: Strips  # the exact drivable area, for pictures and tests
@@ -82,7 +73,7 @@ class Map:
         return Map.from_arrays, (self.arrays(),)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Map:
-        """It cannot be changed, so that copies share it."""
+        """Copies share the map, because it cannot be changed."""
         return self
 
 

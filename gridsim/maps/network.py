@@ -19,7 +19,7 @@ _ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 
 
 class Network(NamedTuple):
-    """Lanes as kernels read them; arrays flat, read-only and C-contiguous. More about each is in `roads.Lanes`."""
+    """Lanes as kernels read them; arrays flat, read-only and C-contiguous. See `roads.Lanes`."""
 
     points: np.ndarray  # float32 [n, 2], m
     speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
@@ -30,7 +30,7 @@ class Network(NamedTuple):
     right: np.ndarray
     crossing_offsets: np.ndarray  # int32 [lanes + 1]
     crossings: np.ndarray  # int32 [c], the junction lanes that cross each lane, lane by lane
-    clear: np.ndarray  # float32 [c], m along each of those beyond which a car no longer blocks this lane
+    clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
     room: np.ndarray  # float32 [n], m that a car can move to the right for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
     width: np.float32  # m, of the torus
@@ -87,7 +87,7 @@ def _ease(offsets, steps, successors, slope, room):
 
 
 def _room_on_right(lanes: Lanes, config: SimConfig, clearance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """How far (m) a car at each point of the lanes can move to the right, by its right side; found by bisection."""
+    """How far (m) a car at each point can move to the right, limited by its right side; found by bisection."""
     vehicle, traffic = config.vehicle, config.traffic
     k, counts = np.arange(len(lanes.points)), np.diff(lanes.offsets)
     before = np.maximum(k - 1, np.repeat(lanes.offsets[:-1], counts))
@@ -146,7 +146,7 @@ def make_network(
     config: SimConfig,
     clearance: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Network:
-    """The network of a map's lanes; `speed_limit` (m/s) is the scenario's.
+    """The network of a map's lanes; `speed_limit` (m/s) is traffic's on a straight.
 
     Args: clearance of points float32 [n, 2] (m), float32 [n] as `roads.clearances`. Without it, `room` is 0.
     """

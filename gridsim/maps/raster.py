@@ -15,7 +15,7 @@ from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
 OUTSIDE = -FIELD_FLOOR  # m of wall around the road, at least, so that it does not wrap round the field's sides
 _FINE = 0.25  # m, largest pixels on which distances are measured; larger ones are subdivided
 _WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
-_TIP = 0.25  # m that a corner may extend beyond a disc of that radius without being a thin wall
+_TIP = 0.25  # m that a corner may extend beyond a disc of radius _WALL without being a thin wall
 _DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m, the largest clearance that the field holds
 _HALO = _DEEPEST + 2.0  # m around a tile that can influence it
 _TILE = 128  # nodes
@@ -223,4 +223,4 @@ def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -
     wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
     if len(wrong):
         x, y, _ = wrong[0]
-        raise ValueError(f"starts: at {x:g} m, {y:g} m from the lower left corner a car is not all on the road")
+        raise ValueError(f"starts: at {x:g} m, {y:g} m from the lower left corner a car is not entirely on the road")

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from gridsim.jit import leaf, njit
 
 CELLS_PER_M = 2  # nodes of the clearance field per metre
-FIELD_FLOOR = -2.0  # m, clearance of byte 0, and of all that is deeper inside a wall
+FIELD_FLOOR = -2.0  # m, clearance of byte 0, also of places deeper inside a wall
 FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
 HEADING_BINS = 90  # bins of heading in the ray start table, 4 degrees each
 HEADING_WRAP = 64  # bins repeated after the last, so that a fan of rays needs no wrapping
@@ -44,11 +44,11 @@ class Road(NamedTuple):
     height: np.float32  # m along y
     speed_low: np.float32  # m/s, the speed interval
     speed_high: np.float32  # m/s
-    thin: np.uint32 = _U(1)  # 1 if walls may be thinner than THIN_WALL, so that rays march with care
+    thin: np.uint32 = _U(1)  # 1 if walls may be thinner than THIN_WALL; then steps of rays are checked
 
 
 class _Arrays:
-    """Base of records of arrays, which cannot be written to through them."""
+    """Base of records that hold read-only views of arrays."""
 
     def __post_init__(self):
         for name, array in vars(self).items():
@@ -83,7 +83,7 @@ class Lanes(_Arrays):
     Attributes:
         points: float32 [n, 2], m; a lane's points lie together, in driving direction, not wrapped over the torus.
         offsets: int32 [lanes + 1], where each lane's points begin.
-        successors: int32 [lanes, k], filled up with -1; every lane has at least one. A successor begins where the lane
+        successors: int32 [lanes, k], padded with -1; every lane has at least one. A successor begins where the lane
             ends, up to whole turns of the torus.
         steps: float32 [lanes], m along the lane between its points; 1 m at most.
         left: int32 [lanes], the lane to the left to which a car may change, or -1. Its point i is beside point i.
@@ -225,8 +225,8 @@ def _ray_starts(nodes, row_of, ray_range):
     ranges = np.empty((count, HEADING_BINS), dtype=np.uint8)
     first, t = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.float32)
     free, at = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.uint32)
-    # Cones of neighbouring cells in one direction are about as long as each other. They are marched in lockstep, by
-    # loops of which all but the one that reads the field are vectorised; finished ones do not move.
+    # Cones of neighbouring cells in one direction are about equally long. They are marched in lockstep, by loops that
+    # are vectorised except the one that reads the field; finished cones do not move.
     lanes = _N(_SIMD_CONES)
     for block in range(0, count, _SIMD_CONES):
         here, any_free = _N(block), _I(0)

@@ -26,7 +26,7 @@ def is_there(ego):
 
 @leaf
 def meets_ego(network, drivers, car, ego):
-    """Whether the ego car is near, at most a length behind, and oncoming or crossing, or was when the car moved over."""
+    """Whether the ego car is near, a length behind at most, and oncoming or crossing, or was when the car shifted."""
     same_way = car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO
     if same_way or not is_there(ego):
         return False

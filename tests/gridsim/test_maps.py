@@ -93,7 +93,7 @@ def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
         load_map(save(tmp_path / "ring.png", pixels))
     assert len(said) == short
     if short:
-        told = r"ring has about (\d+) m of road\. What is driven again within 200 m counts nothing"
+        told = r"ring has about (\d+) m of road\. Ground driven again within 200 m does not count"
         about = re.match(told, str(said[0].message))
         assert about is not None
         assert float(about[1]) == pytest.approx(2 * math.pi * radius, rel=0.1)

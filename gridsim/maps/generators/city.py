@@ -22,13 +22,13 @@ CORNER = (8.0, 10.0)  # m, radius of the roads' centre lines round a corner, dra
 # For each axis, the number of streets and the least distance between them (m). The way round the smallest block,
 # corners cut, is longer than the 200 m within which the same ground does not count again.
 GRIDS = (((4, 60.5), (4, 60.5)), ((3, 72.0), (4, 54.0)), ((4, 54.0), (3, 72.0)))
-BAY_SHARE = 0.6  # of the sides of streets have a bay
+BAY_SHARE = 0.6  # share of street sides with a bay
 BAY_DEPTH = 2.0  # m
 BAY_LENGTH = 12.0  # m, at least, without its ends
 BAY_AWAY = 5.5  # m from the crossing, at least
 CAR = (2.0, 0.9)  # m, half length and half width of a parked car
 CAR_PITCH = (5.2, 7.0)  # m from one parking place to the next
-CAR_SHARE = 0.7  # of the parking places are taken
+CAR_SHARE = 0.7  # share of parking places that are taken
 CAR_SKEW = 0.05  # rad, at most, either way
 CAR_OUT = 0.25  # m towards the lane from the middle of the bay, at most
 
@@ -70,7 +70,7 @@ def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
     edges = street_graph(rng, columns, rows)
     corner = rng.uniform(*CORNER, (rows, columns))
     half_road = rng.uniform(*HALF_ROAD)
-    bay_half = half_road + BAY_DEPTH / 2  # a bay is a strip as wide as the road and itself
+    bay_half = half_road + BAY_DEPTH / 2  # the strip of a bay also covers the road
     layout = Layout(half_road, LANE_WIDTH)
 
     def street(x: float, y: float, d: int, length: float) -> None:

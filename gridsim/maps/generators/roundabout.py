@@ -1,4 +1,4 @@
-"""Roundabouts in a network of tiles, and the road of which each junction is one."""
+"""Roundabouts in a network of tiles, and the scenario in which every junction is one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _flare() -> tuple[float, float, float]:
 
 
 def _around(turn: int, half: float, _offset: float) -> Pieces:
-    """Pieces of the lane through a roundabout, counter-clockwise; arguments as of `squares.through_square`."""
+    """Pieces of the lane through a roundabout, counter-clockwise; arguments as for `squares.through_square`."""
     x, _, angle = _flare()
     straight = (half - x, 0.0)
     flare = ((math.pi / 2 - angle) * FLARE, -1.0 / FLARE)

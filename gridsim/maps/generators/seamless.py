@@ -1,4 +1,4 @@
-"""The seamless road network: tiles of which a few are roundabouts."""
+"""The seamless road network: tiles, a few of them roundabouts."""
 
 from __future__ import annotations
 

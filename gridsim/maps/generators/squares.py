@@ -95,7 +95,7 @@ class Layout:
         arms: list[int],
         pieces: Callable[[int, float, float], Pieces] = through_square,
     ) -> None:
-        """Lanes from each to each other of some sides of a square; `pieces` is called like `through_square`."""
+        """Lanes from each of some sides of a square to each other one; `pieces` is called like `through_square`."""
         for entry in arms:
             edge_x, edge_y = rotated(half, self.offset, entry)
             for exit in arms:
