@@ -1,1 +1,1 @@
-"""GridSim's learning: pure algorithms over flat genomes. Knows nothing of Ray, MLflow or files."""
+"""GridSim's learning: pure algorithms over flat genomes. Independent of Ray, MLflow and files."""

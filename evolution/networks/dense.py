@@ -1,7 +1,7 @@
 """Vector code for network layers, with sums held in registers.
 
 `tile` computes some positions times some units of a layer: the inputs of a position are `planes` x `rows` runs of `run`
-consecutive numbers, in a dense layer one run. It is emitted as LLVM vectors.
+consecutive numbers, or in a dense layer a single run. It is emitted as LLVM vectors.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numba.core.extending import intrinsic
 
 
 def tile(positions: int, lanes: int, rectify: bool, chains: int = 1) -> Any:
-    """A function for kernels: biases plus weights times inputs for `positions` x `lanes` outputs, then maybe ReLU.
+    """A function for kernels: biases plus weights times inputs for `positions` x `lanes` outputs, optionally with ReLU.
 
     Its arguments: inputs x float32 [any], with the offset of the first position and the stride of positions, number and
     stride of planes, number and stride of rows, and length of a run; weights w, their offset, the units of the whole

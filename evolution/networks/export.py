@@ -54,7 +54,7 @@ def layers_of(spec: PolicySpec, genome: torch.Tensor) -> Layers:
 def outputs(
     spec: PolicySpec, layers: Layers, x: torch.Tensor, squash: Callable[[torch.Tensor], torch.Tensor]
 ) -> torch.Tensor:
-    """Outputs float32 [n, outputs] for a network's inputs [n, inputs]; squash: what a perceptron has for tanh."""
+    """Outputs float32 [n, outputs] for a network's inputs [n, inputs]; squash: a perceptron's tanh."""
     import torch
 
     if isinstance(spec, CnnSpec):
@@ -78,7 +78,7 @@ def outputs(
 def to_torch(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> torch.nn.Module:
     """A genome float32 [genes] as a module in evaluation mode, on the CPU, without gradients.
 
-    `config` has the scales of the environment's observations.
+    `config` gives the scales of the environment's observations.
     Raises: ValueError with one line if the genome does not fit the policy.
     """
     import torch

@@ -140,7 +140,7 @@ class CnnSpec(PolicySpec):
 
     Two convolutions (8 x 8 with stride 4, 4 x 4 with stride 2), a dense layer with the speed as a further input, and
     the outputs. `cnn:16,32,256@4` has the channels of the convolutions, the units of the dense layer, and the frames:
-    the grids of so many consecutive control steps, the newest last. `cnn` alone means this network, which is that of
+    the grids of that many consecutive control steps, the newest last. `cnn` alone means this network, which is that of
     the paper's authors plus the speed; without `@` there are 4 frames.
 
     A unit's inputs are ordered (frame, row, column) in the first layer, (row, column, channel) in the others; the
@@ -338,7 +338,7 @@ def outputs_of(
 ) -> np.ndarray:
     """Outputs float32 [n, 8] of a perceptron, one for each action.
 
-    Args: ranges float32 [n, 31], m; closing speeds float32 [n, 31], m/s, without motion of any shape; speeds float32
+    Args: ranges float32 [n, 31], m; closing speeds float32 [n, 31], m/s, of any shape without motion; speeds float32
     [n], m/s; steering angles float32 [n], rad.
     """
     outputs = np.empty((len(ranges), spec.outputs), dtype=np.float32)

@@ -53,7 +53,7 @@ class Generation(NamedTuple):
     groups: Sequence[slice] = ()  # the members of each group, which are consecutive
 
     def and_copies(self, genomes: np.ndarray) -> Generation:
-        """These, and then plain copies of genomes float32 [k, genes], which are in no group."""
+        """These members, followed by copies of genomes float32 [k, genes], which are in no group."""
         copies = recipes(len(genomes))
         copies["kind"], copies["a"] = Kind.COPY, np.arange(len(self.parents), len(self.parents) + len(genomes))
         return self._replace(
@@ -79,9 +79,7 @@ class Search(ABC):
 
     @abstractmethod
     def leader(self) -> np.ndarray | None:
-        """The best genome known before a generation, float32 [genes], also the candidate for champion; None before the
-        first generation.
-        """
+        """The best genome known so far, float32 [genes], also the candidate for champion; None if there is none yet."""
 
     @abstractmethod
     def state(self) -> tuple[Arrays, dict[str, float]]:
@@ -98,7 +96,7 @@ class Search(ABC):
     def _tell(self, asked: Generation, scores: np.ndarray) -> None: ...
 
     def ask(self) -> Generation:
-        """The next generation. Raises: RuntimeError if the last one was not told its scores."""
+        """The next generation. Raises: RuntimeError if `tell` was not called for the last one."""
         if self.asked is not None:
             raise RuntimeError("ask() was called twice; tell() the scores first")
         self.asked = self._ask(int(self._rng(0).integers(1 << 63)))

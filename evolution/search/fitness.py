@@ -1,8 +1,8 @@
 """The fitness by which members are ranked.
 
-It has two elements: the distance travelled, and the distance travelled at a forward speed within the
-scenario's interval. Their weighted mean is relative to the episode's target, on a scale that is mostly logarithmic (the
-first bend is worth as much as the last kilometre) and partly linear (so that the last kilometre still counts).
+It has two elements: the distance travelled, and the distance travelled at a forward speed within the scenario's
+interval. Their weighted mean is relative to the episode's target, on a scale that is mostly logarithmic (the first bend
+is worth as much as the last kilometre) and partly linear (so that the last kilometre still counts).
 """
 
 from __future__ import annotations

@@ -15,16 +15,7 @@ import numpy as np
 
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
-from evolution.search.base import (
-    Arrays,
-    Generation,
-    Search,
-    SearchConfig,
-    ranks,
-    recipes,
-    split,
-    tournament_weights,
-)
+from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournament_weights
 from evolution.search.breeding import Kind, Mutation, moments
 
 _CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the broadcast parents
@@ -43,7 +34,7 @@ class Recombination(Search):
 
     Attributes:
         centre: float64 [genes], or [0] before the first generation.
-        path: float64 [free genes], the evolution path; N(0, 1) in each initially and under random selection.
+        path: float64 [free genes], the evolution path; each initially N(0, 1), as under random selection.
         variances: float64 [genes], diagonal of the covariance, initially 1.
         sigma: the overall step size.
         average: float64 [genes], exponential moving average of the centres.

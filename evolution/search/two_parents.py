@@ -1,6 +1,6 @@
 """The classic genetic algorithm: tournaments, elitism, uniform crossover of two parents, Gaussian mutation.
 
-Also random search, the baseline that every search must beat: it keeps only the elites, all other members are random.
+Also random search, the baseline that every search must beat: only the elites are kept; all others are random.
 """
 
 from __future__ import annotations
