@@ -29,7 +29,7 @@ from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 _F = np.float32
 
 NO_ACTION = 255  # of an episode's last row
-UNITS = _F(4096.0)  # of the fixed point, to 1
+UNITS = _F(4096.0)  # fixed-point units per 1
 OLDEST = 255  # largest age; greater ones are clipped to it
 _AREA = CELLS * CELLS
 _FRAME = _AREA // 4  # bytes
@@ -56,7 +56,7 @@ def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
 
 
 def empty(spec: PolicySpec, *shape: int) -> Experience:
-    """Uninitialised experience of so many rows, or [episodes, rows]."""
+    """Uninitialised experience of shape [rows] or [episodes, rows]."""
     dtype, width = observation_dtype_and_width(spec)
     return Experience(
         np.empty((*shape, width), dtype=dtype),

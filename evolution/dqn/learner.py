@@ -85,7 +85,7 @@ def _squash(x):
 
 
 class Squash(torch.autograd.Function):
-    """Hyperbolic tangent on the CPU, in place, by the policies' own `squash`: 256 x 64 in 5 us, by torch.tanh in 45."""
+    """Hyperbolic tangent on the CPU, in place, by the policies' `squash`: 5 us for 256 x 64; torch.tanh takes 45."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
@@ -185,7 +185,7 @@ class DqnLearner:
         return torch.from_numpy(array).to(self.device, copy=True)
 
     def targets(self, batch: Batch) -> torch.Tensor:
-        """What the values of a batch's actions are to become: y [n], without gradients."""
+        """Targets y [n] for the values of a batch's actions, without gradients."""
         with torch.no_grad():
             following = self._tensor(batch.next_observations)
             values = self.target(following)

@@ -1,7 +1,7 @@
 """The replay buffer: a ring of the latest rows of experience, from which transitions are drawn uniformly.
 
 A row of `Experience` is a row of the ring, so that each observation is stored once. A transition is a row with an
-action and the row after it. The value after it counts for the discount, or for nothing if the step ended in COLLISION,
+action and the row after it. The value after it is multiplied by the discount, or by 0 if the step ended in COLLISION,
 IDLE or SUCCESS. After TIME it is estimated from the episode's last row.
 
 The oldest rows are overwritten first. Rows of grids that have lost earlier frames of their stack are no longer drawn.

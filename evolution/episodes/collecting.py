@@ -37,7 +37,7 @@ def _collect(
 ):  # fmt: skip
     """Drive a genome through episodes `which` [k] on one map; fills their rows of experience and results.
 
-    Args: experience [e, rows, ...]; the others, but for the first four and the buffers, [e, ...].
+    Args: experience [e, rows, ...]; starts, targets, steps, worlds, epsilons, keys and results [e, ...].
     """
     workspace = make_workspace(simulation, layers, 0, 0)
     packed = packed_genome(genome, layers, grid_buffers)

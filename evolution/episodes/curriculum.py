@@ -28,7 +28,7 @@ from gridsim.traffic.world import FIELDS, LANE
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
-LEAST_CRASH_WEIGHT = 0.05  # of a crash that all members avoid or none does, where one that half of them avoid has 1
+LEAST_CRASH_WEIGHT = 0.05  # of a crash that all members avoid or none does; one that half of them avoid has weight 1
 
 
 @dataclass(frozen=True)
@@ -43,17 +43,17 @@ class CurriculumConfig:
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, target of crash starts
     crash_memory: int = 64  # crashes that are remembered
-    crowd: float = 2.0  # factor on the number of other cars in training, for more encounters on the same way
+    crowd: float = 2.0  # factor on the number of other cars in training, for more encounters over the same distance
     rewind: int = 64  # control steps from a crash start to the crash
     leader_episodes: int = 16  # episodes of the leader in each generation
     leader_stretch: float = 2.5  # target of the leader's episodes, relative to the members'
     first_target: float = 150.0  # m, target of the first episodes
     last_target: float = 400.0  # m, largest target of training; further starts teach as much as longer episodes
     growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
-    pace: float = 7.0  # m/s, mean speed that a training episode's time limit requires; for seamless, as champion_pace
+    pace: float = 7.0  # m/s, mean speed required by a training episode's time limit; seamless's, like champion_pace
     slack: float = 3.0  # s, added to that time limit
     promising: float = 0.5  # least success rate of the leader before candidates are validated ...
-    latest: int = 4  # ... as the mean over so many generations
+    latest: int = 4  # ... averaged over this many generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
     validation: int = 256  # episodes of validation
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
@@ -161,7 +161,7 @@ class Curriculum:
         if not len(self.crashes) or not self.config.crash_starts:
             return
         chosen = self._choose_crashes(generation).reshape(len(results), -1)
-        self.failures = self.failures.copy()  # the one before may be on its way into a checkpoint
+        self.failures = self.failures.copy()  # a checkpoint may still be writing the old array
         for crashes, result in zip(chosen, results, strict=True):
             failed = (result["end"][:, -len(crashes) :] != End.SUCCESS).mean(axis=0)
             self.failures[crashes] = (self.failures[crashes] + failed) / 2.0
@@ -210,8 +210,7 @@ class Curriculum:
     def validation(self) -> Episodes:
         """Validation's episodes, the same for all runs of a scenario with the same traffic.
 
-        They are driven in one task with a generation's episodes, so their worlds are filled up with absent cars to the
-        same size.
+        They share a task with a generation's episodes, so their worlds are padded with absent cars to the same size.
         """
         if self._validation is None:
             maps, rows, worlds = spread_starts(self.build, VALIDATION_SEEDS, self.config.validation, self.traffic)

@@ -13,16 +13,7 @@ import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, store_grid, store_rays
 from evolution.networks import convnet
-from evolution.networks.policy import (
-    RAYS,
-    CnnSpec,
-    MlpSpec,
-    PolicySpec,
-    decide,
-    encode,
-    pack,
-    scratch_size,
-)
+from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
 from gridsim.car.ego import DISTANCE, FIELDS, PACED, SPEED, STEERING, End, control, look, place, start_from, visit_cells
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
@@ -41,8 +32,8 @@ _F, _U = np.float32, np.uint64
 _IDLE = int(End.IDLE)
 
 #: An episode: index of its map in the task; x, y (m), heading (rad), speed (m/s), steering (rad) at its start; its
-#: target (m) and time limit (control steps), or 0 for those of `Limits`; rewind: return the state so many control steps
-#: before the end, or 0 for none.
+#: target (m) and time limit (control steps), or 0 for those of `Limits`; rewind: if above 0, return the state that many
+#: control steps before the end.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
 
 #: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
@@ -206,7 +197,7 @@ def _explore(recorder, step, action, actions):
 def _control_step(simulation, setup, car, visits, world, action):
     """One control step of the car and of the traffic around it. Returns an End as a number.
 
-    A `leaf`: read in `run_episode`, the parts of `simulation` are counted, which costs 15 % among 8 cars.
+    A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
     """
     if world is not None:
         flow(simulation.network, simulation.drivers, world, car)
@@ -321,7 +312,7 @@ def evaluate(
         episodes: EPISODE [e].
         worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
 
-    Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states so many steps before their ends, or at the
+    Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
     start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, world.FIELDS]).
     Raises: ValueError if shapes do not fit.
     """
