@@ -3,8 +3,8 @@
 Importing it registers the Gymnasium environments. That takes milliseconds, because Numba and the maps are loaded only
 when an environment is made. `gymnasium.make("gridsim:GridSim/City-v0")` imports it implicitly.
 
-`gridsim.evolve` and the rest of `_API` are loaded from `cluster.api` on first use: users look for them here, but the
-simulator must not import what trains in it.
+`gridsim.evolve` and the other names of `cluster.api` are loaded from there on first use: users look for them here, but
+the simulator must not import what trains in it.
 """
 
 from importlib import import_module as _import_module

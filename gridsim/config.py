@@ -23,7 +23,7 @@ CRASH_REWARD = -1.0
 # Lanes. Own choices, unless a source is named.
 CROSSING_GAP = 1.5  # m between two lanes' centre lines below which they cross; lanes side by side are 3 m apart
 
-# Traffic, beside `TrafficConfig`; float32 because kernels read them as globals. Own choices, unless a source is named.
+# Traffic, besides `TrafficConfig`; float32 because kernels read them as globals. Own choices, unless a source is named.
 TRAFFIC_PACE = 0.5  # traffic's speed on a straight, as a share of lower + upper speed: the middle of the interval
 SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of the lane's: least, and range above it
 SPAWN_SPEED = _F(0.5)  # of the desired speed, at the start of an episode

@@ -181,7 +181,7 @@ class Curriculum:
         return self._new_starts(self._some_maps(generation, count, rng), rng)
 
     def leader_episodes(self, generation: int) -> Episodes:
-        """The leader's episodes beside a generation, with `rewind` set for crash starts."""
+        """The leader's episodes alongside a generation, with `rewind` set for crash starts."""
         episodes = self._drawn(generation, self.config.leader_episodes, 2).with_limits(self.leader_limits())
         episodes.rows["rewind"] = self.config.rewind
         return episodes

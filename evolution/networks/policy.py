@@ -63,11 +63,11 @@ class PolicySpec(ABC):
             spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
             if any(n < UNIT_MULTIPLE or n % UNIT_MULTIPLE for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
                 raise ValueError(
-                    f"policy {text!r}: layers of a cnn have {UNIT_MULTIPLE} units or a multiple of it, "
+                    f"policy {text!r}: layers of a cnn need a positive multiple of {UNIT_MULTIPLE} units, "
                     f"and it sees 1 to {MAX_FRAMES} frames"
                 )
             if spec.size > MAX_GENES:
-                raise ValueError(f"policy {text!r} has {spec.size:,} genes; {MAX_GENES:,} are the most")
+                raise ValueError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
             return spec
         raise ValueError(
             f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "

@@ -83,7 +83,7 @@ class Search(ABC):
 
     @abstractmethod
     def state(self) -> tuple[Arrays, dict[str, float]]:
-        """The arrays and numbers that an exact resume needs, beside the generation."""
+        """The arrays and numbers that an exact resume needs, besides the generation."""
 
     @abstractmethod
     def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:

@@ -250,9 +250,9 @@ def read_free(file: MapFile) -> np.ndarray:
     except Exception as error:  # decoders raise many types of error
         raise GridSimError(f"{file.image}: truncated or damaged: {_shown(str(error))}") from None
     if not free.any():
-        raise GridSimError(f"{file.image}: all wall; road is what is {'darker' if file.negate else 'brighter'}")
+        raise GridSimError(f"{file.image}: all wall; road must be {'darker' if file.negate else 'brighter'}")
     if free.all():
-        raise GridSimError(f"{file.image}: all road; wall is what is {'brighter' if file.negate else 'darker'}")
+        raise GridSimError(f"{file.image}: all road; wall must be {'brighter' if file.negate else 'darker'}")
     return free[::-1]
 
 
@@ -304,7 +304,7 @@ def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit
     border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
     if border >= MOST_BORDER:
         warnings.warn(
-            f"{border:.0%} of {stem}'s border is road. If the road is what is {'bright' if file.negate else 'dark'}, "
+            f"{border:.0%} of {stem}'s border is road. If the road is {'bright' if file.negate else 'dark'}, "
             f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
             "surroundings as wall",
             MapWarning,

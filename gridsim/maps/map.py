@@ -41,7 +41,7 @@ class Map:
 
     @cached_property
     def mileage(self) -> np.ndarray:
-        """Cumulated length (m) at each point of `lanes`, with all lanes laid end to end: float64 [points]."""
+        """Cumulative length (m) at each point of `lanes`, with all lanes laid end to end: float64 [points]."""
         step = np.diff(self.lanes.points.astype(np.float64), axis=0)
         length = np.hypot(step[:, 0], step[:, 1])
         length[self.lanes.offsets[1:-1] - 1] = 0.0  # between lanes there is no road

@@ -67,7 +67,7 @@ def _speed_profile(points, offsets, steps, successors, top, lateral, comfort, sp
 
 @njit
 def _ease(offsets, steps, successors, slope, room):
-    """Limit the slope of the room on the right (m for each m of way), also from lane to lane."""
+    """Limit the slope of the room on the right (m per m of lane), also from lane to lane."""
     lanes = offsets.shape[0] - 1
     for _ in range(4):
         for lane in range(lanes):

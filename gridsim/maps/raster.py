@@ -198,8 +198,8 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     large = _large(wide)
     if not large.any():
         raise ValueError(
-            f"no room for a car: nowhere is the road {vehicle.width + 2 * _MARGIN:g} m wide over {_EXTENT:g} m; "
-            f"check the resolution and what is bright"
+            f"no room for a car: the road is nowhere {vehicle.width + 2 * _MARGIN:g} m wide over {_EXTENT:g} m; "
+            f"check the resolution and which pixels are bright"
         )
     ridge = large & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.25)
     angle, coherence = _directions(nodes)
@@ -211,7 +211,7 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     if not len(poses):
         raise ValueError(
             f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "
-            f"check the resolution and what is bright, or name starts in a YAML"
+            f"check the resolution and which pixels are bright, or give starts in a YAML"
         )
     poses[:, :2] += corner
     return _spread_sample(poses, _STARTS)

@@ -31,7 +31,7 @@ class Scenario:
     """A kind of road: its layout and its driving limitations (the paper's term)."""
 
     speed_interval: tuple[float, float]  # m/s, within which speed counts
-    traffic: int  # default number of cars beside the ego car
+    traffic: int  # default number of other cars
     thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 

@@ -249,7 +249,7 @@ class Window:
         except pygame.error as error:
             pygame.display.quit()
             raise NoDisplayError(
-                f"no window can be opened ({error}): set DISPLAY to a running display, or use what needs no window"
+                f"no window can be opened ({error}): set DISPLAY to a running display, or work without a window"
             ) from error
         pygame.display.set_caption(caption)
         self._clock = pygame.time.Clock()

@@ -102,7 +102,7 @@ def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
 def test_an_inverted_picture_is_told_by_environments_and_commands(tmp_path):
     pixels = picture(lambda x, y: ring(x - 45, y - 45, 36.0, 5.0), 90.0, 90.0)
     save(tmp_path / "dark.png", 255 - pixels)
-    expected = "100% of dark's border is road. If the road is what is dark, set negate: 1 in its YAML"
+    expected = "100% of dark's border is road. If the road is dark, set negate: 1 in its YAML"
     with pytest.warns(MapWarning, match=expected):
         GridSimEnv(str(tmp_path / "dark.png"))
     done = finish("gridsim-evaluate", str(CHAMPION), "--scenario", "dark.png", "--episodes", "1", cwd=tmp_path)
