@@ -210,8 +210,8 @@ def _control_step(simulation, setup, car, visits, world, action):
 def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, result):
     """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
 
-    What may be None is a separate argument, because Numba removes dead branches only for arguments. If an output is
-    NaN, the episode ends as IDLE; so does the last recorded step, if any.
+    Anything that may be None is passed separately, because Numba removes dead branches only for arguments. If an output
+    is NaN, the episode ends as IDLE; so does the last recorded step, if any.
     """
     car = workspace.car
     place(simulation.road, setup.start, car, workspace.visits)

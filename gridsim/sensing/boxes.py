@@ -19,7 +19,7 @@ def cast_boxes(constants, fan, width, height, x, y, cosine, sine, velocity, worl
     """Shorten ranges (m) to the first box of a world that each ray hits: slab test (Kay and Kajiya 1986).
 
     Args: fan of `rays.fan`; sides of the torus, m; the sensor's position (m), heading, and velocity (m/s) along the
-    heading and to the left; world of `world`.
+    heading and to the left; world as in `traffic.world`.
     Writes: ranges float32 [rays] and, if not None, closing float32 [rays]: the closing speed (m/s), along the ray, of
     the sensor and the car that the ray hits, as a radar measures it; 0 where the ray hits the road's edge.
     """

@@ -1,6 +1,6 @@
 """Traffic: cars that follow lanes, keep their distance, give way where paths cross, and change lanes on the highway.
 
-Car following is the intelligent driver model (IDM; Treiber, Hennecke and Helbing 2000), lane changes are MOBIL
+Car following is the intelligent driver model (IDM; Treiber, Hennecke and Helbing 2000), and lane changes are MOBIL
 (Kesting, Treiber and Helbing 2007). The ego car is an obstacle like the other cars, but has the right of way at
 junctions (`junctions.py`), and oncoming cars keep to the right for it (`encounters.py`). `world.py` defines a car's
 state, `maps/network.py` the lanes.

@@ -31,7 +31,7 @@ COLUMNS = (
     "traffic",  # other cars
     "scenario", "map_seed",
 )  # fmt: skip
-"""Of a recorded drive."""
+"""The columns of a recorded drive."""
 MAX_TRAFFIC = 1000  # of a drive that is read
 MAX_BYTES = 1 << 28  # of a file that is read
 FPS = 30  # pictures a second in the window
