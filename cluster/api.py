@@ -1,6 +1,6 @@
-"""GridSim from Python, without folders or MLflow: train with a fitness of one's own, load, drive, evaluate.
+"""GridSim's Python API, without run folders or MLflow: train, with a fitness of your own, load, drive, evaluate.
 
-`import gridsim` has all of this: `gridsim.evolve(scenario="city", workers=2)`.
+`import gridsim` offers all of it: `gridsim.evolve(scenario="city", workers=2)`.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ def evolve(
     2
 
     Args:
-        settings: as the command's flags; or give those by name, such as scenario="city".
-        fitness: scores float64 [n], greater is better, from the episodes' results (structured, [n, episodes], with
-            fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.car.ego.End`)) and
-            the episodes' targets (m). It runs here, never in the workers. Default: `evolution.search.fitness.scalar`.
+        settings: what the command's flags set; alternatively give these by name, such as scenario="city".
+        fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
+            with fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.car.ego.End`))
+            and targets (m). It runs in this process only. Default: `evolution.search.fitness.scalar`.
         workers: Ray workers on this machine; 0 evaluates in this process.
-        on_generation: called with the number of generations done and the last one's figures.
+        on_generation: called with the number of generations done and the latest one's figures.
 
-    Returns: the champion, and the history, a row of figures for each generation, by the names of a run's history.csv:
-    `.../mean` is of all members on training's episodes, `.../best` of the best genome so far on episodes of its own.
-    Raises: SettingsError, PoolError with one line.
+    Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
+    `.../mean` is over all members on training episodes, `.../best` of the best genome so far on its own episodes.
+    Raises: SettingsError or PoolError; the message is one line.
     """
     return _train(settings or EvolveSettings(**flags), workers, on_generation, fitness)
 
@@ -58,7 +58,7 @@ def evolve(
 def train_dqn(
     settings: DqnSettings | None = None, workers: int = 0, on_evaluation: OnStep | None = None, **flags: Any
 ) -> Trained:
-    """Train a driver by deep Q-learning, in memory. As `evolve`; the history has a row for each evaluation.
+    """Train a driver by deep Q-learning, in memory, like `evolve`; the history has a row for each evaluation.
 
     >>> import gridsim
     >>> champion, history = gridsim.train_dqn(scenario="curved", car_steps=1000)
@@ -67,14 +67,14 @@ def train_dqn(
 
 
 def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Compare finished runs, as `gridsim-compare RUNS` does: figures of each, and its errors against the reference.
+    """Compare finished runs, as `gridsim-compare RUNS` does: each one's figures, and errors against the reference.
 
     Args:
         runs: their folders; a comparison's folder stands for all of its finished runs.
 
     Returns: a row for each run: folder, scenario, learner, seed, traffic, and the figures as table.csv names them; nan
-    where an error is not known.
-    Raises: GridSimError with one line for what is no finished run.
+    for an unknown error.
+    Raises: GridSimError, with a one-line message, for a folder that is not a finished run.
     """
     from cluster.comparison.plan import read_runs
     from cluster.comparison.results import errors_of
@@ -97,7 +97,7 @@ def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness:
             learning.score = fitness
         while not learning.done():
             row = learning.step()
-            learning.elites.clear()  # nobody asks for them
+            learning.elites.clear()  # needed only for a run's folder
             if on_step:
                 on_step(learning.steps, row)
         learning.validate_last()

@@ -1,4 +1,4 @@
-"""The commands: parse, build, run. Wrong use ends with one clear line and 2, Ctrl-C with a clean save and 130."""
+"""The commands: parse, build, run. Wrong use exits with one clear line and 2, Ctrl-C saves and exits with 130."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ from gridsim.reference.errors import errors
 
 @dataclass(frozen=True)
 class RunFlags:
-    """Which run it is, and what it begins with."""
+    """The run's name, and what it starts from."""
 
     name: Annotated[str, IN_WORDS] = ""
     """Name of the run; by default made of scenario, algorithm, seed and time."""
@@ -74,9 +74,9 @@ class EvolveFlags(RunFlags, WorkFlags, EvolveSettings):
 
     groups: ClassVar[dict[str, type]] = {"learning": EvolveSettings, "work": WorkFlags, "run": RunFlags}
     example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1 --workers 2"
-    #: Flags that version 0.1 had, and what takes their place.
+    #: Flags of version 0.1, and what replaces them.
     removed: ClassVar[dict[str, str]] = {
-        "--islands": "a run has one population; use --recombination all, the default, which needs no others",
+        "--islands": "a run has one population; use --recombination all, the default, which needs no islands",
         "--island-car-steps": "a run has one population; use --car-steps for its budget",
         "--parents": "the mating pool of --recombination two has a fixed size; use --tournament for selection pressure",
         "--crossover": "all children of --recombination two have two parents; use --recombination",
@@ -87,7 +87,7 @@ class EvolveFlags(RunFlags, WorkFlags, EvolveSettings):
 
 @dataclass(frozen=True)
 class DqnFlags(RunFlags, WorkFlags, DqnSettings):
-    """Train a driver by deep Q-learning: the workers collect experience while the learner trains on what they brought.
+    """Train a driver by deep Q-learning: workers collect experience while the learner trains on what they collected.
 
     The run's folder holds the champion, history, pictures and a checkpoint after every evaluation; MLflow holds its
     curves, on the same axes as those of gridsim-evolve. The champion is the network that did best on validation. It
@@ -96,7 +96,7 @@ class DqnFlags(RunFlags, WorkFlags, DqnSettings):
 
     groups: ClassVar[dict[str, type]] = {"learning": DqnSettings, "work": WorkFlags, "run": RunFlags}
     example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1 --workers 2"
-    #: Flags that version 0.2 had, and why they went.
+    #: Flags of version 0.2, and why they were removed.
     removed: ClassVar[dict[str, str]] = {
         **dict.fromkeys(("--prioritised", "--no-prioritised"), "transitions are drawn uniformly, which does as well"),
         **dict.fromkeys(("--double", "--no-double"), "the DQN is always a double DQN"),
@@ -142,7 +142,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     resume, config = flags.resume, flags.config
     if resume and config:
         raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
-    if resume or config:  # its settings are the defaults
+    if resume or config:  # the settings of that run are the defaults
         if resume:
             run = open_run(Path(resume))
             settings, init = run.settings, run.init
@@ -150,7 +150,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
             settings, init = read_config(Path(config))
         if settings.command != prog:
             flag, path = ("--resume", resume) if resume else ("--config", config)
-            raise UsageError(f"{path} is of another learner; use {settings.command} {flag} {path}")
+            raise UsageError(f"{path} belongs to another learner; use {settings.command} {flag} {path}")
         base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
@@ -166,12 +166,12 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     settings = select(EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings, flags)
     settings.check()
     if isinstance(flags, DqnFlags) and flags.device == "cuda":
-        from evolution.dqn.learner import device_of  # and PyTorch
+        from evolution.dqn.learner import device_of  # imports PyTorch
 
         try:
             device_of(flags.device)
         except ValueError as error:
-            there = f"{resume} was trained with --device cuda, and PyTorch finds none; continue it where one is"
+            there = f"{resume} was trained with --device cuda, and PyTorch finds no GPU; continue it where there is one"
             raise UsageError(there if resume else f"--device cuda: {error}") from error
     if resume:
         run.settings = settings
@@ -182,7 +182,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
             raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
         if not np.isfinite(champion.genome).all():
-            raise UsageError(f"--init {flags.init}: some of its genes are no numbers; choose another champion")
+            raise UsageError(f"--init {flags.init}: some of its genes are not numbers; choose another champion")
         digest = champion.sha256
     return flags, new_run(Path(flags.output), flags.name, settings, flags.init, digest)
 
@@ -207,7 +207,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     uri = check_uri(flags.tracking_uri, saved)
     address = flags.address or os.environ.get("RAY_ADDRESS") or None
     if address and flags.workers:
-        from cluster.workers.ray_session import check_address  # and Ray
+        from cluster.workers.ray_session import check_address  # imports Ray
 
         address = check_address(address)
     warn_of_many_workers(prog, flags.workers, flags.address)
@@ -226,7 +226,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
         code = INTERRUPTED
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         code, message = FAILED, str(error) or type(error).__name__
-        if isinstance(error, FloatingPointError):  # continued, it would fail in the same way
+        if isinstance(error, FloatingPointError):  # if resumed, it would fail again
             hint = f"repeat it with: {command_path(prog)} --config {folder}/config.json --learning-rate ..."
     finally:
         with undisturbed():
@@ -248,7 +248,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
 
 
 def _print_end(console: Console, session: Session) -> None:
-    """The closing words of a finished run."""
+    """Print how a finished run did, and where to look next."""
     summary, name, path = session.summary, session.learning.step_name, session.run.path
     console.print(held_out_table("The champion on held-out drives", summary["held_out"]))
     steps, how = count(summary[name + "s"], name), "solved" if summary["solved"] else "not solved yet"

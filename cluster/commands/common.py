@@ -1,4 +1,4 @@
-"""What the commands share: reading the command line, failing in one clear line."""
+"""What the commands share: parsing the command line, failing with one clear line."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from gridsim.maps.scenarios import HELD_OUT_SEED
 
 T = TypeVar("T")
 FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
-MANY_WORKERS = 4  # a core; more give a warning
-# What tyro says of wrong flags, as patterns, and what the user reads.
+MANY_WORKERS = 4  # per core; more cause a warning
+# Patterns of tyro's messages about wrong flags, and what the user reads instead.
 PLAIN = {
     r"Error parsing (?=--)": "",
-    r"could not convert string to float: ('[^']*')": r"\1 is no number",
+    r"could not convert string to float: ('[^']*')": r"\1 is not a number",
     r"Missing from \S+: (\S+) ([^()]*) \(required\)": r"\1 is missing: \2",
 }
 
-# tyro wraps a field's docstring as a whole only where its lines are not indented.
+# tyro wraps a field's docstring as one paragraph only if its lines are not indented.
 _constant = attrdoc.ast_get_constant_value
 attrdoc.ast_get_constant_value = lambda node: (
     " ".join(value.split()) if isinstance(value := _constant(node), str) else value
@@ -47,7 +47,7 @@ registry = tyro.constructors.ConstructorRegistry()
 
 @registry.primitive_rule
 def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[int] | None:
-    """Integers, also written as in 1e6."""
+    """Integers, which may also be written as 1e6."""
     if field.type is not int:
         return None
 
@@ -57,7 +57,7 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
         with contextlib.suppress(ValueError):
             if (number := float(words[0])).is_integer():
                 return int(number)
-        raise ValueError(f"'{words[0]}' is no whole number")
+        raise ValueError(f"'{words[0]}' is not a whole number")
 
     return tyro.constructors.PrimitiveConstructorSpec(
         nargs=1,
@@ -69,7 +69,7 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
 
 
 class UsageError(GridSimError):
-    """Wrong use; the message is shown in one line."""
+    """Wrong use; the message is one line for the user."""
 
 
 def cores() -> int:
@@ -86,9 +86,9 @@ class WorkFlags:
     output: str = "runs"
     """Folder in which the run's folder is created."""
     address: Annotated[str, IN_WORDS] = ""
-    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else a Ray is started here."""
+    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else Ray is started on this machine."""
     patience: Annotated[float, IN_WORDS] = 0.0
-    """Seconds without any worker after which a run stops, to be resumed. By default 60, on a cluster 300."""
+    """Seconds without any worker after which a run stops; it can be resumed. By default 60, on a cluster 300."""
     tracking_uri: Annotated[str, IN_WORDS] = ""
     """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: str = "gridsim"
@@ -108,19 +108,19 @@ class RoadFlags:
 
 
 def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None = None) -> T:
-    """Read the command line. Ends the process: 0 after --help, 2 with a clear line for wrong use."""
+    """Parse the command line. Exits with 0 after --help, and with 2 and one clear line for wrong use."""
     _check_flags(kind, prog, arguments)
     config = (tyro.conf.PositionalMetavarFromFieldName, tyro.conf.DisallowNone, tyro.conf.OmitArgPrefixes)
     given: dict[str, Any] = {} if default is None else {"default": default}
     asked: type = kind
     if groups := getattr(kind, "groups", None):  # tyro shows each field of this type as a group
-        # A new run's groups have no default: in settings made before the flags are known, the policy is chosen already.
+        # A new run's groups get no default: settings made before the flags are known would already fix the policy.
         shown: list[Any] = list(groups.items())
         if default is not None:
             shown = [(name, part, field(default=select(part, default))) for name, part in shown]
         asked, given = dataclasses.make_dataclass(kind.__name__, shown), {}
     printed = io.StringIO()
-    # Without a terminal tyro draws no box and uses no colours: its error is read below.
+    # Not on a terminal, tyro draws no box and uses no colours: its error is parsed below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
     with _reader_may_leave(), contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
@@ -131,7 +131,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
         except SystemExit as stop:
             if not stop.code:
                 raise
-    # A title, what is wrong, and where to read more, with rules in between.
+    # tyro prints a title, what is wrong, and where to read more, separated by rules.
     parts = re.split(r"-{9,}", printed.getvalue())
     reason = " ".join(parts[1].split()) if len(parts) > 1 else "cannot read these flags"
     for words, plain in PLAIN.items():
@@ -141,19 +141,19 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
 
 @contextlib.contextmanager
 def _reader_may_leave() -> Iterator[None]:
-    """End quietly where the output's reader leaves first, as in `--help | head`."""
+    """Exit quietly if the output's reader leaves first, as in `--help | head`."""
     try:
         try:
             yield
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more on exit
         raise SystemExit(0) from None
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
-    """Fail for an unknown flag, with the most similar one, or what replaces a removed one."""
+    """Fail for an unknown flag, naming the most similar one, or what replaces a removed one."""
     fields = dataclasses.fields(kind)
     known = [as_flag(f.name) for f in fields if "Positional" not in str(f.type)]
     for argument in arguments:
@@ -168,7 +168,7 @@ def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
 
 
 def as_flag(name: str) -> str:
-    """A field's name as the command line has it."""
+    """A field's name as a flag."""
     return f"--{name.replace('_', '-')}"
 
 
@@ -181,9 +181,9 @@ def _about(kind: type) -> str:
 
 
 def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Collection[str], what: str) -> None:
-    """Raises UsageError if flags contradict those of the run or comparison (`what`) that is continued.
+    """Raises UsageError if flags contradict those of the run or comparison (`what`) that is resumed.
 
-    Args: `free` fields may differ; those that `may_grow` may be greater, where 0 stands for any number.
+    Args: `free` fields may differ; fields that `may_grow` may be greater, where 0 means unlimited.
     """
     for f in dataclasses.fields(before):
         new, old = getattr(flags, f.name), getattr(before, f.name)
@@ -194,13 +194,13 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
         new, old = (" ".join(value) if isinstance(value, tuple) else value for value in (new, old))
         problem, remedy = f"contradicts the {what}'s {old}", "leave it out"
         if f.name in may_grow:
-            problem = problem if old else f"is not what bounds the {what}"
+            problem = problem if old else f"does not limit the {what}"
             remedy = f"give a greater {' or '.join(as_flag(name) for name in may_grow if getattr(before, name))}"
         raise UsageError(f"{as_flag(f.name)} {new} {problem}; {remedy}, or start a new {what}")
 
 
 def select(kind: type[T], flags: Any) -> T:
-    """Those of a command's flags that are fields of `kind`."""
+    """A `kind` with the values that a command's flags have for its fields."""
     return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})  # type: ignore[arg-type]
 
 
@@ -214,14 +214,14 @@ def wrong_use() -> Iterator[None]:
 
 
 def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
-    """End with one clear line, and perhaps a second one that says what to do."""
+    """Exit with one clear line, and perhaps a second one that says what to do."""
     line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: command_path(name[0]), " ".join(message.split()))
     print(f"{prog}: error: {line}", *([hint] if hint else []), sep="\n", file=sys.stderr, flush=True)
     raise SystemExit(code)
 
 
 def short_path(path: Path) -> str:
-    """A path as the user would type it: relative to the working directory if it lies there."""
+    """A path as the user would type it: relative to the working directory if it is inside."""
     absolute, here = path.resolve(), Path.cwd()
     return str(absolute.relative_to(here) if absolute.is_relative_to(here) else path)
 
@@ -237,7 +237,7 @@ def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
     """Warn in one line if this machine has far fewer cores than workers."""
     if workers > MANY_WORKERS * cores() and not (address or os.environ.get("RAY_ADDRESS")):
         print(
-            f"{prog}: warning: {workers:,} workers on {cores()} cores: more than one a core are no faster, and each "
+            f"{prog}: warning: {workers:,} workers on {cores()} cores: more than one per core is no faster, and each "
             "takes some 200 MB",
             file=sys.stderr,
         )
@@ -246,12 +246,12 @@ def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
 def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], str] | None = None) -> NoReturn:
     """Run a command and exit with the code that `body` returns.
 
-    Errors for the user are shown in one line, and a second one if there is a hint for their kind; warnings in one line.
+    Errors for the user are shown in one line, followed by the hint for their type, if any; warnings in one line.
     """
     warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
     try:
         sys.exit(body())
-    except KeyboardInterrupt:  # before there was anything to save, or for the second time
+    except KeyboardInterrupt:  # before there was anything to save, or a second one
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except GridSimError as error:

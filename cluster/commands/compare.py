@@ -57,16 +57,16 @@ class CompareFlags(WorkFlags, Plan):
     """Compare learners: the same car on the same roads, each learner with the same budget, over several seeds.
 
     Trains every learner on every scenario with every seed, then writes comparison.html: tables, a picture, and a link
-    to each champion's drive; also table.md, table.csv and comparison.png. A run's folder is kept for each, and what is
-    finished is never done again. With RUNS, folders of finished runs or of comparisons, it only compares these.
+    to each champion's drive; also table.md, table.csv and comparison.png. Each run's folder is kept, and a finished run
+    is never repeated. With RUNS, folders of finished runs or of comparisons, it only compares these.
     """
 
     runs: tyro.conf.Positional[tuple[str, ...]] = ()
     """Folders of finished runs to compare, in place of training."""
     quick: bool = False
-    """A first look, in minutes: one seed, 10 s a run."""
+    """A first look, in minutes: one seed, 10 s per run."""
     name: Annotated[str, IN_WORDS] = ""
-    """Name of the comparison; by default made of the time."""
+    """Name of the comparison; by default made from the time."""
     resume: Annotated[str, IN_WORDS] = ""
     """Folder of a comparison to continue; a larger --seeds adds to it."""
 
@@ -120,7 +120,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 
 
 def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags) -> int:
-    """Train what is not finished, one run after the other on one pool of workers; write tables and a picture of all."""
+    """Train the unfinished runs, one after the other on one pool of workers; write tables and a picture of all runs."""
     folder.write()
     uri = folder.tracking_uri
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
@@ -149,10 +149,10 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
                     shown.note("measuring errors")
                     shown.done(results.add(read_run(cell.folder)))
                     results.write_tables()
-                except (GridSimError, FloatingPointError) as error:  # stops no other run
+                except (GridSimError, FloatingPointError) as error:  # the other runs go on
                     failed += 1
                     shown.failed(str(error))
-                    workers.close()  # the next run has workers of its own
+                    workers.close()  # the next run starts new ones
     except KeyboardInterrupt:
         code, status = INTERRUPTED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
@@ -181,7 +181,7 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
 
 
 class Results:
-    """Finished runs with their errors, and the files that are made of them."""
+    """Finished runs with their errors, and the files made from them."""
 
     def __init__(self, path: Path, plan: Plan | None = None):
         self.path, self.plan = path, plan
@@ -209,17 +209,17 @@ class Results:
         checkpoint.write_atomic(self.path / REPORT, page(self.path, groups, self.plan, self.path / PICTURE))
 
     def files(self) -> list[Path]:
-        """Those that exist."""
+        """The files that exist."""
         names = (COMPARISON, REPORT, TABLE, ROWS, PICTURE)
         return [self.path / name for name in names if (self.path / name).is_file()]
 
     def show(self, console: Console) -> None:
-        """Print the tables without their quartiles, and where the whole ones are."""
+        """Print the tables without their quartiles, and where the complete ones are."""
         console.print(tables.introduction(self.plan))
         for columns in (tables.DRIVING, tables.ERRORS):
             head, *rows = tables.table(self.groups, columns)
             table = Table(box=SIMPLE, padding=0, pad_edge=False, show_edge=False)
-            for name in head:  # a word a line, so that it is narrow
+            for name in head:  # one word per line, to be narrow
                 table.add_column(
                     name.replace(",", "").replace(" ", "\n"), overflow="fold", no_wrap=name in ("road", "learner")
                 )
@@ -251,12 +251,12 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
 
 
 class Progress(Line):
-    """Shows which run is trained, how far it is, and ETA: a line on a terminal, plain lines elsewhere."""
+    """Shows which run is being trained, its progress and ETA: a line on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console, folder: ComparisonFolder, cells: Sequence[Cell]):
         super().__init__(console)
         self._total, self.left = len(cells), sum(not cell.finished() for cell in cells)
-        self._run_s = limits(folder.plan.budget)[1] or math.nan  # until a first run is done
+        self._run_s = limits(folder.plan.budget)[1] or math.nan  # until the first run is done
         there = f", {self._total - self.left} of them finished" if self.left < self._total else ""
         console.print(f"comparing {self._total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
@@ -266,7 +266,7 @@ class Progress(Line):
         self.note("starting" if self._is_new else "reading what is finished")
 
     def note(self, text: str, more: str = "") -> None:
-        """How far it is, and more where there is room."""
+        """Show `text` after counter and ETA, and `more` if there is room."""
         self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}  {text}", f"{self.name}  {more}"
 
     def compiling(self) -> AbstractContextManager[object]:
@@ -302,6 +302,6 @@ class Progress(Line):
         return f"run {self._total - self.left}/{self._total}"
 
     def _eta(self) -> str:
-        """As if each run took as long as the latest one, or a budget of wall time."""
+        """The ETA if each run takes as long as the latest one, or at first as the budget of wall time."""
         seconds = self._run_s * self.left - (time.perf_counter() - self._begun)
         return clock(max(seconds, 0.0)) if math.isfinite(seconds) else "-:--"

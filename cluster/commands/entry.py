@@ -14,13 +14,13 @@ from importlib import import_module
 from importlib.metadata import version
 from types import FrameType
 
-STARTED = time.perf_counter()  # of the process, but for Python's own start of some 30 ms
+STARTED = time.perf_counter()  # when the process started, but for Python's own startup of some 30 ms
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Signal handler: KeyboardInterrupt, but once the import system is left.
+    """Signal handler: raise KeyboardInterrupt, but never inside the import system.
 
-    Raised there, it can be lost, or leave the import lock held, for which other threads then wait forever.
+    Raised there, it can be lost, or leave the import lock held, so that other threads wait for it forever.
     """
     if frame and frame.f_code.co_filename.startswith("<frozen importlib"):
         threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
@@ -35,7 +35,7 @@ def _enter(module: str, name: str) -> None:
     if "--version" in sys.argv[1:]:
         print(f"gridsim {version('gridsim')}")
         return
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the shell has it ignored
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the shell had it ignored
         signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
     try:
@@ -43,8 +43,8 @@ def _enter(module: str, name: str) -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except SystemExit as ended:
-        # At once: the last garbage collection takes seconds with PyTorch, threads may still be compiling, and while
-        # C++ destructors run, threads that Ray leaves behind abort the process once in some thousands of times.
+        # Exit at once: the last garbage collection takes seconds with PyTorch, threads may still be compiling, and
+        # threads that Ray leaves behind abort one process in some thousands while C++ destructors run.
         with contextlib.suppress(OSError):
             sys.stdout.flush()
             sys.stderr.flush()

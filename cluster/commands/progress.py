@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from cluster.training.trainer import Learning
 
 LINE_S = 5.0  # between lines without a terminal
-WINDOW_S = 10.0  # of steps from which the ETA follows, at least
+WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time
 BAR = 10  # characters
 
 
 class Line(Reporter):
-    """On a terminal `head`, `facts`, a bar and the time if `share` is known, and `rest` on a line of its own.
+    """On a terminal: `head`, `facts`, a bar and the elapsed time if `share` is known, and `rest` on a second line.
 
-    Warnings begin with `name`; `resume` is the command that sends later what MLflow lacks.
+    Warnings begin with `name`; `resume` is the command that later sends what MLflow lacks.
     """
 
     def __init__(self, console: Console, name: str = "", resume: str = ""):
@@ -45,7 +45,7 @@ class Line(Reporter):
         self._live.stop()
 
     def text(self) -> Text:
-        """The line as it is now."""
+        """Both lines as they are now."""
         line = Text(no_wrap=True, overflow="ellipsis").append(self.head, "bold").append(f"  {self.facts}  ")
         if self.share is not None:
             done = round(BAR * min(self.share, 1.0))
@@ -61,15 +61,16 @@ class Line(Reporter):
 
 
 class Progress(Line):
-    """Shows how far a run is, its success and ETA, then distance, speed and car-steps per second.
+    """Shows a run's progress, success and ETA, then distance, speed and car-steps per second.
 
-    Args: the console; the command's name; the run's folder and how to resume it, as the user would type these.
+    Args: the console; the command's name; the run's folder and the command that resumes it, as the user would type
+    them.
     """
 
     def __init__(self, console: Console, prog: str, folder: str, resume: str):
         super().__init__(console, prog, resume)
         self._folder = folder
-        self._steps: deque[tuple[float, float, float]] = deque()  # when each ended, how far the run was, car-steps
+        self._steps: deque[tuple[float, float, float]] = deque()  # of each: end time, progress, car-steps
         self._printed = 0.0
         self._text = ""
         self.facts, self.rest = "success 0%  ETA -:--", "starting the workers"
@@ -106,7 +107,7 @@ class Progress(Line):
             self.console.print(f"{self.head}  {self.facts}  {self._text}", soft_wrap=True)
 
     def _eta(self, car_steps: float) -> str:
-        """When the run reaches the first of its bounds at the pace of the latest steps. It may be solved before."""
+        """Time until the run reaches its first limit at the pace of the latest steps. It may be solved before."""
         now, (done, total, _) = time.perf_counter(), self._learning.progress()
         self._steps.append((now, done, car_steps))
         while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:
@@ -128,15 +129,15 @@ class Progress(Line):
 
 
 def progress_of(learning: Learning, bound: bool = True) -> str:
-    """How far a run is, in words: what is done, not which step is the next."""
+    """A run's progress in words: what is done, not which step comes next."""
     done, total, unit = learning.progress()
-    done = min(done, total or done)  # a budget is spent before the last step ends
+    done = min(done, total or done)  # the last step may exceed the budget
     of = f"/{total:g}" if total and bound else ""
     return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{done:.0f}{of} {unit}"
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds, and hours where there are some."""
+    """Minutes and seconds, with hours if there are any."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

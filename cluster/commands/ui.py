@@ -1,4 +1,4 @@
-"""`make ui`: MLflow's UI on loopback, and the links to the run tables in it once it answers."""
+"""`make ui`: MLflow's UI on loopback; links to its run tables are printed once it answers."""
 
 import os
 import signal
@@ -21,8 +21,8 @@ def main(port: str) -> None:
     except TrackingError as error:
         sys.exit(f"make ui: {error}")
     except (OSError, OverflowError, ValueError):
-        sys.exit(f"make ui: port {port} is in use or none; choose another with make ui PORT=...")
-    except Exception as error:  # a database of another MLflow
+        sys.exit(f"make ui: port {port} is in use or not a port; choose another with make ui PORT=...")
+    except Exception as error:  # a database of another MLflow version
         sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}; move it elsewhere if another MLflow made it")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]

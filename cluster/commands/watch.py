@@ -1,4 +1,4 @@
-"""gridsim-watch and gridsim-drive: a window on a drive, a film or a page of it."""
+"""gridsim-watch and gridsim-drive: a drive in a window, as a film, or on a page."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class DriveFlags:
 
 
 def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
-    """Width and height in pixels, and seconds, infinite for 0. Raises UsageError for these or --traffic."""
+    """Width and height in pixels, and seconds, infinite for 0. Raises UsageError if these or --traffic are wrong."""
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
     if not (64 <= min(width, height) <= max(width, height) <= 4096) or width % 2 or height % 2:
@@ -144,7 +144,7 @@ def _watch() -> int:
 
 
 def checkpoint_time(run: Path) -> int:
-    """When a run's checkpoint was written, ns; 0 before there is one."""
+    """When a run's checkpoint was written, ns; 0 if there is none yet."""
     try:
         return (run / CHECKPOINT).stat().st_mtime_ns
     except OSError:
@@ -167,7 +167,7 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
 
 
 def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
-    """Gives the champion or elite before each drive, with its title. Raises UsageError, RunError, CheckpointError."""
+    """A function that returns each drive's driver and its title. Raises UsageError, RunError, CheckpointError."""
     source, of_run = Path(flags.source), flags.generation is not None or flags.follow
     if flags.generation is not None and flags.follow:
         raise UsageError("--generation and --follow exclude each other; leave one out")
@@ -190,7 +190,7 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
 
 
 def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
-    """Drives to show, without an end unless it is a recorded one, and what they are. Raises GridSimError."""
+    """Yield drives and their titles: a recorded drive's episodes, else without end. Raises GridSimError."""
     if _is_recording(flags):
         yield from _recorded(flags)
         return
@@ -209,14 +209,16 @@ def _is_recording(flags: WatchFlags) -> bool:
 
 
 def _drives_once(flags: WatchFlags, seconds: float) -> list[tuple[Recording, str]]:
-    """As `_drives`, but one drive of a champion."""
+    """As `_drives`, but only one drive of a champion."""
     return list(_recorded(flags)) if _is_recording(flags) else [next(_drives(flags, seconds))]
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     """The episodes of a recorded drive."""
     if flags.generation is not None or flags.follow or flags.scenario or flags.traffic != -1:
-        raise UsageError("a recorded drive has its own driver and road; leave out all but --output and how it looks")
+        raise UsageError(
+            "a recorded drive has its own driver and road; leave out --generation, --follow, --scenario and --traffic"
+        )
     recorded, config = read_drive(flags.source), SimConfig()
     scenario, _ = _map(recorded.scenario, recorded.map_seed, config)
     _, cars, ranges, worlds = replay(recorded, scenario)
@@ -229,7 +231,7 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
 
 
 def _output(flags: WatchFlags) -> Path:
-    """Where to write. Raises UsageError if that cannot be."""
+    """Where to write. Raises UsageError for another kind of file, or if there is no such folder."""
     output = Path(flags.output)
     if output.suffix.lower() not in (*CODING, ".html"):
         raise UsageError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
@@ -248,7 +250,7 @@ def _page(flags: WatchFlags, limit: float) -> None:
         for found, title in _drives_once(one, limit):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
             shown.append(Shown(label, str(len(shown)), found))
-            if not recorded:  # the others drive on its road, among as many cars
+            if not recorded:  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise UsageError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
@@ -290,7 +292,7 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     fps = flags.fps or 30
     run = Path(flags.source)
     drives = _drives(flags, SimConfig().episode.time_limit)
-    first = next(drives)  # errors come before the window
+    first = next(drives)  # raises errors before the window opens
     shown = 0.0
     with Window(size, f"GridSim: {flags.source}") as window:
         for drive, title in itertools.chain([first], drives):

@@ -303,7 +303,7 @@ def stopped(tmp_path):
             "--generations 2",
             "--generations 2 contradicts the run's 6; give a greater --generations, or start a new run",
         ),
-        ("--car-steps 1e6", "--car-steps 1000000 is not what bounds the run; give a greater --generations"),
+        ("--car-steps 1e6", "--car-steps 1000000 does not limit the run; give a greater --generations"),
         ("--name other", "--name other contradicts the run's r"),
         ("--output elsewhere", "contradicts the run's"),
         ("--config r/config.json", "--resume and --config exclude each other"),
@@ -318,7 +318,7 @@ def test_resume_refuses_contradictions(stopped, change, said, monkeypatch, capsy
 
 def test_a_run_is_for_the_command_that_made_it(stopped, monkeypatch, capsys):
     (line,) = refused(dqn_main, monkeypatch, capsys, "--resume", str(stopped))
-    assert line.endswith(f"{stopped} is of another learner; use gridsim-evolve --resume {stopped}")
+    assert line.endswith(f"{stopped} belongs to another learner; use gridsim-evolve --resume {stopped}")
 
 
 def test_resume_refuses_damaged_checkpoints(stopped, monkeypatch, capsys):
@@ -347,7 +347,7 @@ def test_a_device_that_is_not_there_is_said(monkeypatch, capsys, tmp_path):
     ("policy", "genome", "said"),
     [
         ("mlp:6,7", 0.0, "is a mlp:6,7; use --policy mlp:6,7"),
-        ("mlp:64+steering", np.nan, "some of its genes are no numbers"),
+        ("mlp:64+steering", np.nan, "some of its genes are not numbers"),
     ],
 )
 def test_a_champion_that_does_not_fit_is_refused(policy, genome, said, monkeypatch, capsys, tmp_path):

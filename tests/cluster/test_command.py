@@ -80,9 +80,9 @@ def refused(prog, line, capsys):
         ("gridsim-watch", "--folow runs/x", "unrecognized --folow; did you mean --follow?"),
         ("gridsim-dqn", "--frobnicate", "unrecognized --frobnicate"),
         ("gridsim-evolve", "stray", "Unrecognized options: stray"),
-        ("gridsim-evolve", "--population 2.5", "--population: '2.5' is no whole number"),
-        ("gridsim-evolve", "--car-steps 1e-3", "--car-steps: '1e-3' is no whole number"),
-        ("gridsim-evolve", "--until soon", "--until: 'soon' is no number"),
+        ("gridsim-evolve", "--population 2.5", "--population: '2.5' is not a whole number"),
+        ("gridsim-evolve", "--car-steps 1e-3", "--car-steps: '1e-3' is not a whole number"),
+        ("gridsim-evolve", "--until soon", "--until: 'soon' is not a number"),
         ("gridsim-evaluate", "--json", "CHAMPION is missing: A champion.npz, or a run's folder."),
         (
             "gridsim-evolve",

@@ -111,5 +111,5 @@ def test_a_port_in_use_is_one_line(tmp_path):
             timeout=120,
         )
     assert done.returncode == 1
-    assert done.stderr == f"make ui: port {port} is in use or none; choose another with make ui PORT=...\n"
+    assert done.stderr == f"make ui: port {port} is in use or not a port; choose another with make ui PORT=...\n"
     assert not list(Path(tmp_path).iterdir())
