@@ -178,7 +178,7 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     if not source.exists():
         raise UsageError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
     if of_run and not (source / CONFIG).is_file():
-        raise RunError(f"{source} is no run's folder: it has no {CONFIG}")
+        raise RunError(f"{source} is not a run's folder: it has no {CONFIG}")
     if not flags.follow:
         found = elite(source, flags.generation) if of_run else (load_champion(source), "champion")
         return lambda: found

@@ -1,4 +1,4 @@
-"""How far a champion drives from the reference driver."""
+"""How far a champion deviates from the reference driver."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def series(
     seed: int = HELD_OUT_SEED,
     traffic: int | None = None,
 ) -> list[Series]:
-    """A champion and the reference along each route, in the order of the episodes (`gridsim.reference.errors.errors`).
+    """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference.errors`.
 
-    An episode without a metre forward has none.
+    Episodes in which it does not drive a metre forward are left out.
 
-    Args: as `champion.evaluate`'s.
-    Raises: ValueError with one line as `champion.evaluate`.
+    Args: as for `champion.evaluate`.
+    Raises: ValueError, as `champion.evaluate` does.
     """
     name = scenario or champion.scenario
     sim, spec, maps = champion.sim, PolicySpec.parse(champion.policy), Maps(name, champion.sim)
@@ -36,6 +36,6 @@ def series(
         for row, world in zip(chosen.rows, chosen.worlds, strict=True):
             road = maps.get(chosen.maps[row["map"]])
             _, states, _ = trajectory(spec, champion.genome, road, row["start"], limits, sim, world)
-            with contextlib.suppress(ValueError):  # without a metre forward
+            with contextlib.suppress(ValueError):  # not a metre forward
                 found.append(error_series(poses_of(states), road, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]

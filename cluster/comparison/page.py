@@ -23,7 +23,7 @@ img { max-width: 100% }"""
 
 
 def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path) -> bytes:
-    """The page, to be written into `folder`, to which its links are relative; the picture is part of it."""
+    """The page as HTML, to be written into `folder`, as its links are relative; the picture is embedded."""
     title = f"GridSim: {escape(folder.name)}"
     parts = [f"<h1>{title}</h1>", f"<p>{escape(introduction(plan))}</p>"]
     for columns in (DRIVING, ERRORS):
@@ -42,13 +42,13 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of cells that are HTML."""
+    """A table as HTML, from cells that are HTML."""
     lines = ["".join(f"<th>{cell}" for cell in head), *("".join(f"<td>{cell}" for cell in row) for row in rows)]
     return "<table>\n" + "\n".join(f"<tr>{line}" for line in lines) + "\n</table>"
 
 
 def _link(folder: Path, run: Run) -> str:
-    """A run's seed and success; a link to its drive where there is one."""
+    """A run's seed and success, linked to its drive if there is one."""
     text = f"seed {run.settings.seed}: {run.figures['success_rate']:.0%}"
     drive = run.folder / PAGE
     if not drive.is_file():

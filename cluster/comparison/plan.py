@@ -31,8 +31,8 @@ from gridsim.maps.scenarios import REGISTRY, is_map_file
 COMPARISON = "comparison.json"
 FORMAT = 2
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
-UNBOUND = MAX_STEPS  # generations or car-steps, where a budget is what ends a run
-EVALUATIONS = 10  # of the DQN at least
+UNBOUND = MAX_STEPS  # generations or car-steps, if a budget ends the run
+EVALUATIONS = 10  # of the DQN, at least
 
 
 class Cell(NamedTuple):
@@ -46,20 +46,20 @@ class Cell(NamedTuple):
         return self.folder.name
 
     def finished(self) -> bool:
-        """Whether its summary is there, the last file that a run writes."""
+        """Whether there is a summary, the last file that a run writes."""
         return (self.folder / SUMMARY).is_file()
 
     def check(self) -> None:
-        """Raises ExperimentError or RunError where the folder holds something else."""
+        """Raises ExperimentError or RunError if the folder holds something else."""
         if (self.folder / CONFIG).is_file():
             if read_config(self.folder / CONFIG)[0] != self.settings:
                 raise ExperimentError(
                     f"{self.folder} is not what {COMPARISON} asks for: one of them was edited, or another version of "
                     "GridSim wrote it; start a new comparison"
                 )
-        # Killed while it wrote its first file, a run leaves a hidden one.
+        # A run that is killed while it writes its first file leaves a hidden one.
         elif self.folder.is_file() or any(self.folder.glob("[!.]*")):
-            raise ExperimentError(f"{self.folder} is in the way and no run; move it elsewhere")
+            raise ExperimentError(f"{self.folder} is in the way and is not a run; move it elsewhere")
 
     def open(self) -> RunFolder:
         """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""
@@ -105,7 +105,7 @@ class Plan:
                 raise ExperimentError(f"--{flag}: {next(n for n in given if given.count(n) > 1)} is named twice")
         for learner in self.learners:
             if learner not in LEARNERS:
-                raise ExperimentError(f"--learners: {learner!r:.40} is none; use {', '.join(LEARNERS)}")
+                raise ExperimentError(f"--learners: {learner!r:.40} is not a learner; use {', '.join(LEARNERS)}")
         if not 1 <= self.seeds <= MAX_SEEDS:
             raise ExperimentError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
         if len({file_name(name) for name in self.scenarios}) != len(self.scenarios):
@@ -123,7 +123,7 @@ class Plan:
         ]
 
     def settings(self, scenario: str, learner: Learner, seed: int) -> RunSettings:
-        """What one run is asked to do."""
+        """The settings of one run."""
         car_steps, _ = limits(self.budget)
         common: dict[str, Any] = {
             "scenario": scenario,
@@ -149,7 +149,7 @@ class Plan:
 
 
 def limits(budget: str) -> tuple[int, float]:
-    """Car-steps and seconds of wall time that a run may use at most; the one that is not limited is 0.
+    """Car-steps and seconds of wall time that a run may use at most; 0 for the one that is not limited.
 
     Reads `20M`, `500k` or `20,000,000` car-steps; `60s`, `5min` or `1h` of wall time. Raises ExperimentError.
     """
@@ -172,7 +172,7 @@ def limits(budget: str) -> tuple[int, float]:
 
 @dataclass
 class ComparisonFolder:
-    """Where a comparison is kept, its plan, and where MLflow has its parent run: the address, and the key."""
+    """Where a comparison is kept, its plan, and how its parent run is found in MLflow: the address and the key."""
 
     path: Path
     plan: Plan
@@ -186,7 +186,7 @@ class ComparisonFolder:
             "command": "gridsim-compare",
             "gridsim": version("gridsim"),
             "plan": dataclasses.asdict(self.plan),
-            # MLflow gets this file, and with it no password.
+            # This file is logged to MLflow, so it must not hold a password.
             "tracking_uri": self.tracking_uri if self.tracking_uri == shown(self.tracking_uri) else "",
             "tracking_key": self.tracking_key,
         }
@@ -198,7 +198,7 @@ def open_comparison(folder: Path) -> ComparisonFolder:
     path = folder / COMPARISON
     if not path.is_file():
         reason = f"it has no {COMPARISON}" if folder.is_dir() else "no such folder"
-        raise ExperimentError(f"{folder} is no comparison's folder: {reason}")
+        raise ExperimentError(f"{folder} is not a comparison's folder: {reason}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
@@ -229,7 +229,7 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
         else:
             found.append(read_run(folder))
     first: dict[tuple[object, ...], Run] = {}
-    for run in found:  # counted as two seeds they would make a figure look more certain than it is
+    for run in found:  # the same run as two seeds would make figures look more certain than they are
         same = (run.champion_sha256, run.settings.learner, run.settings.scenario, run.settings.traffic)
         other = first.setdefault(same, run)
         if other is not run:

@@ -1,4 +1,4 @@
-"""Finished training runs as a comparison reads them: what they were, how well they drove, and their errors."""
+"""Finished training runs as a comparison reads them: their settings, how well they drove, and their errors."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from gridsim.reference.errors import errors
 
 Learner = Literal["evolution", "two-parents", "dqn", "random"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
-LEAST_SHARE = 0.25  # of a summary's distance that a champion must drive again when its errors are measured
-LEFT_OUT_M = 100.0  # m of an episode, at most, of which no error is known
+LEAST_SHARE = 0.25  # of its summary's distance that a champion must drive again when its errors are measured
+LEFT_OUT_M = 100.0  # m of an episode, at most, over which no error is measured
 
 ERROR_FIGURES = {
     "velocity_error_mps": "velocity_mean_mps",
@@ -51,7 +51,7 @@ class Run:
 
     Attributes:
         champion_sha256: digest of its champion's genome.
-        figures: RUN_FIGURES, and ERROR_FIGURES once they are measured; not a number where they could not be.
+        figures: RUN_FIGURES, and ERROR_FIGURES once they are measured; nan where they could not be.
     """
 
     folder: Path
@@ -61,12 +61,12 @@ class Run:
 
 
 def read_run(folder: Path) -> Run:
-    """A finished run from its folder. Raises ExperimentError, RunError, CheckpointError with one line."""
+    """A finished run from its folder. Raises ExperimentError, RunError, CheckpointError."""
     path = folder / SUMMARY
     if not folder.is_dir():
-        raise ExperimentError(f"{folder}: no such folder" if not folder.exists() else f"{folder} is no folder")
+        raise ExperimentError(f"{folder}: no such folder" if not folder.exists() else f"{folder} is not a folder")
     if not (folder / CONFIG).is_file():
-        raise ExperimentError(f"{folder} is no run's folder: it has no {CONFIG}")
+        raise ExperimentError(f"{folder} is not a run's folder: it has no {CONFIG}")
     if not path.is_file():
         raise ExperimentError(f"{folder} is not finished: it has no {SUMMARY}; finish it with --resume {folder}")
     settings, _ = read_config(folder / CONFIG)
@@ -84,7 +84,7 @@ def read_run(folder: Path) -> Run:
 
 
 def errors_of(run: Run) -> dict[str, float]:
-    """ERROR_FIGURES of a run's champion, not a number for one without a metre forward. Raises ExperimentError."""
+    """ERROR_FIGURES of a run's champion, nan if it never drives a metre forward. Raises ExperimentError."""
     settings = run.settings
     try:
         champion = load_champion(run.folder / CHAMPION)

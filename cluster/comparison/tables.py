@@ -22,12 +22,12 @@ NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "
 COLUMNS = (
     "scenario", "traffic", "observation", "learner", "seed", *RUN_FIGURES, *ERROR_FIGURES, "champion_sha256", "run",
 )  # fmt: skip
-"""Of table.csv."""
+"""Columns of table.csv."""
 NOTHING = "–"
 
 
 class Spread(NamedTuple):
-    """Median and quartiles of a figure over n seeds; not a number without any."""
+    """Median and quartiles of a figure over n seeds; nan if n is 0."""
 
     n: int
     lower: float
@@ -36,20 +36,20 @@ class Spread(NamedTuple):
 
 
 def spread(values: Iterable[float]) -> Spread:
-    """Median and quartiles (linear interpolation) of the finite values: others were not measured."""
+    """Median and quartiles (linear interpolation) of the finite values; the others were not measured."""
     found = [value for value in values if math.isfinite(value)]
     return Spread(len(found), *np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist())
 
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one learner on one road, all seeds of them.
+    """The runs of one learner on one road with all seeds.
 
     Attributes:
-        road: the scenario's name, with its traffic where the comparison has several.
-        name: the learner's, with its observation where the comparison has both.
+        road: the scenario's name, with the traffic if the comparison has several amounts of it.
+        name: the learner's name, with the observation if the comparison has both.
         runs: the finished ones.
-        seeds: those of the plan.
+        seeds: all of the plan's.
     """
 
     scenario: str
@@ -62,16 +62,16 @@ class Group:
     seeds: tuple[int, ...]
 
     def values(self, figure: str) -> list[float]:
-        """One number a run."""
+        """One number for each run."""
         return [run.figures.get(figure, math.nan) for run in self.runs]
 
     def spread(self, figure: str) -> Spread:
-        """Over seeds."""
+        """Median and quartiles over seeds."""
         return spread(self.values(figure))
 
 
 def group(runs: Sequence[Run], plan: Plan | None = None) -> list[Group]:
-    """Runs by road and learner, in the order of the registry and of NAMES; with a plan also what is missing."""
+    """Runs by road and learner, in the order of the registry and of NAMES; with a plan, also the missing ones."""
     settings = [each.settings for each in (plan.cells(Path()) if plan else runs)]
 
     def order(key: tuple[str, int, str, str]) -> tuple[int, str, int, int, str]:
@@ -182,12 +182,12 @@ ERRORS: Columns = {
 
 
 def table(groups: Sequence[Group], columns: Columns) -> list[list[str]]:
-    """Head and rows of a table: road, learner and the columns."""
+    """Header and rows of a table: road, learner and the columns."""
     rows = [[group.road, group.name, *(cell(group) for cell in columns.values())] for group in groups]
     return [["road", "learner", *columns], *rows]
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    """A table: words to the left, numbers to the right; the first row is its head."""
+    """A Markdown table, words aligned left and numbers right; the first row is its header."""
     rule = ["---", "---", *["---:"] * (len(rows[0]) - 2)]
     return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in [rows[0], rule, *rows[1:]])

@@ -22,7 +22,7 @@ from gridsim.traffic.world import LANE
 from gridsim.view.render import Renderer, interpolate
 
 CODING = {
-    # Flat colours compress well: some 3 MB a minute. The index in front lets a browser begin at once.
+    # Flat colours compress well: some 3 MB a minute. With the index in front, a browser can start at once.
     ".mp4": "-c:v libx264 -preset superfast -crf 25 -pix_fmt yuv420p -movflags +faststart -f mp4",
     ".gif": "-filter_complex split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none:"
     "diff_mode=rectangle -f gif",
@@ -40,11 +40,11 @@ class Recording:
     Attributes:
         scenario: the map.
         cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.car.ego`).
-        ranges: float32 [steps + 1, rays], of its rays, m.
+        ranges: float32 [steps + 1, rays], the lengths of its rays, m.
         boxes: float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine).
-        end: how it ended; RUNNING where the recording did.
+        end: how it ended; RUNNING if only the recording did.
         period: s from state to state.
-        outputs: float32 [steps + 1, 8], the network's for each action; None where they are unknown.
+        outputs: float32 [steps + 1, 8], the network's for each action; None if they are unknown.
     """
 
     scenario: Map
@@ -64,7 +64,7 @@ class Recording:
 def record(
     champion: Champion, scenario: Map, start: np.ndarray, seconds: float, world: np.ndarray | None = None
 ) -> Recording:
-    """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for so many seconds.
+    """Drive from `start` float32 [5] (x, y, heading, speed, steering) to the episode's end, or for `seconds`.
 
     Args: world float32 [others, world.FIELDS], the traffic at the start.
     """
@@ -108,7 +108,7 @@ def picture(renderer: Renderer, drive: Recording, seconds: float, title: str = "
 
 
 def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") -> Iterator[np.ndarray]:
-    """Pictures uint8 [h, w, 3] of a whole drive: as many as it lasts seconds times `fps`, and one at least."""
+    """Pictures uint8 [h, w, 3] of a whole drive: `fps` for each second of it, and at least one."""
     for k in range(max(1, round(drive.seconds * fps))):
         yield picture(renderer, drive, k / fps, title)
 
@@ -116,7 +116,7 @@ def frames(renderer: Renderer, drive: Recording, fps: float, title: str = "") ->
 def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> int:
     """Write pictures uint8 [h, w, 3] as H.264 in an MP4, or as a GIF, by the path's suffix; whole or not at all.
 
-    Returns: how many there were. Raises: VideoError with one line; a file that was there before is then kept.
+    Returns: how many there were. Raises: VideoError; a file that was there before is then kept.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -131,7 +131,7 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int
 
 
 def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], fps: float, coding: list[str]) -> int:
-    """Pipe pictures through ffmpeg. Raises VideoError where there is none or it fails."""
+    """Pipe pictures through ffmpeg. Raises VideoError if there is no ffmpeg or it fails."""
     import imageio_ffmpeg
 
     try:

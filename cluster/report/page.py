@@ -1,7 +1,7 @@
 """The drive's page: one HTML file that plays drives in any browser, offline.
 
-Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, a row a channel; their
-differences from moment to moment are compressed. Positions are in 65,536ths of the map's sides and headings in
+Its script is in `drive.html`; this file packs the numbers. A drive is a table of 16-bit numbers, one row per channel;
+the differences between moments are compressed. Positions are in 65,536ths of the map's sides and headings in
 65,536ths of a turn, so that both wrap as the torus and the angle do.
 """
 
@@ -37,7 +37,7 @@ OFF_ROAD, ROAD = (223, 228, 220), (112, 120, 126)  # colours
 class Shown:
     """A drive on a page: the driver's name, a shorter one beside its car, and the recording.
 
-    `stride` counts control steps from moment to moment of the page; rays and outputs are shown if it is 1.
+    `stride` is the number of control steps between moments of the page; rays and outputs are shown only if it is 1.
     """
 
     label: str
@@ -46,7 +46,7 @@ class Shown:
     stride: int = 1
 
     def packed(self) -> dict[str, object]:
-        """It, as the page's script reads it."""
+        """The drive as the page's script reads it."""
         drive, road = self.drive, self.drive.scenario.road
         size = float(road.width), float(road.height)
         cars, boxes = drive.cars[:: self.stride], drive.boxes[:: self.stride]
@@ -86,7 +86,7 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
 
 
 def write_page(path: str | os.PathLike[str], title: str, shown: Sequence[Shown], config: SimConfig) -> None:
-    """Write a page of drives on one map, at first with the last of them. Raises: CheckpointError with one line."""
+    """Write a page of drives on one map, which shows the last of them first. Raises: CheckpointError."""
     road_map, constant = shown[-1].drive.scenario, constants(config)
     x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
     data = {

@@ -82,7 +82,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], 
     axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
     axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
     axis.set(xlim=(0, width), ylim=(0, height), aspect="equal", xlabel="x, m", ylabel="y, m")
-    if not scenario.torus:  # its sides are rounded up to powers of two; beyond the road all is wall
+    if not scenario.torus:  # show the road alone: the map's sides are rounded up to powers of two, with wall
         y, x = np.nonzero(nodes > 0.0)
         left, right, low, high = (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width).tolist()
         axis.set(xlim=(left - 5.0, right + 5.0), ylim=(low - 5.0, high + 5.0))
@@ -161,7 +161,7 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
 
 
 def errors_table(title: str, figures: Mapping[str, float]) -> Table:
-    """Velocity and steering errors, `gridsim.reference.errors.errors`."""
+    """Velocity and steering errors, as from `gridsim.reference.errors.errors`."""
     table = Table("", "mean", "max", title=title, title_justify="left")
     for column in table.columns[1:]:
         column.justify = "right"

@@ -1,4 +1,4 @@
-"""Champions: what is written of them, and what a person does with one: load it, drive it, evaluate it.
+"""Champions: how they are saved, and what you can do with one: load it, drive it, evaluate it.
 
 >>> champion = load_champion("runs/NAME")  # doctest: +SKIP
 >>> env = champion.make_env()  # doctest: +SKIP
@@ -32,7 +32,7 @@ from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED, check_name, default_traffic
 
-GONE = ("apart", "kerb")  # numbers of traffic that older champions hold
+GONE = ("apart", "kerb")  # former parameters of traffic, which older champions hold
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class Champion:
 
     Attributes:
         genome: float32 [genes].
-        policy: its network, as in `mlp:6,7`.
+        policy: its network, such as `mlp:6,7`.
         scenario: where it learned.
-        sim: the simulator's numbers it learned with.
-        traffic: other cars it learned among.
+        sim: the simulator's parameters it learned with.
+        traffic: number of other cars it learned among.
     """
 
     genome: np.ndarray
@@ -58,7 +58,7 @@ class Champion:
 
     @property
     def sha256(self) -> str:
-        """Of the genome's bytes."""
+        """Digest of the genome's bytes."""
         return hashlib.sha256(self.genome.tobytes()).hexdigest()
 
     @property
@@ -67,7 +67,7 @@ class Champion:
         return PolicySpec.parse(self.policy).observation
 
     def traffic_on(self, scenario: str) -> int:
-        """Other cars on a scenario unless told otherwise: as many as it learned among, elsewhere the scenario's own."""
+        """Other cars on a scenario by default: on its own as many as it learned among, elsewhere the usual number."""
         return self.traffic if scenario == self.scenario else default_traffic(scenario)
 
     def act(
@@ -75,10 +75,10 @@ class Champion:
     ) -> int | np.ndarray:
         """The action for an observation, or actions [n] for n of them.
 
-        Args: of rays, the environment's float32 [32] or [n, 32], which contain the speed, and what else it may see
-        (`make_env` gives it). Of the grid, the environment's dictionary of grid and speed, or what `convnet.act_on`
-        takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which that does not show.
-        Raises: ValueError with one line for an observation that this champion does not see.
+        Args: with rays, the environment's float32 [32] or [n, 32], which contains the speed, or more numbers if the
+        policy sees more (as from `make_env`). With the grid, the environment's dictionary of grid and speed, or what
+        `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which the grid does not show.
+        Raises: ValueError, with a one-line message, for an observation that does not fit this champion.
         """
         spec = PolicySpec.parse(self.policy)
         if isinstance(spec, CnnSpec):
@@ -114,7 +114,7 @@ class Champion:
         return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **{**sees, **options})
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write champion.npz. Raises CheckpointError if that cannot be done."""
+        """Write champion.npz. Raises CheckpointError if it cannot be written."""
         meta = {
             "policy": self.policy,
             "scenario": self.scenario,
@@ -131,8 +131,8 @@ class UnfinishedError(CheckpointError):
 def load_champion(path: str | os.PathLike[str]) -> Champion:
     """Read a champion.npz, given the file or its run's folder.
 
-    Raises: UnfinishedError for a run that has no champion yet, CheckpointError with one line for what is missing,
-    damaged, hostile or no champion.
+    Raises: UnfinishedError for a run that has no champion yet, CheckpointError for a file that is missing, damaged,
+    hostile or not a champion.
     """
     path = Path(path)
     if path.is_dir():
@@ -154,15 +154,15 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
         )
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: no champion: {error}") from error
+        raise CheckpointError(f"{path}: not a champion: {error}") from error
 
 
 def _check_finished(run: Path) -> None:
-    """Raises: CheckpointError with one line where a folder has no champion.npz."""
+    """Raises: CheckpointError if a folder has no champion.npz."""
     if (run / CHAMPION).exists():
         return
     if not (run / CONFIG).is_file():
-        raise CheckpointError(f"{run} is no run's folder: it has neither {CHAMPION} nor {CONFIG}")
+        raise CheckpointError(f"{run} is not a run's folder: it has neither {CHAMPION} nor {CONFIG}")
     try:
         command = read_config(run / CONFIG)[0].command
     except GridSimError:

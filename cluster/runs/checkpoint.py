@@ -2,7 +2,7 @@
 
 The format is NumPy's `.npz` (an uncompressed zip; `np.load` reads it) with two additions: the member `meta`, JSON as
 uint8, and a zip comment `sha256:<hex>` that covers every byte before the hex digits. So a truncated or edited file is
-distinguished from a whole one before anything in it is parsed. Nothing is ever pickled.
+detected before anything in it is parsed. Nothing is ever pickled.
 """
 
 import contextlib
@@ -28,11 +28,11 @@ _DIGEST = 64  # hex digits of a sha256
 
 
 class CheckpointError(GridSimError):
-    """A file that cannot be saved or that must not be trusted; its text is one line for the user."""
+    """A file that cannot be saved or must not be trusted; the message is one line for the user."""
 
 
 def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-    """Write `arrays` and `meta` to `path` in one step: afterwards the file is the new one whole, or the old one whole.
+    """Write `arrays` and `meta` to `path` in one step: afterwards the file is the new one or the old one, complete.
 
     The same content gives the same bytes. `meta` has to be plain JSON (string keys; tuples come back as lists).
     Raises TypeError or ValueError for what the format cannot hold (objects) and CheckpointError if the file cannot be
@@ -52,7 +52,7 @@ def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict
 def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read what `save` wrote: the arrays (owned, aligned, writable, C order) and the meta data.
 
-    Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited, hostile or another's.
+    Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited, hostile or not GridSim's.
     """
     content = _read(Path(path))
     if not content.startswith(b"PK\x03\x04"):
@@ -61,8 +61,8 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
         raise CheckpointError(f"{path}: truncated, or not written by GridSim")
     if content[-_DIGEST:] != hashlib.sha256(memoryview(content)[:-_DIGEST]).hexdigest().encode():
         raise CheckpointError(f"{path}: damaged or edited: its content does not match its checksum")
-    # A checksum is no signature: another program may have written these bytes. zipfile, numpy and json raise a dozen
-    # kinds of errors for such content, and all mean the same.
+    # A checksum is not a signature: another program may have written these bytes. zipfile, numpy and json raise a dozen
+    # kinds of errors for such content, which all mean the same.
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             if sum(member.file_size for member in archive.infolist()) > len(content):
@@ -83,13 +83,13 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, durable: bool = True) -> None:
-    """Replace the file at `path` by `content`, or leave it as it was and raise CheckpointError.
+    """Replace the file at `path` with `content`, or leave it as it was and raise CheckpointError.
 
-    With `durable` it is on the disk when this returns. Without, a power cut (no mere kill) can lose it; for
-    what can be made again.
+    With `durable` it is on the disk when this returns. Without, for files that can be made again, a power cut (but not
+    a kill) can lose it.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")  # of a writer that is killed it is left, until the next one
+    temporary = path.with_name(f".{path.name}.tmp")  # a writer that is killed leaves it, until the next one writes
     try:
         with open(temporary, "wb") as file:
             file.write(content)
@@ -106,7 +106,7 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
 
 
 def _read(path: Path) -> bytes:
-    """The whole file, if it is one."""
+    """The whole content of a file. Raises CheckpointError."""
     try:
         if path.exists() and not path.is_file():
             raise CheckpointError(f"{path}: not a file")

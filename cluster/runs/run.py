@@ -1,4 +1,4 @@
-"""A run's folder: made, locked, opened, and what its config.json says."""
+"""A run's folder: how it is made, locked and opened, and what its config.json says."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class RunFolder:
         init: path of the champion it started from, or "".
         init_sha256: digest of that genome, or "".
         map_sha256: digest of the map's file, or "".
-        saved: arrays and meta of its checkpoint, where it is resumed.
-        tracking_key: by which MLflow's run is found again.
+        saved: arrays and meta of its checkpoint, if it is resumed.
+        tracking_key: by which its MLflow run is found again.
     """
 
     path: Path
@@ -78,7 +78,7 @@ class RunFolder:
         }
 
     def digest(self) -> str:
-        """Of what must not differ between a run and its resumption."""
+        """Digest of what must not differ between a run and its resumption."""
         parts = self.config()
         for name in self.settings.unbound:
             parts["settings"].pop(name)
@@ -97,7 +97,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         config = json.loads(path.read_text(encoding="utf-8"))
         form = config.get("format")
         if form in OLD_FORMATS:
-            raise RunError(f"{path} is of a run of GridSim 0.1, which this version cannot go on with; start a new run")
+            raise RunError(f"{path} is of a run of GridSim 0.1, which this version cannot continue; start a new run")
         if form != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim; start a new run")
         settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))
@@ -122,7 +122,7 @@ def _map_sha256(settings: RunSettings) -> str:
         raise SettingsError(str(error)) from error
 
 
-@functools.cache  # a process may ask again
+@functools.cache  # so that a process may lock a folder again
 def lock(path: Path) -> None:
     """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
     try:
@@ -142,7 +142,7 @@ def open_run(folder: Path) -> RunFolder:
     if not folder.is_dir():
         raise RunError(f"{folder}: no such folder")
     if not (folder / CONFIG).is_file():
-        raise RunError(f"{folder} is no run's folder: it has no {CONFIG}")
+        raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
     lock(folder.resolve())
     settings, init = read_config(folder / CONFIG)
     run = RunFolder(folder.resolve(), settings, init, map_sha256=_map_sha256(settings))
@@ -170,7 +170,7 @@ def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init
 
 
 def new_folder(output: Path, name: str, kind: str) -> Path:
-    """The folder of a new run or comparison, checked but not yet made; without a name its `kind` and the time make one.
+    """The folder of a new run or comparison, checked but not yet made; by default named by `kind` and time.
 
     Raises: RunError.
     """
@@ -192,7 +192,7 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
 
 
 def is_finished(run: RunFolder) -> bool:
-    """Whether nothing is left to do: learned to the end, and all files are there; an extended run has steps.part."""
+    """Whether nothing is left to do: learning has ended and all files are there. An extended run has steps.part."""
     concluded = (run.path / SUMMARY).is_file() and not (run.path / STEPS).exists()
     return run.saved is not None and concluded and run.settings.ended(run.saved[1])
 

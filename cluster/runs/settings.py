@@ -1,4 +1,4 @@
-"""What a run was asked to do: the fields are the command's flags, and config.json is them written down."""
+"""A run's settings: the fields are the command's flags, and config.json stores them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MAX_UPDATES = 1_000_000  # for each thousand car-steps
 CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
-"""Of flags whose help says in words what their default means."""
+"""For flags whose help describes the default in words."""
 
 S = TypeVar("S", bound="RunSettings")
 
@@ -43,9 +43,9 @@ class SettingsError(GridSimError):
 class RunSettings:
     """What any learner's run depends on: two runs with equal settings have the same champion."""
 
-    command: ClassVar[str]  # that makes such a run
+    command: ClassVar[str]  # that starts such a run
     default_policies: ClassVar[dict[Observation, str]]
-    unbound: ClassVar[tuple[str, ...]]  # what may be greater when a run is resumed: it only ends later
+    unbound: ClassVar[tuple[str, ...]]  # limits that may be raised when a run is resumed: it only ends later
     counts: ClassVar[tuple[str, ...]]  # integers in a checkpoint that say how far a run has come
 
     scenario: str = "seamless"
@@ -69,7 +69,7 @@ class RunSettings:
     follow from it. By default a little above the lower end of the road's speed interval."""
 
     def __post_init__(self) -> None:
-        if is_map_file(self.scenario):  # absolute: what is written down is read again from anywhere
+        if is_map_file(self.scenario):  # absolute: config.json may be read from another folder
             object.__setattr__(self, "scenario", os.path.abspath(self.scenario))
         if self.traffic == -1:
             object.__setattr__(self, "traffic", default_traffic(self.scenario))
@@ -87,21 +87,21 @@ class RunSettings:
 
     @property
     def learner(self) -> str:
-        """Its name in a comparison, which distinguishes the two ways of recombination."""
+        """Its name in a comparison, which tells apart the two kinds of recombination."""
         return self.algorithm
 
     def curriculum(self) -> CurriculumConfig:
-        """The curriculum of such a run: its paces are those of the scenario, and of traffic where there is any."""
+        """The curriculum of such a run: its paces suit the scenario, and traffic if there is any."""
         low, _ = speed_interval(self.scenario)
         pace, champion_pace = (low + 0.8, low + 0.3) if self.traffic else (low + 2.0, low + 0.85)
         if self.pace:
             pace, champion_pace = self.pace + 1.15, self.pace
-        # In traffic much is chance: it takes more episodes to see how well a network drives.
+        # In traffic, chance matters more: it takes more episodes to see how well a network drives.
         episodes = 3 if self.traffic else 1
         return CurriculumConfig(pace=pace, champion_pace=champion_pace, starts=episodes, crash_starts=episodes)
 
     def extending(self, base: RunSettings) -> Self:
-        """These, asked for where a run of `base` goes on: its bounds may be greater."""
+        """These settings for a run of `base` that is continued: its limits may be raised."""
         return self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
@@ -113,7 +113,7 @@ class RunSettings:
         try:
             check_name(self.scenario)
             if is_map_file(self.scenario):
-                build(self.scenario, 0)  # kept, so that it is read once
+                build(self.scenario, 0)  # cached, so that it is read once
         except ValueError as error:
             raise SettingsError(str(error)) from error
         self._check_range(0, MAX_TRAFFIC, "traffic")
@@ -215,7 +215,7 @@ class EvolveSettings(RunSettings):
 
     def extending(self, base: RunSettings) -> Self:
         longer = isinstance(base, EvolveSettings) and self.generations > base.generations
-        # As for a new run that is given its --generations.
+        # As for a new run that is given --generations: the default car-steps do not apply.
         usual = self.car_steps == base.car_steps == self.default_car_steps()
         return replace(self, car_steps=0) if longer and usual else self
 
@@ -251,8 +251,8 @@ class DqnSettings(RunSettings):
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
     unbound: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
     counts: ClassVar[tuple[str, ...]] = ("evaluation", "car_steps", "episodes", "updates", "converged")
-    #: What is 0 unless it is given. An update on grids takes a hundred times as long as one on rays, so that half an
-    #: hour has 2 million car-steps and not 400.
+    #: What replaces 0 in these settings. An update on grids takes a hundred times as long as one on rays,
+    #: so that half an hour is enough for 2 million car-steps, not 400 million.
     suited: ClassVar[dict[Observation, dict[str, Any]]] = {
         "rays": {
             "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3, "anneal": 30_000_000,
@@ -329,7 +329,7 @@ SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (Evolve
 
 
 def check_workers(workers: int, address: str, patience_s: float) -> None:
-    """Raises SettingsError, one line, where a run cannot be computed like that; no result depends on it."""
+    """Raises SettingsError if a run cannot be computed with these, on which no result depends."""
     if not 0 <= workers <= MAX_WORKERS:
         raise SettingsError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
     if workers == 0 and address:

@@ -1,8 +1,9 @@
-"""What each step of a run leaves for good, its row of the history and its elite, in a file that grows with the run.
+"""What is kept of each step of a run, its row of the history and its elite, in a file that grows with the run.
 
-The checkpoint counts them and has their digest, and so is as small after thousands of steps as after the first. They
-are on the disk before it is: what a kill leaves behind the last step that is counted is cut off when the run goes on,
-and comes again. When a run ends, its history goes into the checkpoint, its elites into elites.npz, and the file goes.
+The checkpoint holds only the number of these records and their digest, and so is as small after thousands of steps as
+after the first. Records are on the disk before the checkpoint that counts them: any that a kill leaves uncounted are
+cut off when the run is resumed, and made again. When a run ends, its history moves into the checkpoint and its elites
+into elites.npz, and the file is deleted.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ def records(rows: np.ndarray, elites: np.ndarray | Sequence[np.ndarray]) -> np.n
 
 
 def append(path: Path, first: int, new: np.ndarray) -> None:
-    """Write records from number `first` on and cut off what is behind them; they are on the disk when this returns.
+    """Write records from number `first` on and cut off what follows them; they are on the disk when this returns.
 
-    Raises: CheckpointError with one line; the records before are kept.
+    Raises: CheckpointError; the records before are kept.
     """
     try:
         path.touch()
@@ -46,9 +47,9 @@ def append(path: Path, first: int, new: np.ndarray) -> None:
 
 
 def resume(folder: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], genes: int) -> np.ndarray:
-    """The records that a run's checkpoint counts; of a run that had ended they are written again.
+    """The records that a run's checkpoint counts; if the run had ended, their file is written again.
 
-    Raises: CheckpointError with one line, and KeyError or ValueError where another version wrote the checkpoint.
+    Raises: CheckpointError, and KeyError or ValueError if another version wrote the checkpoint.
     """
     path = folder / STEPS
     if "history" not in arrays:
@@ -66,13 +67,13 @@ def resume(folder: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, An
 
 
 def read_elites(folder: Path, policy: str) -> np.ndarray:
-    """The elites float32 [steps, genes] of a run that is going on, was stopped or has ended, of that policy.
+    """The elites float32 [steps, genes], of that policy, of a run that is going on, was stopped or has ended.
 
-    Raises: CheckpointError with one line.
+    Raises: CheckpointError.
     """
     genes, path = PolicySpec.parse(policy).size, folder / STEPS
     try:
-        with open(path, "rb") as file:  # opened before the checkpoint is read: it goes when the run ends
+        with open(path, "rb") as file:  # opened before the checkpoint is read: a run that ends deletes it
             return np.array(_read(file, checkpoint.load(folder / CHECKPOINT)[1], genes)["elite"])
     except FileNotFoundError:
         path = folder / ELITES
@@ -80,7 +81,7 @@ def read_elites(folder: Path, policy: str) -> np.ndarray:
         raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
     genomes = checkpoint.load(path)[0].get("genomes")
     if genomes is None or genomes.dtype != np.float32 or genomes.shape[1:] != (genes,) or not len(genomes):
-        raise CheckpointError(f"{path}: its elites are no {policy}")
+        raise CheckpointError(f"{path}: its elites do not fit {policy}")
     return genomes
 
 

@@ -17,7 +17,7 @@ def probe(address: str) -> None:
     """Raises PoolError, one line, within seconds unless a Ray cluster answers at `host:port` and would let us in."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536 or "/" in address:
-        raise PoolError(f"{address!r} is no address of a Ray cluster; give host:port (of `ray start --head`) or auto")
+        raise PoolError(f"{address!r} is not a Ray address; give host:port (of `ray start --head`) or auto")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), PROBE_S) as connection:
             if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
@@ -29,7 +29,7 @@ def probe(address: str) -> None:
                     "what `ray get-auth-token` says on its head"
                 )
             if b"grpc-status" not in answer:
-                raise PoolError(f"what answers at {address} is no Ray cluster; is that its head's port?")
+                raise PoolError(f"what answers at {address} is not a Ray cluster; is that its head's port?")
     except OSError as error:
         reason = f"no answer within {PROBE_S:g} s" if isinstance(error, TimeoutError) else error.strerror or str(error)
         raise PoolError(f"no Ray cluster answers at {address}: {reason}; is `ray start --head` up?") from None

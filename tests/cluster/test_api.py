@@ -130,7 +130,7 @@ def test_bad_champions_are_refused(champion, tmp_path):
 
 @pytest.mark.parametrize("settings", [SMALL, DqnSettings("curved")])
 def test_an_unfinished_run_says_how_to_go_on(settings, tmp_path):
-    with pytest.raises(CheckpointError, match="no run's folder"):
+    with pytest.raises(CheckpointError, match="not a run's folder"):
         load_champion(tmp_path)
     RunFolder(tmp_path, settings).write_config()
     with pytest.raises(CheckpointError, match=rf"no champion.npz yet.* {settings.command} --config \S+/config.json$"):

@@ -209,7 +209,7 @@ WRONG = [
     ("--patience -1", "--patience must be 0 or more"),
     ("--output /proc/nowhere", "--output"),
     ("--name ../up", "--name"),
-    ("--resume .", "no run's folder"),
+    ("--resume .", "not a run's folder"),
     ("--resume nowhere", "nowhere: no such folder"),
     ("--config /etc/hostname", "config.json"),
     ("--init nothing.npz", "nothing.npz: no such file"),

@@ -33,7 +33,7 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
         (["--workers", -1], "--workers"),
         (["--workers", 0, "--address", "auto"], "--address"),
         (["--resume", "nowhere"], "no such folder"),
-        (["--resume", "a"], "no comparison's folder"),
+        (["--resume", "a"], "not a comparison's folder"),
         (["--resume", ".", "--budget", "2k"], "contradicts the comparison's 1k"),
         (["--resume", ".", "--seeds", 1], "contradicts the comparison's 2"),
         (["--resume", ".", "--learners", "dqn"], "contradicts the comparison's evolution random"),

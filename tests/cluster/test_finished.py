@@ -51,7 +51,7 @@ def test_run_is_read(tmp_path):
     ("file", "text", "said"),
     [
         ("summary.json", None, "not finished"),
-        ("config.json", None, "no run's folder"),
+        ("config.json", None, "not a run's folder"),
         ("champion.npz", None, "no such file"),
         *(("summary.json", text, "damaged") for text in ("", "{", "[" * 100_000, "[1]", "{}")),
         ("config.json", '{"settings": []}', "not a config.json"),

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.e2e
 
 @pytest.mark.parametrize("address", ["nowhere", "host:0", "host:99999", ":6379", "ray://127.0.0.1:10001", "a/b:1"])
 def test_what_is_no_address(address: str) -> None:
-    with pytest.raises(PoolError, match="is no address of a Ray cluster; give host:port"):
+    with pytest.raises(PoolError, match="is not a Ray address; give host:port"):
         RayPool(2, never_built, address)
 
 
@@ -38,7 +38,7 @@ def test_an_address_where_something_else_answers() -> None:
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Quiet) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        with pytest.raises(PoolError, match="is no Ray cluster; is that its head's port"):
+        with pytest.raises(PoolError, match="is not a Ray cluster; is that its head's port"):
             check_address(f"127.0.0.1:{server.server_port}")
         server.shutdown()
 
@@ -46,6 +46,6 @@ def test_an_address_where_something_else_answers() -> None:
 def test_an_address_that_accepts_and_says_nothing() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         started = time.perf_counter()
-        with pytest.raises(PoolError, match="is no Ray cluster"):
+        with pytest.raises(PoolError, match="is not a Ray cluster"):
             check_address(f"127.0.0.1:{server.getsockname()[1]}")
         assert time.perf_counter() - started < 5

@@ -200,14 +200,14 @@ def test_newest_elite_is_read_anew(going):
     checkpoint.save(going / "elites.npz", {"genomes": elites}, {})  # which a run leaves at its end
     assert (elite(going, 2)[0].genome == elites[2]).all()
     checkpoint.save(going / "elites.npz", {"genomes": elites[:, :5]}, {})
-    with pytest.raises(CheckpointError, match="its elites are no mlp:6,7"):
+    with pytest.raises(CheckpointError, match="its elites do not fit mlp:6,7"):
         elite(going, 2)
 
 
 WRONG = [
     ("RUN", "to watch it as it stands: --follow, or --generation N"),
     ("nothing", "nothing: no such file"),
-    (".", "no run's folder"),
+    (".", "not a run's folder"),
     ("CHAMPION/x --output a.mp4", "no such file"),
     ("RUN --generation 99 --output a.mp4", "0 to 3"),
     ("RUN --generation -1 --output a.mp4", "0 to 3"),
