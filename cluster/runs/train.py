@@ -1,9 +1,9 @@
 """A training run, new or resumed, from its start to its end, for commands and comparisons alike.
 
-A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: their
-elites and rows of the history (`runs/steps.py`), the checkpoint that counts them, history.csv, the MLflow rows, in this
-order. Whatever kills the process, the folder holds a whole step, of a second ago or the one before, and a resumed run
-gives the same champion.
+A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: first
+their elites and rows of the history (`runs/steps.py`), then the checkpoint that counts them, history.csv and the MLflow
+rows. Whatever kills the process, the folder holds a whole step, the previous one or one of a second ago, and a resumed
+run gives the same champion.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
 
 ELITES_SHOWN = 24  # on the page beside the champion, at most; most of them early ones, which show the learning
-NOT_LOGGED = ("target_m",)  # columns of the history that are no metric
+NOT_LOGGED = ("target_m",)  # columns of the history that are not metrics
 
 
 class Reporter:
@@ -63,19 +63,19 @@ class Reporter:
         return nullcontext()
 
     def row(self, steps: int, row: dict[str, float]) -> None:
-        """So many steps are done; the last one's row."""
+        """The number of steps that are done, and the last one's row."""
 
     def members(self, stage: str, done: int, total: int) -> None:
         """Part of a step is done."""
 
     def note(self, text: str) -> None:
-        """What happens after the last step."""
+        """What is being done after the last step."""
 
     def stopping(self) -> None:
         """A run that was interrupted is being closed."""
 
     def unsent(self, text: str, finished: bool) -> None:
-        """One line about what MLflow lacks, of a run that is finished or of one that is to be resumed."""
+        """One line about what MLflow lacks of a run that is finished, or is to be resumed."""
         self.warn(text)
 
 
@@ -96,7 +96,7 @@ class Workers:
     _maps: Maps | None = None
 
     def open(self, maps: Maps) -> WorkerPool:
-        """The pool, which gets its maps from these."""
+        """The pool, which gets its maps from `maps`."""
         self._maps = maps
         if self._pool is None and self.number:
             from cluster.workers.ray_pool import RayPool
@@ -105,7 +105,7 @@ class Workers:
         return self._pool or SerialPool(self._build)
 
     def close(self) -> None:
-        """Stop the workers; the next run has new ones."""
+        """Stop the workers; the next run starts new ones."""
         if self._pool:
             self._pool.close()
             self._pool = None
@@ -123,7 +123,7 @@ def train(
 
     Args: `started` is time.perf_counter() of the process's start; None: time counts from the first step on. For the
     others see `Session`. The workers stay open.
-    Raises: GridSimError with one line, and whatever stops or breaks a run; the last whole step is saved.
+    Raises: GridSimError, and whatever else stops a run; the last whole step is saved.
     """
     settings = run.settings
     status: Status = "KILLED"
@@ -150,7 +150,7 @@ def train(
             session.finish(workers.number)
         status = "FINISHED"
         return session
-    except SystemError as error:  # what Ray makes of a signal where it waits
+    except SystemError as error:  # what Ray turns a signal into while it waits
         raise error.__cause__ or error from None
     except Exception:
         status = "FAILED"
@@ -170,7 +170,7 @@ def train(
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """No signal may cut short the saving and closing."""
+    """Ignore SIGINT and SIGTERM, which must not cut short saving and closing."""
     before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM)]
     try:
         yield
@@ -179,14 +179,12 @@ def undisturbed() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def new_learning(
-    settings: RunSettings, pool: WorkerPool, maps: Maps, initial: np.ndarray | None = None
-) -> Learning:  # fmt: skip
-    """The learner that such settings ask for."""
+def new_learning(settings: RunSettings, pool: WorkerPool, maps: Maps, initial: np.ndarray | None = None) -> Learning:
+    """The learner that these settings ask for."""
     if isinstance(settings, EvolveSettings):
         return Evolution(settings, pool, maps, initial)
     assert isinstance(settings, DqnSettings)
-    from cluster.training.dqn import Dqn  # and PyTorch, which evolution does not need
+    from cluster.training.dqn import Dqn  # imports PyTorch, which evolution does not need
 
     return Dqn(settings, pool, maps, initial)
 
@@ -200,11 +198,11 @@ class Session:
         pool: evaluates.
         maps: builds maps.
         uri, experiment: of MLflow.
-        reporter: shows how it goes.
+        reporter: shows progress and warnings.
         started: time.perf_counter() from which the run's time counts.
         initial: a genome to start from, float32 [genes].
         parent_id: MLflow's run that this one belongs to, or "".
-        wall_limit_s: seconds of learning, with those before a resumption, after which no step but the first is begun.
+        wall_limit_s: seconds of learning, including those before it was resumed, after which only a first step begins.
         summary: what summary.json holds, once it is finished.
     """
 
@@ -221,7 +219,7 @@ class Session:
     summary: dict[str, Any] = field(default_factory=dict)
     learning: Learning = field(init=False)
     tracker: Tracker = field(init=False)
-    _state: State = field(init=False)  # after the last whole step, with the rows of the history that are not saved
+    _state: State = field(init=False)  # after the last whole step, with the unsaved rows of the history
     _saved_steps: int = 0  # steps that are in the folder
     _sha256: Any = field(default_factory=hashlib.sha256)  # of their records
     _saved_at: float = -math.inf
@@ -289,9 +287,9 @@ class Session:
             self.save()
 
     def save(self) -> None:
-        """Write the last whole step's checkpoint, then history.csv from it, and log its rows, unless that is done.
+        """Write the last whole step's checkpoint, then history.csv, and log the new rows, unless that is done.
 
-        Interrupted anywhere, it can be called again. Raises: CheckpointError; the files before are kept.
+        If it is interrupted, it can be called again. Raises: CheckpointError; the previous files are kept.
         """
         learning, (arrays, meta), saved = self.learning, self._state, self._saved_steps
         done, path = meta[learning.step_name], self.run.path
@@ -315,7 +313,7 @@ class Session:
         checkpoint.write_atomic(self.run.path / HISTORY, content, durable=False)
 
     def finish(self, workers: int) -> None:
-        """Measure the champion on held-out drives, write what is left to the folder, and hand it to the tracker."""
+        """Measure the champion on held-out drives, write the remaining files, and hand all of them to the tracker."""
         from cluster.report import film, page, pictures
 
         self.reporter.note("measuring the champion on held-out drives")
@@ -370,9 +368,9 @@ class Session:
         log_end(self.tracker, self.run, learning.steps - 1, self.summary, description.describe(self.run, self.summary))
 
     def _conclude(self) -> None:
-        """Mark the run as finished. Its checkpoint gets the history, and loses a DQN's replay, most of it.
+        """Mark the run as finished. Its checkpoint gets the history, and loses a DQN's replay, which is most of it.
 
-        So the file of the steps, whose elites are in elites.npz by now, is not needed any more.
+        So the file of the steps, whose elites are in elites.npz by now, is no longer needed.
         """
         path = self.run.path
         arrays, meta = checkpoint.load(path / CHECKPOINT)
@@ -384,7 +382,7 @@ class Session:
 
 
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:
-    """The run's tracker; `parent_id` is MLflow's run that it belongs to. `more` is its `Identity`'s."""
+    """The run's tracker; `parent_id` is MLflow's run that it belongs to. `more` is for its `Identity`."""
     tags = description.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(Identity(
         uri, experiment, run.name, description.params(run.settings), tags,
@@ -393,18 +391,18 @@ def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "",
 
 
 def log_rows(tracker: Tracker, rows: list[dict[str, float]], first: int = 0) -> None:
-    """Log rows of a history, of step `first` and those after it."""
+    """Log rows of a history, from step `first` on."""
     for step, row in enumerate(rows, first):
         tracker.log_row(step, {name: row[name] for name in row if name not in NOT_LOGGED}, row["wall_s"])
 
 
 def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any], note: str) -> None:
-    """Log what a finished run has beside rows and model; its summary gets the id of MLflow's run."""
+    """Log what a finished run has besides rows and model; its summary gets the id of MLflow's run."""
     tracker.log_row(step, description.held_out_metrics(summary["held_out"]), summary["wall_s"])
     final = {"validation/success_rate": summary["validation_success_rate"]}  # the last candidate is tried after the end
     tracker.log_row(step + 1, final, summary["wall_s"])
     if not summary.get("mlflow_run_id"):
-        with contextlib.suppress(TrackingError):  # what is missing there is said when the tracker closes
+        with contextlib.suppress(TrackingError):  # the tracker reports what is missing when it closes
             summary["mlflow_run_id"] = tracker.wait_ready(30.0)
             write_summary(run.path, summary)
     tracker.describe(note)
@@ -414,7 +412,7 @@ def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any]
 def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
     """Send to MLflow what it lacks of a finished run, with the original times; what MLflow has stays as it is.
 
-    Args: the run, opened; the tracking address, or "" for the one that the run has; the experiment.
+    Args: the run, opened; the tracking address, or "" for the run's own; the experiment.
     Returns: what was sent, in a few words, and one line about what could not be, or None.
     """
     assert run.saved is not None
@@ -428,7 +426,7 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
         uri = check_uri(uri or meta["tracking"]["uri"] or None)
     except GridSimError as error:
         return "", f"what MLflow lacks is not sent: {error}"
-    except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited
+    except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited by hand
         reason = f"{path} is damaged ({type(error).__name__}); delete it, and make it again with --resume {run.path}"
         return "", f"what MLflow lacks is not sent: {reason}"
     tracker = make_tracker(run, uri, experiment, finished=True, started=started)

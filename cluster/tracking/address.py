@@ -1,4 +1,4 @@
-"""Tracking addresses: which may be used, made absolute, and how they are shown. Knows nothing of MLflow.
+"""Tracking addresses: checked, made absolute, and shown without passwords. Does not import MLflow.
 
 An address is probed before MLflow is imported: with a dead one MLflow would hang for minutes.
 """
@@ -30,8 +30,8 @@ class TrackingError(GridSimError):
 def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     """The tracking address made absolute and probed, without MLflow.
 
-    None stands for the address that a resumed run was begun with. Its server may be away: that stops no run, and the
-    tracker says so. Without one it is MLFLOW_TRACKING_URI, or else `sqlite:///mlflow.db` in the working directory.
+    None stands for the address that a resumed run was begun with; its server need not answer, as the run goes on and
+    the tracker reports it. For a new run it is MLFLOW_TRACKING_URI, or `sqlite:///mlflow.db` in the working directory.
     Raises TrackingError for a server that does not answer, a database that cannot be written, a folder (MLflow 3
     stores nothing in folders) and anything unknown.
     """
@@ -90,7 +90,7 @@ def sqlite_path(uri: str) -> Path | None:
 
 
 def server_problem(uri: str) -> str:
-    """Why there is no MLflow server at `uri`, or "". Sends no credentials, and so checks no certificate."""
+    """Why there is no MLflow server at `uri`, or "". It sends no credentials, so checks no certificate."""
     unchecked = ssl.create_default_context()
     unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
     try:
@@ -112,7 +112,7 @@ def shown(uri: str) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """The error in one line without a password; of a failed connection only what went wrong."""
+    """The error in one line, without a password; for a failed connection only what went wrong."""
     text = str(error) or type(error).__name__
     reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>]+)", text)
     if reasons:

@@ -10,7 +10,7 @@ DIRTY = "-dirty"
 
 @functools.cache
 def git_commit() -> str:
-    """The commit that this code was checked out from, with DIRTY behind it where a tracked file was changed since.
+    """The commit that this code was checked out from, followed by DIRTY if a tracked file was changed since.
 
     `unknown` outside git: an installed copy, no git, no commit.
     """
@@ -24,7 +24,7 @@ def git_commit() -> str:
         return done.stdout.strip()
 
     try:
-        # Installed into a .venv inside another repository, this file is not tracked there.
+        # If installed into a .venv inside another repository, this file is not tracked there.
         git("ls-files", "--error-unmatch", here.name)
         changed = git("--no-optional-locks", "status", "--porcelain", "--untracked-files=no")
         return git("rev-parse", "HEAD") + (DIRTY if changed else "")

@@ -27,29 +27,29 @@ def file_name(scenario: str) -> str:
 
 
 def default_name(settings: RunSettings) -> str:
-    """Scenario, algorithm and seed in one word, with which the name of a run begins unless another is given."""
+    """Scenario, algorithm and seed in one word, with which the default name of a run begins."""
     return f"{file_name(settings.scenario)}-{settings.algorithm}-s{settings.seed}"
 
 
 def group(settings: RunSettings) -> str:
-    """What runs have in common that differ in their seeds alone, in words."""
+    """What runs that differ only in their seeds have in common, in words."""
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [f"{settings.traffic} cars"] if settings.traffic else []
     given = asdict(settings)
     shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
     usual = asdict(type(settings)(**shared)) | {"recombination": "all"}
-    left_out = {"seed", "policy", "search", *settings.unbound}  # decide when a run ends, or are named before
+    left_out = {"seed", "policy", "search", *settings.unbound}  # are named above, or only decide when a run ends
     more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
     return ", ".join([" ".join(words), *more])
 
 
 def params(settings: RunSettings) -> dict[str, str]:
-    """All that decides the champion; what follows from it, and the simulator's constants, are in config.json."""
+    """All that decides the champion; what follows from this, and the simulator's constants, are in config.json."""
     return {name: str(value) for name, value in asdict(settings).items()}
 
 
 def tags(settings: RunSettings) -> dict[str, str]:
-    """What runs are found and grouped by, beside their parameters; `group` is all but the seed."""
+    """What runs are found and grouped by, besides their parameters; `group` is all but the seed."""
     return {
         "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
         "scenario": settings.scenario,
@@ -64,20 +64,20 @@ def held_out_metrics(figures: Mapping[str, float]) -> dict[str, float]:
 
 
 def model_name(settings: RunSettings) -> str:
-    """The registered model that the champions of such runs are versions of."""
+    """The registered model whose versions are the champions of such runs."""
     road = re.sub(r"[^\w.-]", "_", label(settings.scenario))  # an @ would be read as an alias
     return f"gridsim-{road}-{settings.algorithm}"
 
 
 def headline(settings: RunSettings) -> str:
-    """What a run does, in a line."""
+    """What a run does, in one line."""
     verb = {"dqn": "Deep Q-learning", "random": "Random search"}.get(settings.algorithm, "Evolution")
     cars = f"among {settings.traffic} cars" if settings.traffic else "without traffic"
     return f"{verb} of a `{settings.policy}` driver on **{label(settings.scenario)}**, {cars}, seed {settings.seed}."
 
 
 def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
-    """A run's description, Markdown: what it is, and once it is finished what came of it and how to see it."""
+    """A run's description, Markdown: what it does, and once it is finished its results and how to watch it."""
     settings, folder = run.settings, run.path
     if summary is None:
         return f"{headline(settings)}\n\nIts folder: `{folder}`"
@@ -112,7 +112,7 @@ def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str
         model_name(settings),
         champion.sha256,
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
-        "observations and return a number for each of the eight actions, of which the greatest acts.",
+        "observations and return a number for each of the eight actions; the action with the greatest is taken.",
         note=f"{headline(settings)} {held_out['success_rate']:.1%} of the held-out drives succeed.",
         tags={
             "policy": champion.policy,

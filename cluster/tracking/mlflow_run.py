@@ -1,6 +1,6 @@
 """A run as MLflow has it: found or created, its rows, files, description and model. The one module that imports MLflow.
 
-Everything here blocks and may raise whatever MLflow raises; any call can be repeated (`tracker.Tracker` does).
+Everything here blocks and may raise whatever MLflow raises; any call can be repeated, as `tracker.Tracker` does.
 
 Models are written here and never read. They are `torch.export`'s graph with its weights, MLflow's format `pt2`, never a
 pickled module, and load where MLFLOW_ALLOW_PICKLE_DESERIALIZATION is `false`. Where it is not, a user's own
@@ -39,22 +39,22 @@ Status = Literal["FINISHED", "KILLED", "FAILED"]
 KEY_TAG = "gridsim.key"
 """The tag by which a run is found again."""
 NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
-"""MLflow's tag of the description, and ours with the digest of the one that was written here; the UI lists neither."""
+"""MLflow's tag for the description, and ours for the digest of the one written here; the UI lists neither."""
 CHAMPION_TAG = "champion_sha256"
 """The tag of a registered version that identifies its champion."""
 RUN_ID = "{run_id}"
-"""Stands in a description for MLflow's id of the run, which is not known when it is written."""
+"""Stands in a description for MLflow's id of the run, which is not yet known when it is written."""
 BEST = "best"
 """Alias of a registered model's version with the greatest success on held-out roads."""
 VIEW, _VIEW_TAG = "gridsim", "mlflow.sharedViewState.gridsim"
 """The saved view of an experiment in MLflow's UI, and the experiment's tag that holds it."""
 _COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_out/speed_mps": 150, "car_steps": 90}
-"""What the view's run table shows of each run, and how wide, in pixels."""
+"""What the view's run table shows of each run, and the columns' widths in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
 MAX_BATCH = 1000  # metrics that MLflow takes in one request
 
-# Unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
+# Set unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
 _ENVIRONMENT = {
     "MLFLOW_ALLOW_PICKLE_DESERIALIZATION": "false",
     "MLFLOW_CONFIGURE_LOGGING": "false",
@@ -67,7 +67,7 @@ _LOGGERS = ("mlflow", "alembic", "sqlalchemy", "urllib3", "torch")
 
 
 def quiet() -> None:
-    """Set MLflow up so that nothing of it reaches the terminal: its errors reach the caller. What is set stays."""
+    """Keep MLflow from writing to the terminal: its errors reach the caller. What the user has set stays."""
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     for name in _LOGGERS:
@@ -78,9 +78,9 @@ def quiet() -> None:
 
 
 class Row(NamedTuple):
-    """Metrics of one step, `wall_s` after the run's start, pauses left out, or else at `logged_ms` since the epoch.
+    """Metrics of one step, `wall_s` after the run's start without pauses, or if None at `logged_ms` since the epoch.
 
-    Times are fixed, so that a repeated request is the same one.
+    Times are fixed, so that a repeated request is the same.
     """
 
     step: int
@@ -93,8 +93,8 @@ class Row(NamedTuple):
 class Identity:
     """Which run is meant, and what a new one begins with.
 
-    What differs in a resumed run (more generations, another commit) is added as tag `resumed/<name>`, as MLflow lets no
-    parameter change.
+    What differs in a resumed run (more generations, another commit) is added as tag `resumed/<name>`, as MLflow does
+    not let parameters change.
 
     Attributes:
         uri: what `address.check_uri` returned.
@@ -125,8 +125,8 @@ class Model:
         about: what all versions of the registered model have in common, Markdown.
         note: what this version is, Markdown.
         tags: the version's; the saved model has them as its metadata.
-        build: makes the module and an input for it, float32 [n, inputs] with n of 2 or more, so that any number may be
-            given to what is written; called in the tracker's thread, as torch takes seconds to import.
+        build: makes the module and an input for it, float32 [n, inputs] with n of 2 or more, so that what is written
+            takes any n; called in the tracker's thread, as torch takes seconds to import.
     """
 
     name: str
@@ -168,12 +168,12 @@ class LoggedRun:
         started = int(1000.0 * (time.time() if identity.started is None else identity.started))
         natural = resolve_tags(ignore=[GitRunContext])  # type: ignore[list-item]  # mlflow.user, mlflow.source.*
         if commit != "unknown":
-            natural["mlflow.source.git.commit"] = commit.removesuffix(DIRTY)  # a commit and nothing else
+            natural["mlflow.source.git.commit"] = commit.removesuffix(DIRTY)  # the bare commit
         tags = {**natural, **self._tags(), **_note_tags(identity.note)}
         return self._client.create_run(self.experiment_id, started, tags, identity.name)
 
     def _complete(self, run: Run) -> None:
-        """Add what the run lacks of parameters and tags, and ask which steps it has."""
+        """Add the parameters and tags that the run lacks, and ask which steps it has."""
         from mlflow.entities import Param, RunTag
 
         run_id, data = run.info.run_id, run.data
@@ -181,7 +181,7 @@ class LoggedRun:
             self._client.update_run(run_id, status="RUNNING")
         for name in data.metrics:
             self._logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
-        # MLflow lets no parameter change; what is different is logged beside it.
+        # MLflow does not let parameters change; what differs is added as a tag.
         resumed: dict[str, str] = {}
         for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
             resumed |= {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
@@ -193,7 +193,7 @@ class LoggedRun:
         return {"git_commit": git_commit(), **self._identity.tags, KEY_TAG: self._identity.key}
 
     def log(self, rows: Sequence[Row]) -> int:
-        """Log what MLflow does not have of some rows. Returns: of how many."""
+        """Log what MLflow lacks of these rows. Returns: how many of them it lacked."""
         from mlflow.entities import Metric
 
         missing = {}
@@ -211,9 +211,9 @@ class LoggedRun:
         return len({step for _, step in missing})
 
     def upload(self, path: Path, folder: str | None = None) -> bool:
-        """Store a file among the artifacts. False for a finished run's file that MLflow has in the same size.
+        """Store a file among the artifacts. Returns: False for a finished run's file that MLflow has in the same size.
 
-        One by one: MLflow's own pool of threads would hold up the exit if a server hangs.
+        Files are sent one by one: MLflow's own pool of threads would hold up the exit if a server hangs.
         """
         if self._identity.finished:
             listed: list[FileInfo] = self._client.list_artifacts(self.run_id, folder)
@@ -225,7 +225,7 @@ class LoggedRun:
     def log_model(self, folder: Path, model: Model) -> bool:
         """Write a model into a run's folder, store it, and make it the newest version of its name.
 
-        The best of all versions gets the alias. Returns: whether there is a new version; a champion has one.
+        The best of all versions gets the alias. Returns: whether there is a new version; a champion gets only one.
         """
         write_model(folder / MODEL, model)
         for path in sorted((folder / MODEL).rglob("*")):
@@ -255,8 +255,8 @@ class LoggedRun:
     def end(self, status: Status, wall_s: float | None = None, note: str = "") -> None:
         """End the run, now or so many seconds after its start, and replace its description unless a user edited it.
 
-        MLflow's UI shows the time from start to end as the run's duration, and lets no start change: the pauses of a
-        run that was stopped and resumed are left out by an earlier end. A run that has ended keeps its end.
+        MLflow's UI shows the time from start to end as the run's duration, and the start cannot be changed: an earlier
+        end leaves out the pauses of a run that was stopped and resumed. A run that has ended keeps its end.
         """
         from mlflow.entities import RunTag
 
@@ -272,7 +272,7 @@ class LoggedRun:
 
 
 def _note_tags(text: str) -> dict[str, str]:
-    """A description, and the digest by which a user's own one is recognised."""
+    """A description, and its digest, by which one that a user has edited is recognised."""
     return {NOTE_TAG: text, OWN_NOTE_TAG: hashlib.sha256(text.encode()).hexdigest()} if text else {}
 
 
@@ -286,7 +286,7 @@ def preload() -> None:
 def write_model(folder: Path, model: Model) -> None:
     """Write a torch model as MLflow's: graph and weights (`pt2`), signature and input example.
 
-    A folder that has the same champion is left as it is, another one is replaced as a whole.
+    A folder that has the same champion is left as it is; any other is replaced as a whole.
     """
     written = folder / "MLmodel"
     if written.is_file() and model.champion_sha256 in written.read_text(encoding="utf-8"):
@@ -299,14 +299,14 @@ def write_model(folder: Path, model: Model) -> None:
     built = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(built, ignore_errors=True)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch's and MLflow's own making
+        warnings.simplefilter("ignore")  # torch and MLflow cause them themselves
         mlflow.pytorch.save_model(
             module,
             str(built),
             input_example=example,
             signature=infer_signature(example, module(torch.from_numpy(example)).numpy()),
             serialization_format="pt2",
-            # Given, as MLflow would start a process and load the model there to find out.
+            # If not given, MLflow starts a process and loads the model there to find out.
             pip_requirements=[f"mlflow=={mlflow.__version__}", f"torch=={torch.__version__.partition('+')[0]}"],
             metadata={**model.tags, CHAMPION_TAG: model.champion_sha256},
         )
@@ -315,10 +315,10 @@ def write_model(folder: Path, model: Model) -> None:
 
 
 def _create_database(path: Path) -> None:
-    """Make a new MLflow database appear at `path` whole, unless another process is first.
+    """Make a new, complete MLflow database appear at `path`, unless another process is first.
 
-    MLflow builds it by 60 migrations in a second. Killed in the middle of them it leaves a database that it can never
-    open again, and two runs that start together do the same to each other. So it is built elsewhere.
+    MLflow builds it by 60 migrations in a second. If it is killed in the middle, or two runs start together, what is
+    left is a database that it can never open again. So it is built elsewhere.
     """
     from mlflow.tracking import MlflowClient
 
@@ -339,7 +339,7 @@ def _create_database(path: Path) -> None:
 
 @contextlib.contextmanager
 def _may_exist() -> Iterator[None]:
-    """Ignore that what is created exists already: another run may have been first."""
+    """Ignore the error if what is created exists already: another run may have been first."""
     from mlflow.exceptions import MlflowException
 
     try:
@@ -362,19 +362,19 @@ def _experiment_id(client: MlflowClient, name: str, database: Path | None) -> st
     if experiment is None or experiment.lifecycle_stage != "active":
         raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
     if _VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
-        with contextlib.suppress(MlflowException):  # a server may allow runs and no more
+        with contextlib.suppress(MlflowException):  # a server may allow nothing but runs
             client.set_experiment_tag(experiment.experiment_id, _VIEW_TAG, _view())
     return experiment.experiment_id
 
 
 def run_table(server: str, experiment_id: str) -> str:
-    """Address of an experiment's run table in the UI that an MLflow server shows: MLflow 3.17 opens another page."""
+    """Address of an experiment's run table in an MLflow server's UI, as MLflow 3.17 opens another page by default."""
     page = f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={VIEW}"
     return f"{shown(server)}/{page}"
 
 
 def run_tables(uri: str, server: str) -> dict[str, str]:
-    """`run_table` of each experiment in a store that has runs, by name."""
+    """`run_table` of each experiment that has runs in a store, by name."""
     quiet()
     from mlflow.tracking import MlflowClient
 

@@ -1,10 +1,10 @@
 """Sends a run to MLflow from a thread of its own, so that MLflow never stops or slows the run.
 
-MLflow takes two seconds to import and to open its store, and milliseconds a row. The thread syncs whenever something
-is new, and a last time when the run ends. A sync sends what MLflow lacks, and nothing twice: it asks MLflow once what
-it has, and repeats a request without an answer with the same timestamps, which MLflow recognises. What cannot be sent
-is kept, tried again, and in the end reported in one line. All of it is also in the run's folder, from which it can be
-sent later (`train.send_missing`).
+MLflow takes two seconds to import and to open its store, and milliseconds for a row. The thread syncs whenever
+something is new, and a last time when the run ends. A sync sends what MLflow lacks, and nothing twice: it asks MLflow
+once what it has, and repeats an unanswered request with the same timestamps, which MLflow recognises. What cannot be
+sent is kept, tried again, and in the end reported in one line. All of it is also in the run's folder, from which it can
+be sent later (`train.send_missing`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status,
 
 FLUSH_S = 2.0  # rows that come within this time go out as one request: 5 ms of CPU for a row alone, 0.8 ms among many
 RETRY_S = 5.0
-CHANCE_S = 1.0  # between the two attempts that a closed tracker still makes
+CHANCE_S = 1.0  # between the two last attempts when it is closed
 CLOSE_S, STOP_S = 60.0, 15.0  # that closing takes at most, for a finished run and for one that was stopped
 
 
@@ -30,7 +30,7 @@ class Tracker:
     A resumed run hands over its whole history, and what MLflow has is skipped. A store without this run gets a new one.
 
     Attributes:
-        run_id: MLflow's id of the run, or None as long as there is none.
+        run_id: MLflow's id of the run, or None until there is one.
         error: why the last attempt to send something failed, in one line; None once a sync has succeeded.
         sent: how many rows, files and models reached MLflow that were not there before.
     """
@@ -64,18 +64,18 @@ class Tracker:
         return self.run_id
 
     def where(self, mlflow: str) -> str:
-        """How to see the run beside others in MLflow's UI, in words for the terminal; `mlflow` is that command."""
+        """How to see the run beside others in MLflow's UI, in words for the terminal; `mlflow` is how to call it."""
         served = self.uri.startswith("http")
         table = run_table(self.uri if served else UI, self._run.experiment_id) if self._run else ""
         if served:
             return table or shown(self.uri)
-        make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # the one that it shows
+        make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # which it shows
         return f"{make}MLFLOW_DISABLE_TELEMETRY=true {mlflow} ui --backend-store-uri {self.uri}" + (
             f"; then open\n{table}" if table else ""
         )
 
     def log_row(self, step: int, row: Mapping[str, float], wall_s: float | None = None) -> None:
-        """Send metrics of a step, of `wall_s` after the run's start, or of now. MLflow's run ends with the last one."""
+        """Send metrics of a step, at `wall_s` after the run's start, or now. MLflow's run ends at the last time."""
         self._rows.append(Row(step, row, wall_s, time.time_ns() // 1_000_000))
         self._wall_s = wall_s
         self._notify()
@@ -139,12 +139,12 @@ class Tracker:
             self._sync()
 
     def _sync(self) -> bool:
-        """Send what MLflow lacks; what fails holds up nothing else. Returns whether MLflow has all of it."""
+        """Send what MLflow lacks; a failure does not hold up the rest. Returns whether MLflow has all of it."""
         error: str | None = None
         for send in (self._send_rows, self._send_files, self._send_model, self._end):
             try:
                 send()
-            except Exception as failure:  # whatever it is, the run that is tracked goes on
+            except Exception as failure:  # whatever it is, the tracked run goes on
                 self.error = error = one_line(failure)
                 if self._run is None:
                     break
