@@ -27,9 +27,9 @@ COLUMNS = (
     "validation/success_rate", "reward/mean", "loss", "q/mean", "q/change", "exploration", "learning_rate", "episodes",
     "updates", "car_steps", "wall_s", "car_steps_per_s",
 )  # fmt: skip
-"""Columns of history.csv after `evaluation`; the names that MLflow has them under.
+"""Columns of history.csv after `evaluation`, and their names in MLflow.
 
-`mean` is of the training episodes since the evaluation before, `best` of the network in validation.
+`mean` is over the training episodes since the previous evaluation, `best` is the network's in validation.
 """
 
 EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there
@@ -41,7 +41,7 @@ RANDOM_SHARE = 0.02  # share of --anneal over which exploration falls from rando
 SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
 LAST_SHARE = 0.05  # share of the learning rate that is left after --anneal
 PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
-CALM = 3  # evaluations in a row without much change of these, after which the run has converged
+CALM = 3  # evaluations in a row with little change of these, after which the run has converged
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Dqn(Learning):
     settings: DqnSettings
     batches: int = 0
     episodes: int = 0
-    calm: int = 0  # evaluations in a row without much change of the Q values
+    calm: int = 0  # evaluations in a row with little change of the Q values
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -148,7 +148,7 @@ class Dqn(Learning):
         return (usual + (1.0 - usual) * random).astype(np.float32)
 
     def _train(self) -> bool:
-        """Make some of the updates that the batches before require. Returns whether some are left."""
+        """Make some of the updates that the batches so far require. Returns whether any are left."""
         if self.meanwhile:
             self.meanwhile()
         if len(self.replay) < min(WARM_UP, self.replay.capacity):
@@ -183,7 +183,7 @@ class Dqn(Learning):
         """Change of the Q values of fixed observations since the last evaluation, as a share of their spread.
 
         Values that change little count towards convergence if there were updates.
-        Raises: FloatingPointError with one line if weights or values are not finite.
+        Raises: FloatingPointError if weights or values are not finite.
         """
         if not len(self.probe):
             key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
@@ -251,7 +251,7 @@ class Dqn(Learning):
 
 
 def _finite(numbers: np.ndarray, updates: int) -> np.ndarray:
-    """Weights or values as they are. Raises: FloatingPointError with one line once they have diverged."""
+    """Weights or values, unchanged. Raises: FloatingPointError, with a one-line message, if they are not finite."""
     if not np.isfinite(numbers).all():
         raise diverged(updates)
     return numbers

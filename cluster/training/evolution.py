@@ -1,7 +1,7 @@
-"""The generation loop of the searches: ask, evaluate, tell, in one call of the pool a generation.
+"""The generation loop of the searches: ask, evaluate, tell, with one call of the pool per generation.
 
-Beside the members, the leader (the best genome known before the generation) drives longer episodes of its own, and
-where it does well, as a candidate for champion, the validation episodes.
+Besides the members, the leader (the best genome known before the generation) drives longer episodes of its own and, if
+it does well, as a candidate for champion, the validation episodes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COLUMNS = (
     "speed_mps/mean", "target_m", "leader/success_rate", "validation/success_rate", "car_steps", "wall_s",
     "car_steps_per_s",
 )  # fmt: skip
-"""Columns of history.csv after `generation`; the names that MLflow has them under. `best` is of the leader."""
+"""Columns of history.csv after `generation`, and their names in MLflow. `best` is the leader's."""
 
 CRASHES = ("crashes", "crash_worlds", "failures")  # the curriculum's arrays in a checkpoint
 AHEAD = 8  # generations for which training maps are built
@@ -58,10 +58,10 @@ class Evolution(Learning):
             self.search.start_from(self.initial)
 
     def _score(self, results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
-        """Scores float64 [n]; what is not a number loses."""
+        """Scores float64 [n]; any that is not finite becomes the worst."""
         score = np.asarray(self.score(results, target), dtype=np.float64)
         if score.shape != (len(results),):
-            raise ValueError(f"a fitness returns one number a member, [{len(results)}], not {score.shape}")
+            raise ValueError(f"a fitness must return one number per member, [{len(results)}], not {score.shape}")
         return np.where(np.isfinite(score), score, -np.inf)
 
     # ------------------------------------------------------------------------------------------------ a generation
@@ -79,7 +79,7 @@ class Evolution(Learning):
         candidate = leader if self._promising() else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.generation)
         n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
-        goals = targets(episodes.rows, limits)[:e]  # of any group
+        goals = targets(episodes.rows, limits)[:e]  # the same in each group
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
 
@@ -95,7 +95,7 @@ class Evolution(Learning):
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
         curriculum.learn_from_members(self.generation, [driven.results[part] for part in groups])
 
-        if leader is None:  # of the first generation it is the best member
+        if leader is None:  # in the first generation, the best member takes its place
             best = int(score.argmax())
             self.elites[self.steps] = self.search.genomes(np.array([best]))[0]
             led, led_score = results[best], float(score[best])

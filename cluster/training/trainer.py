@@ -1,8 +1,8 @@
 """What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
 
-A learner is a loop of steps between a pool and a run's files: `evolution` has that of the searches, `dqn` the DQN's.
-Everything it decides follows from the seed and from what the workers return; nothing depends on the clock or on which
-worker returned it.
+A learner is a loop of steps between a pool and a run's files: `evolution` has the searches' loop, `dqn` the DQN's. All
+its decisions follow from the seed and from what the workers return; none depends on the clock or on which worker
+returned what.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
 
 class Maps:
-    """A run's maps: builds each once, and ahead of its use in threads."""
+    """A run's maps, each of which is built once, ahead of its use, in a thread."""
 
     def __init__(self, scenario: str, config: SimConfig):
         self._scenario, self._config = scenario, config
         self._built: dict[int, Future[Map]] = {}
         self._lock = threading.Lock()
-        # Two threads for later ones: where the workers wait for validation's maps, both cores build them.
+        # Two threads for later ones: while the workers wait for validation's maps, both cores build them.
         self._soon, self._later = (ThreadPoolExecutor(n, thread_name_prefix=f"maps-{n}") for n in (1, 2))
 
     def ahead(self, seeds: Sequence[int], later: bool = False) -> None:
-        """Begin to build maps that will be needed, in this order; `later` ones do not keep others waiting."""
+        """Begin to build maps that will be needed, in this order; `later` ones do not delay the others."""
         thread = self._later if later else self._soon
         with self._lock:
             for seed in seeds:
@@ -64,13 +64,13 @@ class Maps:
         return self._built[seed].result()
 
     def build(self, scenario: str, seed: int) -> Map:
-        """As pools ask for it."""
+        """The map of a scenario and seed, which is how pools ask for it."""
         if scenario != self._scenario:
             raise ValueError(f"a run on {self._scenario} has no map of {scenario}")
         return self.get(seed)
 
     def close(self) -> None:
-        """Forget what is not yet begun."""
+        """Cancel what has not begun."""
         for thread in (self._soon, self._later):
             thread.shutdown(wait=False, cancel_futures=True)
 
@@ -105,15 +105,15 @@ class Learning(ABC):
         initial: a genome to start from, float32 [genes].
         history: a row of figures for each step (`columns`).
         elites: the network of each step that is not saved yet, by the step, float32 [genes].
-        validation_steps: car-steps of these that validation took.
+        validation_steps: how many of the car-steps validation took.
         lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
-        warn: called with one line for each of these, and for each worker that is replaced because it is silent.
+        warn: called with one line for each of those, and for each worker that is replaced because it is silent.
     """
 
-    columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number; the names that MLflow has them under
+    columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number, and their names in MLflow
     step_name: ClassVar[str]  # what a step is called
     verb: ClassVar[str]  # what is done to a network
-    save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved at the next step's beginning, which changes it
+    save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved as the next step begins, which changes it
 
     settings: RunSettings
     pool: WorkerPool
@@ -130,8 +130,8 @@ class Learning(ABC):
     wall_before_s: float = 0.0
     warn: Callable[[str], None] = warnings.warn
     on_progress: Callable[[str, int, int], None] | None = None
-    meanwhile: Callable[[], None] | None = None  # called in each step when the workers are busy
-    out_of_time: Callable[[], bool] = lambda: False  # whether a budget of wall time is spent: a long step ends early
+    meanwhile: Callable[[], None] | None = None  # called in each step while the workers are busy
+    out_of_time: Callable[[], bool] = lambda: False  # whether the wall-time budget is spent, so that a long step ends
 
     def __post_init__(self) -> None:
         s = self.settings
@@ -234,7 +234,7 @@ class Learning(ABC):
             self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
 
     def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits) -> Outcome:
-        """Results [n, e] of given genomes [n, genes]: recipes that are plain copies."""
+        """Results [n, e] of given genomes [n, genes], which are sent as plain copies."""
         return self._evaluate(stage, unmodified(genomes), episodes, limits)
 
     def add_wall_clock(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
@@ -292,7 +292,7 @@ class Learning(ABC):
         return np.array(rows, dtype=np.float64).reshape(-1, len(self.columns))
 
     def history_csv(self, steps: int) -> bytes:
-        """history.csv: a row for each of the first steps. Each is written out once: thousands take tens of ms."""
+        """history.csv: a row for each of the first steps. Each is formatted only once: thousands take tens of ms."""
         for k in range(len(self._lines), steps):
             self._lines.append(",".join([str(k), *(repr(self.history[k][name]) for name in self.columns)]))
         return "\n".join([",".join([self.step_name, *self.columns]), *self._lines[:steps], ""]).encode()
@@ -304,7 +304,7 @@ def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 
 
 def genes_of(genome: np.ndarray | None) -> np.ndarray:
-    """A genome as a checkpoint has it: float32 [genes], or [0] of none."""
+    """A genome as a checkpoint has it: float32 [genes], or [0] for none."""
     return np.zeros(0, dtype=np.float32) if genome is None else genome
 
 
@@ -342,5 +342,5 @@ def mean_speed(results: np.ndarray, period_s: float) -> float:
 
 
 def now() -> float:
-    """The clock that durations are taken with; nothing is decided by it."""
+    """The clock by which durations are measured; nothing that is learned depends on it."""
     return time.perf_counter()

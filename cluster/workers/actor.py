@@ -1,6 +1,6 @@
-"""Both ends of what travels to an actor: tasks and maps are put into an object store once, chunks are sent. No Ray.
+"""Both ends of sending work to an actor: tasks and maps go into an object store once, chunks are sent. No Ray.
 
-An actor gets the values of references that are arguments of their own, read-only and without a copy.
+For a reference that is an argument of its own, an actor gets the value, read-only and without a copy.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
 Name = tuple[str, int]
-"""Of a map: scenario and seed."""
+"""A map's scenario and seed."""
 
 Work = tuple[bytes, int, int]
 """A chunk: its members' recipes, its first episode and the one after its last."""
@@ -30,7 +30,7 @@ INLINE = 1 << 16
 
 
 class Actor:
-    """Runs in a worker's process: holds the present task and its maps, answers chunks.
+    """Runs in a worker's process: holds the current task and its maps, answers chunks.
 
     Args:
         factory: makes the worker.
@@ -42,12 +42,12 @@ class Actor:
         self._maps: dict[Name, Map] = {}
 
     def hello(self) -> int:
-        """The process's id. It ignores Ctrl-C, which goes to all of a terminal: the coordinator ends its workers."""
+        """The process's id. It then ignores Ctrl-C, which a terminal sends to all: the coordinator ends its workers."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return os.getpid()
 
     def prepare(self, *update: Any) -> int:
-        """Take up a first task and load its kernels with an empty chunk: if that kills it, no member is blamed."""
+        """Take up a first task and load its kernels with an empty chunk: if this crashes, no member is blamed."""
         self.run([(b"", 0, 0)], *update)
         return os.getpid()
 
@@ -57,13 +57,13 @@ class Actor:
     ) -> bytes:  # fmt: skip
         """What `Worker.answer` returns for each piece of work, pickled: Ray is slower with arrays than with bytes.
 
-        `names` and all after it are `Shared.update`, for an actor that does not have the task yet.
+        `names` and all after it come from `Shared.update`, for an actor that does not have the task yet.
         """
         if shared is not None:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:
                 self._maps.pop(name, None)
-            self._task = replace(pickle.loads(shared))  # which makes its arrays read-only
+            self._task = replace(pickle.loads(shared))  # `replace` makes its arrays read-only
         mine = [self._maps[name] for name in self._task.maps]
         answers = [
             self._worker.answer(self._task, mine, np.frombuffer(recipes, RECIPE), first, stop)
@@ -101,7 +101,7 @@ class Shared:
         return data if len(data) <= INLINE else self._put(data), sent
 
     def update(self, known: set[Name], task: Task | CollectTask, shared: Any) -> list[Any]:
-        """What an actor with the maps `known` needs to take up a task; `known` then is what it has.
+        """What an actor with the maps `known` needs to take up a task; `known` is updated to what it then has.
 
         Returns: the names of the maps that it lacks, those to forget, the task as `put` returned it, and references to
         the maps.

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from cluster.workers.pool import Chunk, Parcel
 
 QUEUE = 2  # parcels that a worker holds: the one that it works on, and one so that it does not wait for the coordinator
-MAX_KILLS = 3  # workers that one member may cost
+MAX_KILLS = 3  # workers that a member kills before it is lost
 
 
 class Dispatch:
@@ -54,7 +54,7 @@ class Dispatch:
         to idle workers. So do suspects, and nothing is queued behind them.
 
         Args:
-            idle: workers that hold nothing, of no earlier call either.
+            idle: workers that hold nothing, not even from an earlier call.
         """
         for worker in idle[: len(self._todo)]:
             yield self._send(worker)
@@ -64,7 +64,7 @@ class Dispatch:
                 yield self._send(worker)
 
     def answered(self, worker: int) -> int | None:
-        """A worker has answered: the parcel, or None if that is lost."""
+        """Record that a worker has answered. Returns its parcel, or None if that is lost."""
         parcel = self._held[worker].popleft()
         self.deaths = 0
         if parcel not in self._open:
@@ -73,7 +73,7 @@ class Dispatch:
         return parcel
 
     def died(self, worker: int, blamed: bool = True) -> list[int]:
-        """A worker is gone, and what it held is sent again. Returns the parcels that are lost, the killer first.
+        """Record that a worker is gone; what it held is sent again. Returns the lost parcels, the killer first.
 
         Args:
             blamed: whether the parcel that it worked on may be the reason; not if its host is gone.
@@ -118,7 +118,7 @@ class Dispatch:
         ]
 
     def _split(self, parcel: int) -> None:
-        """Put a parcel of each of its members in a parcel's place, or of each of its episodes."""
+        """Replace a parcel by one for each of its members, or for each of its episodes."""
         self._open.remove(parcel)
         for unit in self._units(parcel):
             piece = len(self.parcels)

@@ -1,10 +1,10 @@
 """Compiling the kernels before they are needed: once for all processes, and on more than one core.
 
-Numba compiles one function at a time in a process. So processes of their own compile what a run needs while this one
-starts Ray, and all others then load it from the cache on disk (`gridsim.jit`).
+Numba compiles one function at a time in a process. So separate processes compile what a run needs while this one starts
+Ray, and all others then load it from the cache on disk (`gridsim.jit`).
 
 Run as `python -m cluster.workers.kernels kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it
-prints a line when what a run needs first is there, and goes on with what is needed at the run's end. `python -m
+prints a line when what a run needs first is compiled, and goes on with what is needed at the run's end. `python -m
 cluster.workers.kernels everything` compiles what the learners need by default on all roads, for an image that is to be
 started often.
 """
@@ -35,18 +35,18 @@ from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.traffic.world import spawn
 
-STEPS = 1  # of the episodes that are driven to compile what drives them
+STEPS = 1  # of the episodes that are driven only to compile kernels
 
 
 @dataclass
 class Warming:
-    """Processes that compile, and the file that says that it is done."""
+    """Processes that compile, and the file that marks what they compile as done."""
 
     done: Path
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def wait(self) -> None:
-        """Wait for what a run needs first. If such a process fails, this one compiles that when it needs it."""
+        """Wait for what a run needs first. If a process fails, this one compiles its part when it is needed."""
         if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
             self.done.touch()
 
@@ -65,7 +65,7 @@ def begin(settings: RunSettings) -> Warming:
         what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
         warming.processes += [
             subprocess.Popen(
-                [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],  # -P: nothing of this folder
+                [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],  # -P: not from this folder
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -77,7 +77,7 @@ def begin(settings: RunSettings) -> Warming:
 
 
 def _marker(settings: RunSettings) -> Path:
-    """The file that says that everything is compiled that such a run needs."""
+    """The file that marks everything that such a run needs as compiled."""
     kind = "cnn" if settings.policy.startswith("cnn") else "mlp"
     road = "file" if is_map_file(settings.scenario) else settings.scenario
     traffic = "traffic" if settings.traffic else "alone"
@@ -108,7 +108,7 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
 
 
 def compile_drive(policy: str, traffic: int) -> None:
-    """The same for recording a drive, and drawing it."""
+    """Compile, or load from the cache, what records and draws a drive."""
     config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
     start = episodes["start"][0]
     _, cars, others = trajectory(PolicySpec.parse(policy), genome, road, start, limits, config, worlds[0])
@@ -117,14 +117,14 @@ def compile_drive(policy: str, traffic: int) -> None:
 
 
 def compile_roads(scenario: str, traffic: int) -> None:
-    """The same for building a scenario's maps."""
+    """Compile, or load from the cache, what builds a scenario's maps."""
     road = build(scenario, 0)
     starts = sample_starts(road, 1, np.random.default_rng(0))
     spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig())
 
 
 def everything_by_default() -> list[RunSettings]:
-    """Settings that need, between them, all that the learners compile on the roads by default."""
+    """Settings that between them need all that the learners compile by default."""
     return [
         kind(scenario=scenario, traffic=traffic, observation=observation)
         for scenario in REGISTRY
@@ -135,7 +135,7 @@ def everything_by_default() -> list[RunSettings]:
 
 
 def compile_everything() -> None:
-    """Compile all that."""
+    """Compile what `everything_by_default` needs."""
     for settings in everything_by_default():
         compile_kernels(settings.policy, settings.traffic, settings.command)
         compile_roads(settings.scenario, settings.traffic)
@@ -145,7 +145,7 @@ def compile_everything() -> None:
 
 
 def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", command: str = "") -> None:
-    """What the process does."""
+    """Compile one part, in a process of its own."""
     traffic = int(cars)
     if part == "everything":
         compile_everything()

@@ -1,4 +1,4 @@
-"""Pools of workers: what the learners call, how work is cut into chunks, and the pool that is this process."""
+"""Pools of workers: what the learners call, how work is cut into chunks, and the pool within this process."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ UNMEASURED_METRE_S = 3e-5  # what Ray's workers are taken to need before it is m
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
 PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
 LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
-LARGER = 4  # times what is worth sending, where that is more
-SHARE = 0.9  # of what would be a worker's part of the rest, in one parcel
+LARGER = 4  # times what is worth sending, if that is more
+SHARE = 0.9  # of a worker's share of the rest, in one parcel
 
 
 class PoolError(GridSimError):
-    """The workers can give no result; the message is one line for the user."""
+    """The workers cannot give a result; the message is one line for the user."""
 
 
 class Chunk(NamedTuple):
@@ -50,7 +50,7 @@ Parcel = tuple[Chunk, ...]
 
 
 def size(chunk: Chunk) -> int:
-    """Episodes of members in a chunk."""
+    """How many episodes the members of a chunk drive, in all."""
     return (chunk.rows.stop - chunk.rows.start) * (chunk.columns.stop - chunk.columns.start)
 
 
@@ -59,13 +59,13 @@ class Call:
     """What one call of a pool returned, and what it took.
 
     Attributes:
-        results: RESULT, one row a member or, where experience is collected, an episode; zero where nothing was asked
+        results: RESULT, one row per member or, if experience is collected, per episode; zero where nothing was asked
             for and where it was lost.
         lost: bool [rows], those that killed every worker that tried them.
-        asked: episodes of members that were asked for.
+        asked: how many episodes the members were to drive, in all.
         wall_s: seconds from call to return.
-        busy_s: seconds that each worker (by its number) was at work. A replaced worker's number goes on counting.
-        episode_s: seconds of that which each episode took, of all members together, float64 [episodes].
+        busy_s: seconds that each worker (by its number) was at work. A replacement keeps the number.
+        episode_s: seconds of these that each episode took, for all members together, float64 [episodes].
         retries: chunks that were sent again because their worker died.
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
@@ -106,7 +106,7 @@ class Outcome(Call):
     """What `evaluate` returned: results RESULT [members, episodes], members in the order of the recipes.
 
     Attributes:
-        rewound: float32 [episodes, 5], of episodes with a `rewind` the state so many steps before the end. Only one
+        rewound: float32 [episodes, 5], for episodes with a `rewind` the state so many steps before the end. Only one
             member drives such an episode.
         worlds: float32 [episodes, cars, world.FIELDS], the traffic at that time.
     """
@@ -124,7 +124,7 @@ class Outcome(Call):
         self._count(worker, chunk, seconds)
 
     def lose(self, chunk: Chunk) -> None:
-        """Do without a chunk's members: also the results that are there do not count."""
+        """Do without a chunk's members: results that they already have do not count either."""
         self.lost[chunk.rows] = True
         self.results[chunk.rows] = np.zeros((), self.results.dtype)
         self.done += size(chunk)
@@ -184,14 +184,14 @@ def new_collected(task: CollectTask) -> Collected:
 
 
 def rectangle(rows: int, columns: int) -> list[Chunk]:
-    """The first so many members on the first so many episodes."""
+    """The first `rows` members on the first `columns` episodes."""
     return [Chunk(slice(0, rows), slice(0, columns))]
 
 
 class WorkerPool(ABC):
     """Evaluates generations and collects experience. What it returns depends on the arguments, never on the workers.
 
-    `meanwhile` is done to its end before a call returns. What it raises ends the call.
+    A call returns only when `meanwhile` is done to its end. What it raises ends the call.
     """
 
     def evaluate(
@@ -208,7 +208,7 @@ class WorkerPool(ABC):
             asked: which members drive which episodes, the longest first; None is all members on all episodes.
             meanwhile: what to do here while workers are busy.
 
-        Raises: PoolError where that cannot be done.
+        Raises: PoolError if that cannot be done.
         """
         asked = rectangle(len(recipes), len(task.episodes)) if asked is None else asked
         outcome = new_outcome(task, recipes, asked)
@@ -220,7 +220,7 @@ class WorkerPool(ABC):
     ) -> Collected:
         """Drive the task's policy through its episodes and return all transitions.
 
-        Raises: PoolError where that cannot be done.
+        Raises: PoolError if that cannot be done.
         """
         collected = new_collected(task)
         asked = rectangle(1, len(task.episodes))
@@ -240,7 +240,7 @@ class WorkerPool(ABC):
 
 
 class SerialPool(WorkerPool):
-    """No other process: the worker lives in this one."""
+    """Starts no other process: the worker is in this one."""
 
     def __init__(self, build_map: BuildMap, worker_factory: Callable[[], Worker] = Worker):
         self._build_map = build_map
@@ -269,7 +269,7 @@ class SerialPool(WorkerPool):
 
 
 def finish(meanwhile: Meanwhile | None) -> None:
-    """Do what is left to do."""
+    """Call `meanwhile` until it is done."""
     while meanwhile and meanwhile():
         pass
 
@@ -284,10 +284,10 @@ def cut(
 ) -> list[Parcel]:
     """Cut what is asked for into parcels, by the seconds that it may take: large ones first, small ones last.
 
-    Each takes most of what would be a worker's share of the rest, so that no worker waits long for the slowest, and
-    little is sent (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one
-    member's episodes, so that all workers share even a single member. It depends only on the arguments, and no result
-    depends on it.
+    Each takes most of a worker's share of the rest, so that no worker waits long for the slowest, and little is sent
+    (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one member's
+    episodes, so that even a single member is shared by all workers. The cut depends only on the arguments, and no
+    result depends on it.
 
     Args:
         metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
@@ -295,7 +295,7 @@ def cut(
     rates = [METRE_S] * len(asked) if metre_s is None else metre_s
     parcels: list[Parcel] = []
     left = sum(rate * metres(task, block) for rate, block in zip(rates, asked, strict=True))
-    worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one is at its parcel, all others get theirs
+    worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one worker computes, all others get their parcels
     least = min(worth_s, left / (2 * workers))  # every worker gets some, however little it costs
     largest = max(LARGEST_S, LARGER * worth_s)
     goals = targets(task.episodes, task.limits)
@@ -318,7 +318,7 @@ def cut(
                 parcel = ()
             else:
                 rest = seconds[-1] - seconds[column]
-                share = rest / math.ceil(rest / room)  # pieces as even as may be: a small one costs as much to send
+                share = rest / math.ceil(rest / room)  # pieces as even as possible: a small one costs as much to send
                 stop = int(np.searchsorted(seconds, seconds[column] + share * (1.0 + 1e-9), side="right")) - 1
                 stop = min(max(stop, column + 1), len(seconds) - 1)
                 parcels.append((Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)),))

@@ -36,7 +36,7 @@ def probe(address: str) -> None:
 
 
 def _ask_for_cluster_id(connection: socket.socket) -> bytes:
-    """Ray's simplest request (gRPC over HTTP/2) written by hand, without a token; returns all of the answer."""
+    """Send Ray's simplest request (gRPC over HTTP/2), written by hand, without a token; returns the whole answer."""
 
     def frame(kind: int, flags: int, stream: int, body: bytes = b"") -> bytes:
         return len(body).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + body
@@ -60,13 +60,13 @@ def _ask_for_cluster_id(connection: socket.socket) -> bytes:
 
 
 def has_token(host: str) -> bool:
-    """Whether Ray has a token to show there. It looks for one by itself on the own machine only, and so do we."""
+    """Whether Ray has a token to show to `host`. Unasked, it looks for one only if that is this machine; so do we."""
     if "RAY_AUTH_MODE" in os.environ:
         return os.environ["RAY_AUTH_MODE"].lower() == "token"
     family, kind, _, _, name = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_STREAM)[0]
     with socket.socket(family, kind) as trial:
         try:
-            trial.bind(name)  # possible for an address of this machine alone
+            trial.bind(name)  # possible only for an address of this machine
         except OSError:
             return False
     return any(name in os.environ for name in AUTH_ENVIRONMENT) or (Path.home() / ".ray/auth_token").exists()

@@ -1,14 +1,14 @@
 """A pool of Ray actors, on a Ray of its own or on an existing cluster.
 
-What differs from Ray's own habits, and why:
+What differs from Ray's defaults, and why:
 
 * A Ray of our own goes without dashboard server, autoscaler monitor and log monitor, none of which a run uses: they
   cost a second at the start, another one at the end, and 1.5 core-seconds of the workers' time (`ray_session`).
-* Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the kernel
-  kills Ray's processes when their parent *thread* dies, and so they die with us whatever kills us.
+* Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the system
+  kills Ray's processes when their parent *thread* dies, and so they die with us, whatever kills us.
 * Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
   `dispatch` has to know which chunk killed which worker.
-* Ray says nothing of a worker that is stopped, or whose host is cut off, for half a minute or for ever. A worker that
+* For half a minute, or forever, Ray does not report a worker that is stopped, or whose host is cut off. A worker that
   has not answered for `patience_s` is replaced, and what it held is sent to another one.
 """
 
@@ -51,7 +51,7 @@ from evolution.episodes.rollout import Limits
 
 CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
-MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill cost fewer
+MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
 
@@ -66,11 +66,11 @@ class _Slot:
     serial: int = 0  # of the last task that it was sent
     maps: set[Name] = field(default_factory=set)  # that it was sent
     sent: deque[tuple[int, Any]] = field(default_factory=deque)  # (serial of the task, answer), oldest first
-    heard: float = 0.0  # when it last answered, or was sent something after all was answered
+    heard: float = 0.0  # when it last answered, or was sent something while it held nothing
 
     @property
     def due(self) -> Any:
-        """The answer that it gives next, or None."""
+        """The answer that it will give next, or None."""
         return self.hello or (self.sent[0][1] if self.sent else None)
 
 
@@ -89,7 +89,7 @@ _Kind = tuple[type, Limits, bool]
 
 
 def _kind(task: Task | CollectTask, part: Chunk) -> _Kind:
-    """Of parts with about the same time for a metre: a single member drives on where many others crash early."""
+    """The same for parts that need about as long for a metre: one member drives on where many others crash early."""
     return type(task), task.limits, part.rows.stop - part.rows.start == 1
 
 
@@ -97,13 +97,13 @@ class RayPool(WorkerPool):
     """Workers as Ray actors of one CPU each. One pool at a time in a process.
 
     Args:
-        workers: how many. On a cluster the first one that is up starts, the others join as they come.
+        workers: how many. On a cluster work begins when the first one is up, and the others join as they come.
         build_map: builds a map, here, once; workers see it in shared memory.
         address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
         worker_factory: makes what evaluates; must be importable in the workers.
         patience_s: how long there may be no worker at all, or one may not answer; default 60 s, on a cluster 300 s.
 
-    Raises PoolError at once where nothing answers at `address`; all else that goes wrong is raised by its calls.
+    Raises PoolError at once if nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class RayPool(WorkerPool):
 
         try:
             self._share_out(task, recipes, asked, call, on_progress, meanwhile)
-        except ray.exceptions.RayError as error:  # Ray itself failed; deaths of workers are handled above
+        except ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
         self._measure(task, asked, call)
         call.wall_s = time.perf_counter() - started
@@ -190,7 +190,7 @@ class RayPool(WorkerPool):
         finish(meanwhile)
 
     def _measure(self, task: Task | CollectTask, asked: Sequence[Chunk], call: Outcome | Collected) -> None:
-        """Remember what a metre took."""
+        """Remember how long a metre took."""
         seconds: defaultdict[_Kind, float] = defaultdict(float)
         whole: defaultdict[_Kind, float] = defaultdict(float)
         for part in asked:
@@ -199,13 +199,13 @@ class RayPool(WorkerPool):
         self._metre_s |= {kind: max(seconds[kind] / whole[kind], 1e-9) for kind in seconds if whole[kind]}
 
     def _ready(self, refs: list[Any], timeout_s: float) -> list[Any]:
-        """All answers that have come; where none has, wait for the next one for so long."""
+        """All answers that have come; if there are none, wait for the next one, at most `timeout_s`."""
         import ray
 
         if not refs:
             time.sleep(timeout_s)
             return []
-        ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0.0)  # with many workers one look costs more than this
+        ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0.0)  # in one look: with many workers it is slow
         if not ready and timeout_s > 0.0:
             ready, _ = ray.wait(refs, num_returns=1, timeout=timeout_s)
         return ready
@@ -221,7 +221,7 @@ class RayPool(WorkerPool):
         job.call.bytes_down += sum(map(len, payloads))
 
     def _update(self, slot: _Slot, job: _Job) -> list[Any]:
-        """What a worker has to be sent of the task, once."""
+        """What a worker still has to be sent of the task."""
         if slot.serial == self._serial:
             return []
         slot.serial = self._serial
@@ -246,7 +246,7 @@ class RayPool(WorkerPool):
             return self._bury(slot, job, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
-        parcel = job.dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
+        parcel = job.dispatch.answered(slot.number) if serial == self._serial else None  # of an interrupted call
         if parcel is not None:
             for chunk, found in zip(job.dispatch.parcels[parcel], pickle.loads(answer), strict=True):
                 job.call.add(slot.number, chunk, *found)
@@ -254,7 +254,7 @@ class RayPool(WorkerPool):
         return parcel is not None
 
     def _bury(self, slot: _Slot, job: _Job, reason: str, blamed: bool = True) -> bool:
-        """Replace a worker, and see to it that what it held is done. Returns whether anything is lost."""
+        """Replace a worker, and have what it held sent again. Returns whether anything is lost."""
         dispatch, call = job.dispatch, job.call
         lost = [chunk for parcel in dispatch.died(slot.number, blamed) for chunk in dispatch.parcels[parcel]]
         call.retries = dispatch.retries
@@ -276,7 +276,7 @@ class RayPool(WorkerPool):
         if self._closed.is_set():
             return
         self._leaving = True
-        self._booted.wait(CONNECT_S)  # a start of Ray cannot be stopped
+        self._booted.wait(CONNECT_S)  # Ray cannot be stopped while it starts
         if self._connected:
             import ray
 
@@ -336,7 +336,7 @@ class RayPool(WorkerPool):
         self._slots[slot.number] = self._start(slot.number)
 
     def _greet(self, slot: _Slot, job: _Job) -> None:
-        """A worker is up and is to be prepared, or it is prepared, or it could not start."""
+        """Take in a `hello`: a worker is up and is to be prepared, or it is prepared, or it could not start."""
         import ray
 
         preparing = slot.serial > 0

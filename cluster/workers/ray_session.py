@@ -1,6 +1,6 @@
-"""Ray itself: one of our own on this machine, or a cluster that is joined; its settings and its error messages.
+"""Ray itself: our own on this machine, or a cluster that is joined; its settings and its error messages.
 
-With `ray_pool` all that imports Ray.
+Only this file and `ray_pool` import Ray.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ ENVIRONMENT = {
 }
 # Read by the processes of a Ray of our own.
 OWN_ENVIRONMENT = {
-    "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it just misses its object store, and then sleeps 1 s
+    "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it first just misses its object store, then sleeps 1 s
     "RAY_raylet_client_num_connect_attempts": "500",
-    "RAY_prestart_worker_first_driver": "0",  # with it, init waits for ever where a worker dies as it starts
+    "RAY_prestart_worker_first_driver": "0",  # with it, init waits forever if a worker dies as it starts
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
 }
 TOKEN = secrets.token_hex(32)
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses /tmp
-PACKAGES = (cluster, evolution, gridsim)  # that travel to a cluster's workers
+PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
 ELSEWHERE = ("ActorUnavailableError", "NodeDiedError", "ObjectLostError", "OwnerDiedError", "ObjectFetchTimedOutError")
 HOST_DIED = "its node has died"  # in an error's text
 
@@ -48,7 +48,7 @@ HOST_DIED = "its node has died"  # in an error's text
 def check_address(address: str) -> str:
     """The `host:port` of the Ray cluster meant by `address` (`host:port`, or `auto`: RAY_ADDRESS, else this machine's).
 
-    Raises PoolError, one line, within seconds where no Ray answers or it would not let us in.
+    Raises PoolError, one line, within seconds if no Ray answers or it would not let us in.
     """
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS") or "auto"
@@ -69,8 +69,8 @@ def start_own(workers: int) -> str:
     import ray
 
     if not any(name in os.environ for name in AUTH_ENVIRONMENT):
-        # Ray listens on all interfaces and lets in who has its token. One of our own need not outlive the run in
-        # ~/.ray, where it would change what `ray start` does from then on.
+        # Ray listens on all interfaces and lets in whoever has its token. Ours must not outlive the run in ~/.ray,
+        # where it would change what `ray start` does from then on.
         os.environ["RAY_AUTH_TOKEN"] = TOKEN
     _be_quiet()
     with _lean_head():
@@ -87,15 +87,15 @@ def start_own(workers: int) -> str:
 
 
 def join(address: str) -> None:
-    """Connect to a cluster that `check_address` found to let us in. This project's packages travel to its workers.
+    """Connect to a cluster that passed `check_address`. This project's packages are sent to its workers.
 
     So a worker runs the very sources that the coordinator runs. Its node needs Ray, NumPy, Numba and SciPy (PyTorch
-    where the network is a `cnn`), in the coordinator's versions.
+    if the network is a `cnn`), in the coordinator's versions.
     """
     import ray
 
     if has_token(address.rpartition(":")[0]):
-        with contextlib.suppress(ImportError, AttributeError):  # what Ray does where it is asked to find the cluster
+        with contextlib.suppress(ImportError, AttributeError):  # as Ray does when it finds the cluster itself
             setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
             setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
     _be_quiet()
@@ -103,20 +103,20 @@ def join(address: str) -> None:
 
 
 def runtime_env() -> dict[str, Any]:
-    """Ray's `runtime_env` of a run's workers, some 200 KB, with the modules of the Ray job that the run may be."""
+    """Ray's `runtime_env` of a run's workers, some 200 KB, with the Ray job's modules if the run is such a job."""
     submitted = json.loads(os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")).get("runtime_env") or {}
     ours = [str(Path(package.__path__[0])) for package in PACKAGES]
     return {"py_modules": [*ours, *submitted.get("py_modules", [])], "excludes": ["__pycache__"]}
 
 
 def leave() -> None:
-    """Leave Ray and the environment as they were: with our token, a cluster that is joined next could not call us."""
+    """Leave Ray, and restore the environment: with our token, a cluster that is joined next could not call us."""
     import ray
 
     ray.shutdown(wait_for_processes=True)
     if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
         del os.environ["RAY_AUTH_TOKEN"]
-        os.environ.pop("RAY_AUTH_MODE", None)  # Ray's own doing
+        os.environ.pop("RAY_AUTH_MODE", None)  # set by Ray
         with contextlib.suppress(ImportError, AttributeError):
             raylet = importlib.import_module("ray._raylet")
             raylet.Config.initialize("")
@@ -132,12 +132,12 @@ def capacity() -> str:
 
 
 def is_to_blame(error: BaseException) -> bool:
-    """Whether a worker may have died of what it did, and not because its host died or is out of reach."""
+    """Whether a worker may have died because of its work, and not because its host died or is out of reach."""
     return type(error).__name__ not in ELSEWHERE and HOST_DIED not in str(error)
 
 
 def failed_as_it_began(error: BaseException) -> bool:
-    """Whether a worker could not be created because of an exception: the next one would meet it, too."""
+    """Whether a worker could not be created because of an exception, which the next one would raise, too."""
     return "raised in its creation task" in str(error)
 
 
@@ -158,7 +158,7 @@ def _private(name: str) -> Any:
 
 
 def _be_quiet() -> None:
-    """Print no worker's death, which Ray does even without `log_to_driver`."""
+    """Keep Ray from printing workers' deaths, which it does even without `log_to_driver`."""
     logging.getLogger("ray").setLevel(logging.CRITICAL)
     _private("worker")._worker_logs_enabled = False
 
@@ -167,9 +167,9 @@ def _be_quiet() -> None:
 def _lean_head() -> Iterator[None]:
     """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
 
-    They get process groups of their own: a signal to our whole group would end them half started, and `ray.init` then
-    waits for a minute. Ray has no settings for either, so this replaces private names, and sets variables for its
-    processes, meanwhile.
+    Its processes get groups of their own: a signal to our whole group would end them half started, and `ray.init` would
+    then wait for a minute. Ray has no settings for either, so meanwhile this replaces private names, and sets variables
+    for its processes.
     """
     with contextlib.ExitStack() as undo:
         for name in OWN_ENVIRONMENT.keys() - os.environ.keys():

@@ -75,7 +75,7 @@ class CollectTask:
 
 
 def _freeze_arrays(task: Task | CollectTask) -> None:
-    """Make arrays read-only, as those from the object store are: Numba compiles again for writable ones."""
+    """Make arrays read-only, like those from the object store: Numba would compile again for writable ones."""
     for name, value in vars(task).items():
         if isinstance(value, np.ndarray):
             object.__setattr__(task, name, freeze(value))
@@ -103,7 +103,7 @@ class Worker:
     def evaluate(
         self, task: Task, maps: Sequence[Map], recipes: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """What `rollout.evaluate` returns of recipes RECIPE [n], and the seconds it took (for statistics only)."""
+        """What `rollout.evaluate` returns for recipes RECIPE [n], and the seconds it took (for statistics only)."""
         started = time.perf_counter()
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)

@@ -100,7 +100,7 @@ def test_own_fitness_decides(champion):
 
 
 def test_fitness_of_the_wrong_shape_is_said_and_not_a_number_loses():
-    with pytest.raises(ValueError, match="one number a member"):
+    with pytest.raises(ValueError, match="one number per member"):
         evolve(SMALL, fitness=lambda results, targets: results["steps"])
 
     def some(results, targets):
