@@ -1,7 +1,7 @@
 """What each part of the default search is worth: python benchmarks/ablations.py [VARIANT ...] [--scenario NAME] ...
 
-Each variant changes one thing and learns with several seeds, without validation. Printed is the success of the leader
-in the 256 validation drives after so many million car-steps: the mean over the seeds, and in brackets the worst.
+Each variant changes one thing and learns with several seeds, without validation. The table has the leader's success in
+the 256 validation drives after so many million car-steps: the mean over the seeds, and the worst of them in brackets.
 All variants on `seamless` with 8 seeds take half an hour on two cores.
 """
 
@@ -48,8 +48,8 @@ class FixedStepSize(Recombination):
 class Unpaired(Recombination):
     """The second child of each pair has noise of its own.
 
-    The update takes it for a mirror image, so noise and step size have to be corrected: a child without a mirror image
-    is a pair of which the other one never wins. So each child is told of as a pair of its own.
+    The update takes it for a mirror image, so noise and step size have to be corrected: to the update each child is a
+    pair of its own, of which the other one never wins.
     """
 
     def _ask(self, key: int) -> Generation:
@@ -112,7 +112,7 @@ VARIANTS = {
 
 
 def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float]) -> list[float]:
-    """Success of the leader after each budget, million car-steps. A process learns once: constants stay changed."""
+    """Success of the leader after each budget, million car-steps. Once per process only: constants stay changed."""
     variant = VARIANTS[name]
     for constant, value in variant.constants.items():
         setattr(curriculum if hasattr(curriculum, constant) else recombination, constant, value)

@@ -2,8 +2,8 @@
 
     python benchmarks/ceilings.py POPULATION
 
-prints as JSON the peak memory of a process that coordinates a run of so many members, all that a run does included, and
-what it broadcasts: a process of its own, so that nothing else is counted.
+prints as JSON the peak memory of a process that coordinates a complete run of so many members, and what it broadcasts.
+It is a process of its own, so that nothing else is counted.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ from gridsim.maps.scenarios import build
 POLICY = "mlp:6,7"  # 311 genes
 CHILDREN = 100_000  # members that the coordinator alone is timed with
 EPISODES = 2  # of a member, as in the default run
-CHUNKS = 2_000  # that are sent to see what one costs
-WAITING = 1_000  # workers that are looked at to see what one costs
+CHUNKS = 2_000  # that are sent to measure the cost of one
+WAITING = 1_000  # busy workers that are looked at to measure the cost of one
 SEED = 7  # of the sleeping workers' naps
 
 
 class InstantWorker(Worker):
-    """Answers at once: most episodes succeed, the others end on their way; whoever crashes, does where it started."""
+    """Answers at once: most episodes succeed, the others end on the way; those that crash do so where they started."""
 
     def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
@@ -70,7 +70,7 @@ class InstantWorker(Worker):
 
 
 class SleepingWorker(InstantWorker):
-    """Sleeps in place of evaluating: for as long as `naps` says, by a member's seed and an episode's mark."""
+    """Sleeps instead of evaluating, for as long as `naps` gives for a member's seed and an episode's mark."""
 
     def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         started = time.perf_counter()
@@ -118,10 +118,10 @@ def learn(this: Session) -> None:
 
 
 def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, float]:
-    """Members a second that the default search asks for, the pool sends and collects and the search recombines.
+    """Members per second that the default search asks for, the pool sends and collects, and the search recombines.
 
-    Of InstantWorkers, whose results come in groups as in a run. And the seconds of the coordinator's own thread's
-    processor that one takes, without those that it waits for the workers.
+    With InstantWorkers, whose results come in groups as in a run. Also the coordinator thread's CPU seconds for a
+    member, in which waiting for the workers does not count.
     """
     search = Recombination(PolicySpec.parse(POLICY), EvolveSettings(population=children).search_config(), 0)
     rng = np.random.default_rng(0)
@@ -140,10 +140,10 @@ def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, f
 
 
 def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
-    """Seconds that the coordinator's thread takes for a chunk of one member, and for each look for what has come.
+    """CPU seconds that the coordinator's thread takes for a chunk of one member, and for each look for answers.
 
-    Of its processor and not of the clock: here InstantWorkers share its cores. With few workers nearly every chunk
-    takes a look of its own, with many one look finds many answers; so looks are taken apart.
+    CPU time and not wall time, as the InstantWorkers share its cores. With few workers nearly every chunk takes a look
+    of its own, with many one look finds many answers; so looks are measured separately.
     """
     import ray
 
@@ -172,7 +172,7 @@ def chunk_costs(pool: WorkerPool, chunks: int = CHUNKS) -> tuple[float, float]:
 
 
 def ray_costs(waiting: int = WAITING) -> tuple[float, float]:
-    """Seconds to look at one busy worker, and to send a byte; while a pool has Ray up."""
+    """Seconds to look at one busy worker, and to send a byte. A pool must have started Ray."""
     import ray
 
     class Helper:
@@ -236,12 +236,12 @@ def step_s(policy: str, members: int = 64) -> float:
 
 
 def sleeping_efficiency(workers: int, members: int, generations: int = 3) -> float:
-    """Efficiency of so many real Ray actors on whatever cores there are: they sleep, which takes none."""
+    """Efficiency of so many real Ray actors, on however many cores there are: they only sleep."""
     maps = Maps("seamless", SimConfig())
     pool = RayPool(workers, maps.build, worker_factory=SleepingWorker)
     recipes, task = some_recipes(members), make_task(rows(ROWS))
     try:
-        while len(pool.pids()) < workers:  # all are up, and it is known how long a metre takes
+        while len(pool.pids()) < workers:  # until all are up, and the time for a metre is known
             pool.evaluate(task, recipes)
         walls = [pool.evaluate(task, recipes).wall_s for _ in range(generations)]
     finally:
@@ -259,9 +259,9 @@ def memory(population: int) -> dict[str, float]:
 
 
 def coordinate(population: int, generations: int = 16) -> dict[str, float]:
-    """Run some generations of InstantWorkers in the longest episodes, saved and logged as always.
+    """Run some generations with InstantWorkers on the longest episodes, saved and logged as always.
 
-    What is broadcast is that of a generation which needs no new map and tries nobody for champion.
+    The broadcast is that of a generation with neither new maps nor a candidate for champion.
     """
     settings = EvolveSettings(population=population, generations=generations, until=2.0)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""What learners of others get from GridSim: python benchmarks/learners.py [--json] [--quick]
+"""How other projects' learners do on GridSim: python benchmarks/learners.py [--json] [--quick]
 
     import_gridsim_ms    `import gridsim` after `import gymnasium`, median of 7 fresh processes
     sb3_vec_env_ratio    car-steps/s under random actions of `SB3VecEnv` with 1,024 cars, over those of
@@ -29,7 +29,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from gridsim.envs.sb3 import SB3VecEnv
 from gridsim.maps.scenarios import HELD_OUT_SEED
 
-ID = "gridsim:GridSim/Curved-v0"  # the module's name is for the processes of SubprocVecEnv
+ID = "gridsim:GridSim/Curved-v0"  # the module's name lets SubprocVecEnv's processes import it
 IMPORT = "import time, gymnasium; a = time.perf_counter(); import gridsim; print(time.perf_counter() - a)"
 EXAMPLE = str(Path(__file__).parent.parent / "examples" / "ppo.py")
 
@@ -49,7 +49,7 @@ def steps_per_s(cars: VecEnv, seconds: float) -> float:
 
 
 def vec_env_ratio(seconds: float) -> float:
-    """Medians of both, which take turns."""
+    """Ratio of their median rates, measured in turn."""
     both: list[VecEnv] = [SB3VecEnv(ID, 1024), make_vec_env(ID, 8, vec_env_cls=SubprocVecEnv)]
     for cars in both:
         cars.reset()
@@ -62,14 +62,14 @@ def vec_env_ratio(seconds: float) -> float:
 
 
 def ppo_success(car_steps: int, drives: int) -> float:
-    """Share of held-out drives on so many maps in which SB3's PPO succeeds."""
+    """Share of held-out drives, on as many maps, in which SB3's PPO succeeds."""
     cars = SB3VecEnv(ID, 64, steering=True)
     learner = PPO("MlpPolicy", cars, n_steps=64, batch_size=512, learning_rate=1e-3, seed=0, device="cpu")
     learner.learn(car_steps)
     held_out = SB3VecEnv(ID, drives, steering=True, maps=drives, map_seed=HELD_OUT_SEED)
     held_out.seed(0)
     observations, succeeded = held_out.reset(), {}
-    while len(succeeded) < drives:  # of each car its first drive
+    while len(succeeded) < drives:  # each car's first drive
         observations, _, dones, infos = held_out.step(learner.predict(observations, deterministic=True)[0])
         for i in np.flatnonzero(dones).tolist():
             succeeded.setdefault(i, infos[i]["is_success"])

@@ -2,9 +2,9 @@
 
     python benchmarks/peers.py NAME
 
-`throughput.py --peers [PYTHON]` runs this file once for each, on its own core, with that Python: it needs nothing of
-this project, so peers may live in an environment of their own. What is printed is one number; what is not installed
-ends it with 3, and a line on stderr says what to do.
+`throughput.py --peers [PYTHON]` runs this file once for each, on the core it is pinned to, with that Python: this file
+needs nothing of this project, so peers may live in an environment of their own. It prints one number; for a peer that
+is not installed it exits with 3, and a line on stderr says what to do.
 
 highway-env decides 15 times a second here, once per simulated step (by default once a second, which would be slower);
 all else is each project's default: 50 other cars on highway-env, one in ten places of traffic in MetaDrive.
@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 NOT_INSTALLED = 3  # exit code
-SECONDS = 3.0  # that steps are taken for
+SECONDS = 3.0  # for which steps are taken
 
 
 def _highway(observation: str) -> Callable[[], Any]:
@@ -46,7 +46,7 @@ def _car_racing() -> Any:
 
 
 class Peer(NamedTuple):
-    """Another environment, and which of our figures it is to be held against."""
+    """Another environment, and which of our figures to compare it with."""
 
     module: str
     pip: str  # what installs it

@@ -1,10 +1,10 @@
 """Measure the tables of docs/results.md: python benchmarks/results.py [TABLE ...] [--output DIR] [--quick] [--write]
 
 Each command is run as a user would run it and timed from start to exit; then its champion drives 512 held-out drives. A
-row is one command, or one with several seeds: their median, and the worst of them in brackets. What is measured is kept
-in DIR as a JSON file for each command; it is measured again only after a change of gridsim, evolution or cluster. So an
-interrupted measurement goes on where it was. --write puts the tables of which all rows are there into docs/results.md,
-with the commit. Nothing else should run on the machine.
+row is one command, or one with several seeds: their median, and the worst of them in brackets. Results are kept in DIR,
+one JSON file per command; they are measured again only after a change of gridsim, evolution or cluster. So an
+interrupted measurement goes on where it stopped. --write puts all complete tables into docs/results.md, with the
+commit. Nothing else should run on the machine.
 
 Tables: seeds, roads, other, speed, learners, comparison; all by default, in an hour and a half on two cores.
 """
@@ -49,7 +49,7 @@ def alone(*commands: str) -> dict[str, list[str]]:
     return {command: [command] for command in commands}
 
 
-# Tables, their rows, and the commands that a row is the median of.
+# Tables, their rows, and the commands of which a row is the median.
 TABLES: dict[str, dict[str, list[str]]] = {
     "seeds": alone(*(f"gridsim-evolve --seed {seed}" for seed in range(SEEDS))),
     "roads": {
@@ -87,13 +87,13 @@ class Store:
     commit: str
 
     def kept(self, command: str) -> dict[str, Any] | None:
-        """What was measured of a command at this commit."""
+        """What was measured for a command at this commit."""
         path = self._path(command)
         measured = json.loads(path.read_text()) if path.exists() else {}
         return measured if measured.get("commit") == self.commit else None
 
     def keep(self, command: str, measured: dict[str, Any]) -> None:
-        """Write it down."""
+        """Save what was measured for a command."""
         self.folder.mkdir(parents=True, exist_ok=True)
         whole = {"command": command, "commit": self.commit, **measured}
         self._path(command).write_text(json.dumps(whole, indent=2) + "\n")
@@ -154,7 +154,7 @@ def measure(command: str, store: Store) -> dict[str, Any]:
 
 
 def compare(command: str, store: Store) -> str:
-    """Run the comparison, or go on with one of this commit; returns its table."""
+    """Run the comparison, or resume this commit's; returns its table."""
     folder = store.folder / f"comparison-{store.commit}"
     if folder.exists():
         call("gridsim-compare", "--resume", str(folder))
@@ -200,7 +200,7 @@ def row_of(label: str, runs: Sequence[dict[str, Any]]) -> str:
 
 
 def write(store: Store) -> None:
-    """Put the whole tables, and the commit, into the page, each between its two marks."""
+    """Put the complete tables, and the commit, into the page, each between its two marks."""
     page = PAGE.read_text()
     for table in TABLES:
         text = render(TABLES[table], store)

@@ -1,8 +1,8 @@
 """How the service scales: python benchmarks/scaling.py [--json] [--quick] [--picture FILE] [--generations N] [--seed N]
 
-On this machine: runs the default job to its end with 2 workers and keeps the state ten generations before it; then
-evolves those ten generations again, with 1 worker, with 2, and with 2 at population 512, saving and logging as always.
-Medians over them:
+On this machine: runs the default job to its end with 2 workers and keeps the state ten generations before the end; then
+evolves the last ten generations again, with 1 worker, with 2, and with 2 at population 512, saving and logging as
+always. Medians over them:
 
     speedup_2_workers               wall clock of all ten with 1 worker over that with 2
     overhead_ms_per_generation      wall clock less the busiest worker's evaluation, 2 workers, population 512
@@ -12,13 +12,13 @@ Medians over them:
 The coordinator's ceilings, with workers that answer at once (`ceilings.py`):
 
     children_per_s                  recipes, dispatch, collection and recombination, mlp:6,7
-    coordinator_mib_100k            peak memory of its process at population 100,000, everything in it
+    coordinator_mib_100k            peak memory of its process at population 100,000, everything included
     broadcast_bytes_100k            as above, at that population
-    chunk_us, look_us, ...          what the simulation is fed with: the coordinator's own time
+    chunk_us, look_us, ...          input of the simulation: the coordinator's own time
 
 On more machines: a simulation (`simulation.py`) of a generation of 10,000 members on 1 to 10,000 workers, as a table
-and, with --picture, a picture; and what it says of 1 to 8 workers beside real Ray actors. Those share this machine's
-cores, so that they sleep in place of evaluating: what is checked is the dispatch, not the cores.
+and, with --picture, a picture; and its figures for 1 to 8 workers beside those of real Ray actors. These share this
+machine's cores, so they sleep instead of evaluating: this checks the dispatch, not the cores.
 
     efficiency_1000_workers         1 s of evaluation a member, mlp:6,7; evaluation over what the workers had
     real_efficiency_<n>, simulated_efficiency_<n>
@@ -74,7 +74,7 @@ from gridsim.config import SimConfig
 LAST = 10  # generations that are measured
 OVERHEAD = 512  # population that the coordinator's time is measured at
 CNN = "cnn:8,16,32@1"
-ACTORS = (1, 2, 4, 8)  # real ones, that the simulation is checked with
+ACTORS = (1, 2, 4, 8)  # real ones, with which the simulation is checked
 NAPPING = 40  # members for each of them
 MEMBER_S = 1.0  # of evaluation, in the simulation
 
@@ -112,7 +112,7 @@ def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> State:
     this.reporter.row = keep
     learn(this)
     for seed in (*this.learning.curriculum.map_seeds, *VALIDATION_SEEDS, *HELD_OUT_SEEDS):
-        maps.get(seed)  # a short run ends before all are built, and nothing else is to be built beside what is measured
+        maps.get(seed)  # a short run ends before all are built, and none is to be built during a measurement
     return states[0]
 
 
@@ -120,7 +120,7 @@ def last_generations(
     folder: Path, settings: EvolveSettings, maps: Maps, state: State, workers: int
 ) -> tuple[dict[str, list[float]], Load]:
     """Evolve LAST generations from a state. Returns: figures of each, and how the last one's episodes went."""
-    # They are counted here: neither a bound of the run nor its champion ends them.
+    # Generations are counted here: neither a limit of the run nor its champion ends it.
     settings = replace(settings, generations=0, car_steps=MAX_STEPS, until=2.0)
     pool = Watched(workers, maps.build)
     this = session(folder, f"last-{workers}-{settings.population}", settings, pool, maps)
@@ -131,7 +131,7 @@ def last_generations(
     def restore() -> None:
         learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
 
-    # By then MLflow's run is open, all workers are at work, and they have nearly all maps.
+    # Before the measurement MLflow's run is opened, and all workers are put to work and sent nearly all maps.
     this.tracker.wait_ready()
     restore()
     coming = [curriculum.episodes(learning.generation + k) for k in range(LAST + 1)]
@@ -157,18 +157,18 @@ def last_generations(
     begun = time.perf_counter()
     learn(this)
     n, goals = settings.population, targets(pool.task.episodes, pool.task.limits)
-    seconds = learning.outcomes[0].results["steps"] * curriculum.period  # `at` makes them evaluation
+    seconds = learning.outcomes[0].results["steps"] * curriculum.period  # driven; `at` scales them to evaluation
     groups = [part for part in pool.asked if part.rows.stop <= n]
     leader = next(part for part in pool.asked if part.rows.start == n)
     load = Load(
         goals[groups[0].columns], np.concatenate([seconds[part] for part in groups]),
         goals[leader.columns], seconds[leader][0], learning.spec.size,
     )  # fmt: skip
-    return {name: values[1:] for name, values in figures.items()}, load  # the first one measures how fast metres are
+    return {name: values[1:] for name, values in figures.items()}, load  # the first one only times metres
 
 
 def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
-    """What the simulation is fed with, and the figures of it."""
+    """The input of the simulation, and the same as figures to print."""
     pool = RayPool(2, maps.build, worker_factory=InstantWorker)
     try:
         children, child = children_per_s(pool, CHILDREN // 10 if quick else CHILDREN)

@@ -1,12 +1,12 @@
 """A generation on 1 to 10,000 workers, as a discrete-event simulation fed by what `ceilings.py` measured.
 
-The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to who is free, looks at all who are
-busy, and takes in what has come. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the
+The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to free workers, looks at all busy
+ones, and takes in their answers. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the
 network's latency and the bandwidth of its own link, the search's few rows on their way to the nodes, and the evaluation
-of the members and of the leader, whose long episodes go out first. All members count as one group. Not simulated: who
-is on trial for champion, maps, deaths, and other people's load.
+of the members and of the leader, whose long episodes go out first. All members count as one group. Not simulated:
+trials of candidates for champion, maps, deaths of workers, and other users' load.
 
-Efficiency is the time of evaluation over what all workers had: 1 means that nobody ever waited.
+Efficiency is the time of evaluation over the time of all workers: 1 means that none ever waited.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ CHUNK_BYTES = 300  # around what is sent, either way: Ray's own description of a
 class Costs:
     """What things cost, in seconds; the last three are assumed and not measured."""
 
-    child_s: float  # of the coordinator's, a member: its recipe, its score, its weight
-    recombine_s: float  # and as much again for each of its genes
-    chunk_s: float  # of the coordinator's, a chunk: to send it and to take in what it brought
-    look_s: float  # of the coordinator's, a look for what has come
-    look_worker_s: float  # and as much again for each worker that is busy
-    byte_s: float  # of the coordinator's, a byte that is sent
+    child_s: float  # of the coordinator, for a member: its recipe, its score, its weight
+    recombine_s: float  # plus this for each of its genes
+    chunk_s: float  # of the coordinator, for a chunk: to send it and to take in its results
+    look_s: float  # of the coordinator, for a look for answers
+    look_worker_s: float  # plus this for each busy worker
+    byte_s: float  # of the coordinator, for a byte that is sent
     gene_s: float  # to breed a gene
     latency_s: float = 0.3e-3  # from one machine to another
     bandwidth: float = 1.25e9  # bytes/s of a machine's link: 10 Gbit/s
@@ -57,7 +57,7 @@ class Load:
 
     Attributes:
         targets: m, of each of a member's episodes [e].
-        drives: s, of each member's episodes [n, e]; members are drawn from it.
+        drives: s, of each member's episodes [n, e]; members are drawn from these.
         leader_targets, leader_drives: the same of the leader's episodes [k], which are driven as they are.
         genes: of a network.
         recipes: whether children are sent as recipes; else as genomes, which the coordinator breeds.
@@ -73,19 +73,19 @@ class Load:
 
 @dataclass
 class Call:
-    """One call of a pool: what is asked for, and how long it took."""
+    """One call of a pool: what is asked for, and how long it takes."""
 
     costs: Costs
     workers: int
     drives: np.ndarray  # s [n, e]; 0 where nothing is asked for
     targets: np.ndarray  # m [e]
     broadcast: int = 0  # bytes
-    asked: Sequence[Chunk] = ()  # what takes longest first; all if empty
+    asked: Sequence[Chunk] = ()  # the longest first; all if empty
     member_bytes: float = RECIPE.itemsize  # sent for each member, in each chunk that it is in
-    member_s: float = 0.0  # of the coordinator's, for the same
+    member_s: float = 0.0  # of the coordinator, for the same
 
     def parcels(self) -> list[Parcel]:
-        """As the pool cuts it, which knows from the last generation how long a metre takes."""
+        """What is asked for as the pool cuts it, knowing from the last generation how long a metre takes."""
         n, e = self.drives.shape
         episodes = np.zeros(e, dtype=EPISODE)
         episodes["target"] = self.targets
@@ -98,16 +98,16 @@ class Call:
         return cut(task, asked, self.workers, [max(self.drives.sum() / whole, 1e-12)] * len(asked))
 
     def run(self) -> float:
-        """Seconds from its begin to its end."""
+        """Seconds from start to end."""
         k, parcels = self.costs, self.parcels()
         size = np.concatenate([np.zeros((len(self.drives), 1)), np.cumsum(self.drives, axis=1)], axis=1)
         todo = deque(parcels)
         idle = deque(range(self.workers))
-        single: deque[int] = deque()  # who holds one chunk, in the order in which they got it
+        single: deque[int] = deque()  # workers that hold one chunk, in the order in which they got it
         held = [0] * self.workers
         free_at = [0.0] * self.workers
         broadcast_at: dict[int, float] = {}  # by node
-        coming: list[tuple[float, int, float]] = []  # (when an answer is here, whose, how many bytes it has)
+        coming: list[tuple[float, int, float]] = []  # (when an answer arrives, whose it is, its bytes)
         link_s = 0.0  # until when the coordinator's link is busy
         now = self.broadcast * k.byte_s
 
@@ -120,7 +120,7 @@ class Call:
             link_s = max(link_s, now) + down / k.bandwidth
             node = worker // k.node_workers
             if node not in broadcast_at:
-                # Every node that has it passes it on, so that those who have it double.
+                # Every node that has the broadcast passes it on, so that their number doubles in each round.
                 rounds = math.ceil(math.log2(node + 2))
                 broadcast_at[node] = link_s + rounds * (2 * k.latency_s + self.broadcast / k.bandwidth)
             begin = max(link_s + k.latency_s, free_at[worker], broadcast_at[node])
@@ -153,7 +153,7 @@ class Call:
 
 
 def generation(costs: Costs, load: Load, workers: int, drives: np.ndarray) -> float:
-    """Seconds of a generation of members [n, e] and the leader, who comes after them in rows and columns."""
+    """Seconds of a generation of members [n, e] and the leader, which comes after them in rows and columns."""
     n, e = drives.shape
     k = len(load.leader_drives)
     both = np.zeros((n + 1, e + k))
@@ -170,13 +170,13 @@ def generation(costs: Costs, load: Load, workers: int, drives: np.ndarray) -> fl
 
 
 def efficiency(costs: Costs, load: Load, workers: int, population: int = POPULATION) -> float:
-    """Time of evaluation over what the workers had."""
+    """Time of evaluation over the time of all workers."""
     drives = load.drives[np.random.default_rng(0).integers(len(load.drives), size=population)]
     return (drives.sum() + load.leader_drives.sum()) / (workers * generation(costs, load, workers, drives))
 
 
 def at(load: Load, member_s: float, genes: int, recipes: bool = True) -> Load:
-    """The same with a network of so many genes, where a member's evaluation takes so long in the mean."""
+    """A load with a network of so many genes, where evaluating a member takes `member_s` on average."""
     factor = member_s / load.drives.sum(axis=1).mean()
     return replace(
         load, drives=load.drives * factor, leader_drives=load.leader_drives * factor, genes=genes, recipes=recipes
@@ -189,7 +189,7 @@ def table(costs: Costs, cases: dict[str, Load], workers: Sequence[int] = WORKERS
 
 
 def draw(figures: dict[str, list[float]], path: Path, workers: Sequence[int] = WORKERS) -> None:
-    """The same as a picture."""
+    """Draw the figures of `table` to a picture."""
     import matplotlib
 
     matplotlib.use("Agg")

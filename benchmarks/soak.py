@@ -1,13 +1,12 @@
-"""Whether memory grows with the generations: python benchmarks/soak.py [--generations 2000] [--workers 2] [--policy P]
+"""Whether memory grows over generations: python benchmarks/soak.py [--generations 2000] [--workers 2] [--policy P]
 
-Evolves a small population from a driver that is trained already, so that everything a long run does is done from the
-start: crashes, validation, a checkpoint and an MLflow row each generation; with --policy a network of that kind, from
-chance, whose leader is validated however it drives. After each, the memory of the command and of all that it started
-(Ray's processes and the workers) is added up as the kernel shares it out (PSS), so that what lies in shared memory
-counts once.
+Evolves a small population from a trained driver, so that everything a long run does is done from the start: crashes,
+validation, a checkpoint and an MLflow row in each generation; with --policy, from random networks of that kind, whose
+leader is validated however it drives. After each generation, the memory of the command and of all that it started
+(Ray's processes and the workers) is added up as PSS, in which shared memory counts once.
 
-What is there after the first 100 generations (or half of a shorter run) is compared with the end's, as medians of 20.
-Exits with 1 where the end's is over 5 % more, of the command alone or of all. Linux only.
+The memory after the first 100 generations (or half of a shorter run) is compared with that at the end, as medians of
+20. Exits with 1 if it grew by over 5 %, of the command alone or of all. Linux only.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ MIB = 2**20
 
 
 def tree(pid: int) -> list[int]:
-    """A process and all below it."""
+    """A process and all its descendants."""
     children: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -53,7 +52,7 @@ def tree(pid: int) -> list[int]:
 
 
 def memory(pid: int) -> int:
-    """Bytes of a process: its own, and its part of what it shares (PSS). 0 where it has gone."""
+    """Bytes of a process: its own, and its part of what it shares (PSS). 0 if it is gone."""
     with contextlib.suppress(OSError):
         for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
             if line.startswith("Pss:"):
@@ -64,7 +63,7 @@ def memory(pid: int) -> int:
 def soak(generations: int, workers: int, policy: str = "") -> dict[str, list[int]]:
     """Bytes after each generation: of the command (`own`), and of all that it started (`started`)."""
     champion = load_champion(Path(__file__).with_name("champion.npz"))
-    # Small steps, so that what is evolved goes on driving well.
+    # Small steps, so that the drivers keep driving well.
     settings = EvolveSettings(
         policy=policy or champion.policy, population=32, sigma=0.01, generations=generations, until=2.0
     )
@@ -99,7 +98,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--generations", type=int, default=2_000, help="how many (2000)")
     parser.add_argument("--workers", type=int, default=2, help="how many (2)")
-    parser.add_argument("--policy", default="", help="of the networks, from chance (that of benchmarks/champion.npz)")
+    parser.add_argument("--policy", default="", help="start from random networks of this kind (champion.npz)")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
     if options.generations < 2 or options.workers < 1:

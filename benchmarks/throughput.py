@@ -1,20 +1,20 @@
-"""Car-steps per second on one pinned core, and what surrounds them.
+"""Car-steps per second on one pinned core, and related figures.
 
     python benchmarks/throughput.py [--json] [--peers [PYTHON]]
 
-On `seamless`, resets included, a trained policy at the wheel over several maps, medians of several runs; ego cars only
-are counted:
+On `seamless`, resets included, driven by a trained policy on several maps, medians of several runs; only ego cars are
+counted:
 
     rollout_rays             car-steps/s of the fused rollout: 31 rays of 50 m, network, act, advance, collide
     vector_env_rays          car-steps/s of `env.step` of the Gymnasium vector environment with 1,024 cars
     vector_env_grid          the same with `observation="grid"`
-    ..._traffic              the same with 8 other cars in each car's world, by a driver who learned among traffic
+    ..._traffic              the same with 8 other cars in each car's world, by a policy that learned in traffic
     breed_512x1000_ms        512 children of about 1,000 genes, half of them of two parents, 3 % of the genes mutated
     breed_step_512x1000_ms   the same around a centre in mirrored pairs, as the default search breeds
     map_<scenario>_ms, _mib  a new map from its seed: time to build it, and its memory
 
 `--json` prints these and the speeds driven as one flat object of numbers. `--peers` adds the steps per second of other
-environments on the same core under random actions, and how many times as many ours takes; they are no dependencies, and
+environments on the same core under random actions, and how many times as fast ours is; they are not dependencies, and
 `--peers /path/to/python` finds them in a virtual environment of their own (`benchmarks/peers.py`).
 """
 
@@ -50,7 +50,7 @@ from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 MAPS = 8
 EPISODES = 16  # of the rollout, over all maps
 CARS = 1024  # of the vector environment
-SPEED = 6.0  # m/s, that the policy must drive at: crashing and parked cars are cheap
+SPEED = 6.0  # m/s at which the policy must drive at least: crashing and parked cars are cheap
 TRAFFIC = 8  # cars in a world
 
 
@@ -82,7 +82,7 @@ def rollout_rays(champion: Champion, maps: list[Map], runs: int, traffic: int = 
 
 @njit
 def _actions(packed, layers, ranges, speeds, actions):
-    """What one network does in many cars."""
+    """The actions of one network in many cars."""
     scratch = np.zeros(scratch_size(layers), dtype=np.float32)
     for i in range(len(actions)):
         encode(ranges[i], None, speeds[i], np.float32(0.0), scratch)
@@ -97,7 +97,7 @@ def vector_env(
     observation: Literal["rays", "grid"] = "rays",
     steps: int = 200,
 ) -> tuple[float, float]:
-    """(car-steps/s, m/s driven) of `env.step`: without the network's own time; a step that only resets is none."""
+    """(car-steps/s, m/s driven) of `env.step`, without the network's own time; steps that only reset do not count."""
     env = gridsim.envs.env.GridSimVectorEnv(
         CARS, maps=maps, config=champion.sim, traffic=traffic, observation=observation, scenario=champion.scenario
     )
@@ -128,8 +128,8 @@ def vector_env(
 def breed_ms(runs: int, crossed: bool) -> float:
     """Milliseconds to breed 512 children of 1,011 genes by Kind.CROSS, or by Kind.STEP and MIRRORED.
 
-    Crossed are the rows of a mating pool of 64, half of the time two of them, half of the time one with itself, whose
-    children are mutated alone; 3 % of all genes mutate. Steps are taken from one row, by the sizes in another.
+    Rows of a mating pool of 64 are crossed: half of the children have two parents, half have one and are only mutated;
+    3 % of all genes mutate. Steps are taken from one row, by the sizes in another.
     """
     spec = PolicySpec.parse("mlp:17,17")
     rng = np.random.default_rng(0)
@@ -147,16 +147,16 @@ def breed_ms(runs: int, crossed: bool) -> float:
 
 
 def new_map(scenario: str, runs: int) -> tuple[float, float]:
-    """(ms to build a map nobody has seen, MiB of its arrays)."""
+    """(ms to build a new map, MiB of its arrays)."""
     made = build(scenario, 0)
     arrays = [value for value in [*made.road, *made.network, *made.arrays().values()] if isinstance(value, np.ndarray)]
-    unique = {array.__array_interface__["data"][0]: array.nbytes for array in arrays}  # some are seen twice
+    unique = {array.__array_interface__["data"][0]: array.nbytes for array in arrays}  # some occur twice
     seeds = iter(range(HELD_OUT_SEED + 1000, HELD_OUT_SEED + 1000 + runs))
     return 1e3 * median_s(lambda: build(scenario, next(seeds)), runs), sum(unique.values()) / 2**20
 
 
 def peer_steps(name: str, python: str) -> float | str:
-    """Steps per second of another environment, measured by a process of that Python; or why there are none."""
+    """Steps per second of another environment, measured by a process of that Python; or why there is no figure."""
     file = str(Path(__file__).with_name("peers.py"))
     try:
         run = subprocess.run([python, file, name], capture_output=True, text=True, timeout=120, check=False)

@@ -1,22 +1,22 @@
-"""Traffic alone: whether it runs into itself or comes to a stop, hour after hour.
+"""Traffic alone: whether its cars run into each other or come to a stop, hour after hour.
 
     python benchmarks/traffic.py [--hours 1 | --ego [200]] [--seeds 20] [--cars N] [--scenario NAME] [--json]
 
 Each scenario's default number of cars (6 where that is 0) drives on so many maps for so many simulated hours, with no
-ego car. A row a scenario:
+ego car. One row per scenario:
 
-    cars        a map, of those that found room to start
+    cars        on a map, of those that found room to start
     overlaps    pairs of cars that overlap, counted in every control step: must be 0
     speed       m/s, mean of all cars over all the time
     worst map   m/s, the same of the slowest map
-    at the end  m/s, the same of the slowest map in the last tenth of the time: what gridlock would bring down
-    open road   m/s, mean speed of one who drives everywhere as fast as the lanes allow
+    at the end  m/s, the same of the slowest map in the last tenth of the time, which gridlock would lower
+    open road   m/s, mean speed of a car that drives everywhere as fast as the lanes allow
     stood       s, the longest that any car stood still
 
-Exits with 1 if there is an overlap, or a map where cars are in the end no faster than half of what the road allows.
+Exits with 1 if there is an overlap, or a map where cars are at the end less than half as fast as on an open road.
 
-With --ego, 24 cars drive for two minutes around an ego car that stands, at so many starts. A row a scenario, and exit
-code 1 if one of these is not 0:
+With --ego, 24 cars drive for two minutes around an ego car that stands, at so many starts. One row per scenario, and
+exit code 1 if one of these is not 0:
 
     egos hit    starts at which a car of the traffic touched the ego car
     off road    control steps of cars in which a part of the car was off the road
@@ -76,7 +76,7 @@ def soak(network, drivers, constants, world, steps, stood) -> tuple[int, float, 
 
 
 def open_road(network: Network) -> float:
-    """Mean speed (m/s), over all lanes, of one who drives everywhere as fast as they allow."""
+    """Mean speed (m/s), over all lanes, of a car that drives everywhere as fast as they allow."""
     metres = np.repeat(network.steps.astype(np.float64), np.diff(network.offsets))
     return float(metres.sum() / (metres / network.speeds).sum())
 
