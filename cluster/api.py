@@ -1,4 +1,4 @@
-"""GridSim's Python API, without run folders or MLflow: train, with a fitness of your own, load, drive, evaluate.
+"""GridSim's Python API, without run folders or MLflow: train, also with your own fitness, load, drive, evaluate.
 
 `import gridsim` offers all of it: `gridsim.evolve(scenario="city", workers=2)`.
 """
@@ -72,8 +72,8 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
     Args:
         runs: their folders; a comparison's folder stands for all of its finished runs.
 
-    Returns: a row for each run: folder, scenario, learner, seed, traffic, and the figures as table.csv names them; nan
-    for an unknown error.
+    Returns: a row for each run: folder, scenario, learner, seed, traffic, and the figures as table.csv names them; an
+    error that could not be measured is nan.
     Raises: GridSimError, with a one-line message, for a folder that is not a finished run.
     """
     from cluster.comparison.plan import read_runs

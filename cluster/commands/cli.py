@@ -55,7 +55,7 @@ class RunFlags:
     """The run's name, and what it starts from."""
 
     name: Annotated[str, IN_WORDS] = ""
-    """Name of the run; by default made of scenario, algorithm, seed and time."""
+    """Name of the run; by default made from scenario, algorithm, seed and time."""
     resume: Annotated[str, IN_WORDS] = ""
     """Folder of a run to continue exactly from its checkpoint."""
     config: Annotated[str, IN_WORDS] = ""

@@ -120,7 +120,7 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
             shown = [(name, part, field(default=select(part, default))) for name, part in shown]
         asked, given = dataclasses.make_dataclass(kind.__name__, shown), {}
     printed = io.StringIO()
-    # Not on a terminal, tyro draws no box and uses no colours: its error is parsed below.
+    # Unless it writes to a terminal, tyro draws no box and uses no colours: its error is parsed below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
     with _reader_may_leave(), contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:

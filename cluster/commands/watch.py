@@ -209,7 +209,7 @@ def _is_recording(flags: WatchFlags) -> bool:
 
 
 def _drives_once(flags: WatchFlags, seconds: float) -> list[tuple[Recording, str]]:
-    """As `_drives`, but only one drive of a champion."""
+    """Like `_drives`, but only one drive of a champion."""
     return list(_recorded(flags)) if _is_recording(flags) else [next(_drives(flags, seconds))]
 
 

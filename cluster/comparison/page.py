@@ -23,7 +23,7 @@ img { max-width: 100% }"""
 
 
 def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path) -> bytes:
-    """The page as HTML, to be written into `folder`, as its links are relative; the picture is embedded."""
+    """The page as HTML, with the picture embedded; its links are relative to `folder`."""
     title = f"GridSim: {escape(folder.name)}"
     parts = [f"<h1>{title}</h1>", f"<p>{escape(introduction(plan))}</p>"]
     for columns in (DRIVING, ERRORS):

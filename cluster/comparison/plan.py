@@ -72,7 +72,7 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """What a comparison is asked to do: the fields are the command's flags, and comparison.json holds them."""
+    """A comparison's plan: the fields are the command's flags, and comparison.json stores them."""
 
     scenarios: tuple[str, ...] = tuple(REGISTRY)
     """Roads to compare on."""

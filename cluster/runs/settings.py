@@ -26,7 +26,7 @@ MAX_REPLAY = 10_000_000
 LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
-# Of evolution, by default.
+# Evolution's default budgets.
 CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
@@ -329,7 +329,7 @@ SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (Evolve
 
 
 def check_workers(workers: int, address: str, patience_s: float) -> None:
-    """Raises SettingsError if a run cannot be computed with these, on which no result depends."""
+    """Raises SettingsError if a run cannot be computed with these values; no result depends on them."""
     if not 0 <= workers <= MAX_WORKERS:
         raise SettingsError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
     if workers == 0 and address:

@@ -370,7 +370,7 @@ class Session:
     def _conclude(self) -> None:
         """Mark the run as finished. Its checkpoint gets the history, and loses a DQN's replay, which is most of it.
 
-        So the file of the steps, whose elites are in elites.npz by now, is no longer needed.
+        So steps.part, whose elites are in elites.npz by now, is no longer needed.
         """
         path = self.run.path
         arrays, meta = checkpoint.load(path / CHECKPOINT)

@@ -90,7 +90,7 @@ def sqlite_path(uri: str) -> Path | None:
 
 
 def server_problem(uri: str) -> str:
-    """Why there is no MLflow server at `uri`, or "". It sends no credentials, so checks no certificate."""
+    """Why there is no MLflow server at `uri`, or "". Sends no credentials, so certificates are not checked."""
     unchecked = ssl.create_default_context()
     unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
     try:

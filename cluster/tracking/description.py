@@ -38,7 +38,7 @@ def group(settings: RunSettings) -> str:
     given = asdict(settings)
     shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
     usual = asdict(type(settings)(**shared)) | {"recombination": "all"}
-    left_out = {"seed", "policy", "search", *settings.unbound}  # are named above, or only decide when a run ends
+    left_out = {"seed", "policy", "search", *settings.unbound}  # varied, named above, or only limits
     more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
     return ", ".join([" ".join(words), *more])
 

@@ -69,13 +69,13 @@ class Tracker:
         table = run_table(self.uri if served else UI, self._run.experiment_id) if self._run else ""
         if served:
             return table or shown(self.uri)
-        make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # which it shows
+        make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # the store that it shows
         return f"{make}MLFLOW_DISABLE_TELEMETRY=true {mlflow} ui --backend-store-uri {self.uri}" + (
             f"; then open\n{table}" if table else ""
         )
 
     def log_row(self, step: int, row: Mapping[str, float], wall_s: float | None = None) -> None:
-        """Send metrics of a step, at `wall_s` after the run's start, or now. MLflow's run ends at the last time."""
+        """Send metrics of a step, at `wall_s` after the run's start, or now. The last of these ends MLflow's run."""
         self._rows.append(Row(step, row, wall_s, time.time_ns() // 1_000_000))
         self._wall_s = wall_s
         self._notify()

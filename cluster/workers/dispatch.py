@@ -18,7 +18,7 @@ MAX_KILLS = 3  # workers that a member kills before it is lost
 
 
 class Dispatch:
-    """The parcels of one call, on their way to workers and back. Workers are numbers.
+    """The parcels of one call, on their way to workers and back. Workers have numbers.
 
     Args:
         parcels: the parcels; where one is split, its pieces are added at the end.

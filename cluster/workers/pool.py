@@ -26,11 +26,11 @@ Meanwhile = Callable[[], bool | None]  # called while workers are busy, again an
 
 SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
 METRE_S = 1e-6  # seconds that a metre of an episode takes a small network
-UNMEASURED_METRE_S = 3e-5  # what Ray's workers are taken to need before it is measured: large networks are slower
+UNMEASURED_METRE_S = 3e-5  # the same, assumed for Ray's workers until it is measured: large networks are slower
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
 PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
 LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
-LARGER = 4  # times what is worth sending, if that is more
+LARGER = 4  # times what is worth sending is the largest parcel, if that is more
 SHARE = 0.9  # of a worker's share of the rest, in one parcel
 
 

@@ -101,7 +101,7 @@ class RayPool(WorkerPool):
         build_map: builds a map, here, once; workers see it in shared memory.
         address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
         worker_factory: makes what evaluates; must be importable in the workers.
-        patience_s: how long there may be no worker at all, or one may not answer; default 60 s, on a cluster 300 s.
+        patience_s: how long to go on without any worker, or wait for a silent one; default 60 s, on a cluster 300 s.
 
     Raises PoolError at once if nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
@@ -205,7 +205,7 @@ class RayPool(WorkerPool):
         if not refs:
             time.sleep(timeout_s)
             return []
-        ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0.0)  # in one look: with many workers it is slow
+        ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0.0)  # one look: with many workers it is slow
         if not ready and timeout_s > 0.0:
             ready, _ = ray.wait(refs, num_returns=1, timeout=timeout_s)
         return ready
@@ -246,7 +246,7 @@ class RayPool(WorkerPool):
             return self._bury(slot, job, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
-        parcel = job.dispatch.answered(slot.number) if serial == self._serial else None  # of an interrupted call
+        parcel = job.dispatch.answered(slot.number) if serial == self._serial else None  # else from an interrupted call
         if parcel is not None:
             for chunk, found in zip(job.dispatch.parcels[parcel], pickle.loads(answer), strict=True):
                 job.call.add(slot.number, chunk, *found)
