@@ -30,7 +30,7 @@ from gridsim.config import SimConfig
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POPULATION = 10_000
 QUEUE = 2  # chunks that a worker holds, as in the pool
-TASK_BYTES = 4_000  # of a broadcast, beside genomes: episodes, settings, and how they are pickled
+TASK_BYTES = 4_000  # of a broadcast, besides genomes: episodes, settings, and how they are pickled
 ROWS = 4  # genomes in a broadcast: centre, step sizes, champion, leader
 CHUNK_BYTES = 300  # around what is sent, either way: Ray's own description of a call
 

@@ -1,6 +1,6 @@
 """Whether memory grows over generations: python benchmarks/soak.py [--generations 2000] [--workers 2] [--policy P]
 
-Evolves a small population from a trained driver, so that everything a long run does is done from the start: crashes,
+Evolves a small population from a trained driver, so that everything a long run does happens from the start: crashes,
 validation, a checkpoint and an MLflow row in each generation; with --policy, from random networks of that kind, whose
 leader is validated however it drives. After each generation, the memory of the command and of all that it started
 (Ray's processes and the workers) is added up as PSS, in which shared memory counts once.

@@ -176,9 +176,9 @@ def main() -> int:
         "--peers", nargs="?", const=sys.executable, metavar="PYTHON", help="also measure other environments"
     )
     here = Path(__file__).parent
-    parser.add_argument("--champion", type=Path, default=here / "champion.npz", help="who drives alone")
+    parser.add_argument("--champion", type=Path, default=here / "champion.npz", help="drives alone")
     parser.add_argument("--champion-traffic", type=Path, default=here / "champion_traffic.npz", help="... in traffic")
-    parser.add_argument("--runs", type=int, default=7, help="of which each figure is the median (7)")
+    parser.add_argument("--runs", type=int, default=7, help="each figure is their median (7)")
     options = parser.parse_args()
     if options.runs < 1:
         parser.error("--runs must be 1 or more")

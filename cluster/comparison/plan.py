@@ -81,7 +81,7 @@ class Plan:
     seeds: int = 3
     """Seeds of each, 0 and up; 1 with --quick."""
     observation: Observation = "rays"
-    """What the networks see beside the speed: rays (31 ranges) or grid (an occupancy grid)."""
+    """What the networks see besides the speed: rays (31 ranges) or grid (an occupancy grid)."""
     budget: str = "60s"
     """What a run may use at most: car-steps (20M, 500k) or wall time (60s, 5min, 1h); 10s with --quick. Car-steps give
     the same networks on any machine. A run may end earlier by its learner's own stopping rule."""

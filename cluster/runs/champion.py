@@ -88,7 +88,7 @@ class Champion:
                 grids = observation["grid"]
                 observation = grids[..., 0, :, :] if spec.frames == 1 else grids
             if speed is None:
-                raise ValueError(f'{spec} needs the speed (m/s) beside the grid: act(grid, info["speed_mps"])')
+                raise ValueError(f'{spec} needs the speed (m/s) besides the grid: act(grid, info["speed_mps"])')
             return convnet.act_on(spec, self.genome, observation, speed)
         return act_on(
             spec,

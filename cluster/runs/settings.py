@@ -55,7 +55,7 @@ class RunSettings:
     seed: int = 0
     """Seed of every random number of the run."""
     observation: Observation = "rays"
-    """What the network sees beside the speed: rays (31 ranges) or grid (an occupancy grid)."""
+    """What the network sees besides the speed: rays (31 ranges) or grid (an occupancy grid)."""
     policy: Annotated[str, IN_WORDS] = ""
     """Network; by default one that suits the observation."""
     car_steps: Annotated[int, IN_WORDS] = 0
