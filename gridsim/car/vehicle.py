@@ -6,7 +6,7 @@ Equations, with l_r the distance from the centre of mass to the rear axle and L 
 The path's curvature is sin(beta) / l_r, but at most grip / v^2: a car that is too fast for its tyres runs wide.
 
 The steering angle changes at the beginning of a control period and then holds. A wheel that turns evenly within the
-period would differ by half a period: 0.8 m to the side after 80 m of changing bends.
+period would lag half a period behind: 0.8 m to the side after 80 m of changing bends.
 """
 
 from __future__ import annotations
