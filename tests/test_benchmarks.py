@@ -11,6 +11,10 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 #: A script (and its mode) and how it is run here; what `--json` must print.
 RUNS = {
     "ablations.py": (["as it is", "--seeds", "1", "--millions", "0.05"], None),
+    "faults.py": (
+        ["--faults", "20", "--json"],
+        {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
+    ),
     "learners.py": (
         ["--quick", "--json"],
         {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},
@@ -45,7 +49,7 @@ def test_script_runs(name: str, tmp_path: Path) -> None:
     arguments, figures = RUNS[name]
     script, *mode = name.split()
     command = [sys.executable, str(FOLDER / script), *mode, *arguments]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     # A peer has to be named; and in so few generations memory still grows.
     allowed = {"peers.py": {2}, "soak.py": {0, 1}}.get(name, {0})
     assert done.returncode in allowed, done.stderr
