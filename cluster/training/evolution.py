@@ -78,12 +78,11 @@ class Evolution(Learning):
         leader = self.search.leader()
         candidate = leader if self._promising() else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.generation)
-        n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
-        goals = targets(episodes.rows, limits)[:e]  # the same in each group
-        groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
+        n, goals = len(asked.recipes), targets(episodes.rows, limits)
+        members = Chunk(slice(0, n), slice(0, len(goals)))
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
 
-        call = _Call(asked, episodes, list(groups))
+        call = _Call(asked, episodes, [members])
         if leader is not None:
             followed = curriculum.leader_episodes(self.generation)
             leading = call.add(leader, followed)
@@ -91,9 +90,9 @@ class Evolution(Learning):
             trial = call.add(candidate, curriculum.validation())
         driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self.meanwhile)
         check_any_left(driven.lost[:n], "evolve")
-        results = np.concatenate([driven.results[part] for part in groups])
+        results = driven.results[members]
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
-        curriculum.learn_from_members(self.generation, [driven.results[part] for part in groups])
+        curriculum.learn_from_members(self.generation, results)
 
         if leader is None:  # in the first generation, the best member takes its place
             best = int(score.argmax())
@@ -185,7 +184,7 @@ class Evolution(Learning):
 
 @dataclass
 class _Call:
-    """What one call of the pool drives: members on their groups' episodes, and single genomes on their own."""
+    """What one call of the pool drives: the members, and single genomes on episodes of their own."""
 
     members: Generation
     episodes: Episodes

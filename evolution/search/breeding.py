@@ -23,15 +23,14 @@ class Kind(IntEnum):
     """How a child is made from the rows a and b of `parents` in its recipe."""
 
     COPY = 0  # parents[a], unmodified
-    NEW = 1  # a random genome, left-right symmetric (`symmetry`), like the noise of STEP and MIRRORED
-    STEP = 2  # parents[a] + parents[b] * N(0, 1): a centre, and a standard deviation for each gene
-    MIRRORED = 3  # parents[a] - parents[b] * N(0, 1): with the same seed, the opposite of a STEP
-    CROSS = 4  # uniform crossover of parents[a] and parents[b], then Gaussian mutation
+    NEW = 1  # a random genome, left-right symmetric (`symmetry`), like the noise of STEP
+    STEP = 2  # parents[a], and all genes mutated
+    CROSS = 3  # uniform crossover of parents[a] and parents[b], then mutation of some genes
 
 
 RECIPE = np.dtype([("kind", "u1"), ("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
 
-_COPY, _NEW, _STEP, _MIRRORED = int(Kind.COPY), int(Kind.NEW), int(Kind.STEP), int(Kind.MIRRORED)
+_COPY, _NEW, _STEP = int(Kind.COPY), int(Kind.NEW), int(Kind.STEP)
 _F, _U = np.float32, np.uint64
 _LEVELS = 1 << 12
 
@@ -49,9 +48,9 @@ QUANTILES = _quantiles()
 
 @dataclass(frozen=True)
 class Mutation:
-    """Mutation of a child of two parents (Kind.CROSS)."""
+    """Gaussian mutation."""
 
-    rate: float = 0.03  # share of genes that get Gaussian noise
+    rate: float = 0.03  # share of genes that get noise, in a child of two parents
     sigma: float = 0.5  # its standard deviation, in units of `policy.gene_scales`
 
 
@@ -105,11 +104,10 @@ def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, chil
                 child[i] = a[i]
         elif kind == _NEW:
             _normals(quantiles, stream, scales, symmetry, child)
-        elif kind in (_STEP, _MIRRORED):
-            _normals(quantiles, stream, b, symmetry, child)
-            sign = _F(1.0) if kind == _STEP else _F(-1.0)
+        elif kind == _STEP:
+            _normals(quantiles, stream, scales, symmetry, child)
             for i in range(genes):
-                child[i] = a[i] + sign * child[i]
+                child[i] = a[i] + sigma * child[i]
         else:
             _cross(a, b, stream, threshold, child, marked)
             for i in range(genes):
@@ -140,24 +138,20 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, 
 
 
 @njit
-def _moments(seeds, weights, squares, key, quantiles, symmetry, first, second):
-    """Add weights[k] * z_k to first [genes] and squares[k] * z_k ** 2 to second, z_k the noise of seeds[k]."""
-    genes = first.shape[0]
-    ones, z = np.ones(genes, dtype=np.float32), np.empty(genes, dtype=np.float32)
+def _noise_sum(seeds, weights, key, quantiles, scales, symmetry, total):
+    """Add weights[k] * z_k to total [genes], z_k the noise of seeds[k]."""
+    z = np.empty(total.shape[0], dtype=np.float32)
     for k in range(seeds.shape[0]):
-        if weights[k] == 0.0 and squares[k] == 0.0:
+        if weights[k] == 0.0:
             continue
-        _normals(quantiles, _stream(key, seeds[k]), ones, symmetry, z)
-        w, s = _F(weights[k]), _F(squares[k])
-        for i in range(genes):
-            first[i] += w * z[i]
-            second[i] += s * z[i] * z[i]
+        _normals(quantiles, _stream(key, seeds[k]), scales, symmetry, z)
+        w = _F(weights[k])
+        for i in range(total.shape[0]):
+            total[i] += w * z[i]
 
 
-def moments(
-    seeds: np.ndarray, weights: np.ndarray, squares: np.ndarray, key: int, spec: PolicySpec
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over the noise z [genes] of seeds [n]: weights [n] times z, and squares [n] times z squared."""
-    first, second = np.zeros(spec.size, dtype=np.float32), np.zeros(spec.size, dtype=np.float32)
-    _moments(seeds.astype(np.uint32), weights, squares, _U(key), QUANTILES, symmetry(spec), first, second)
-    return first, second
+def noise_sum(seeds: np.ndarray, weights: np.ndarray, key: int, spec: PolicySpec) -> np.ndarray:
+    """Sum float32 [genes] of weights [n] times the noise of Kind.STEP at sigma 1 with these seeds [n]."""
+    total = np.zeros(spec.size, dtype=np.float32)
+    _noise_sum(seeds.astype(np.uint32), weights, _U(key), QUANTILES, gene_scales(spec), symmetry(spec), total)
+    return total

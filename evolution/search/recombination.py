@@ -1,10 +1,9 @@
 """The default search: tournament winners are recombined into one centre, around which the next generation is sampled.
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
-adaptation (Hansen and Ostermeier 2001) and a diagonal covariance (separable CMA-ES, Ros and Hansen 2008). Noise is
-left-right symmetric (`symmetry`). Children come in mirrored pairs (Brockhoff et al. 2010), the centre plus and minus
-the same noise, which drive the same episodes. The elites are the centre and the champion (before the first champion,
-the average of centres). They are evaluated unmodified, and can win like other members.
+adaptation (Hansen and Ostermeier 2001). Noise is left-right symmetric (`symmetry`). The elites are the centre and the
+champion (before the first champion, the average of centres). They are evaluated unmodified, and can win like other
+members.
 """
 
 from __future__ import annotations
@@ -15,10 +14,10 @@ import numpy as np
 
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
-from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournament_weights
-from evolution.search.breeding import Kind, Mutation, moments
+from evolution.search.base import Arrays, Generation, Search, SearchConfig, recipes, tournament_weights
+from evolution.search.breeding import Kind, Mutation, noise_sum
 
-_CENTRE, _STEPS, _OTHER = 0, 1, 2  # rows of the broadcast parents
+_CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
 _ELITES = 2  # the centre, and the champion or, before the first one, the average
 # Learning rate of the mean (c_m of Hansen 2016, "The CMA Evolution Strategy: A Tutorial"), by measurement.
 _LEARNING_RATE = 2.0
@@ -26,17 +25,16 @@ _KEPT = 0.9  # decay of the average of centres in each generation
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
 _MAX_GROWTH = 2.0
-_ARRAYS = ("centre", "average", "path", "variances")  # of the state
+_ARRAYS = ("centre", "average", "path")  # of the state
 
 
 class Recombination(Search):
-    """Children are centre + sigma * scales * sqrt(variances) * N(0, 1); the first generation is random.
+    """Children are centre + sigma * scales * N(0, 1), see `gene_scales`; the first generation is random.
 
     Attributes:
         centre: float64 [genes], or [0] before the first generation.
         path: float64 [free genes], the evolution path; each initially N(0, 1), as under random selection.
-        variances: float64 [genes], diagonal of the covariance, initially 1.
-        sigma: the overall step size.
+        sigma: the step size.
         average: float64 [genes], exponential moving average of the centres.
         champion: float32 [genes], the run's champion, or None.
     """
@@ -47,7 +45,6 @@ class Recombination(Search):
         self._free = symmetry(spec).free
         # From 0, the step size would shrink until the path has grown to its expected length.
         self.path = self._rng(1).standard_normal(len(self._free))
-        self.variances = np.ones(spec.size)
         self.average = np.zeros(0)
         self.sigma = config.sigma
         self.champion: np.ndarray | None = None
@@ -62,55 +59,41 @@ class Recombination(Search):
         """The average of centres, which drives better than any one of them."""
         return self.average.astype(np.float32) if len(self.average) else None
 
-    def steps(self) -> np.ndarray:
-        """Standard deviation of each gene, float64 [genes]."""
-        return self.sigma * gene_scales(self.spec) * np.sqrt(self.variances)
-
     def _ask(self, key: int) -> Generation:
         n = self.config.population
         made = recipes(n)
         if not len(self.centre):
             made["kind"] = Kind.NEW
-            none = np.zeros((0, self.spec.size), dtype=np.float32)
-            return Generation(none, made, key, Mutation(), split(n, self.config.groups))
+            return Generation(np.zeros((0, self.spec.size), dtype=np.float32), made, key)
         other = self.average if self.champion is None else self.champion
-        rows = np.stack([self.centre, self.steps(), other]).astype(np.float32)
-        made["kind"], made["seed"] = Kind.COPY, 0
-        made["a"][:_ELITES] = _CENTRE, _OTHER
-        child = np.arange(n - _ELITES)
-        made["kind"][_ELITES:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
-        made["a"][_ELITES:], made["b"][_ELITES:] = _CENTRE, _STEPS
-        made["seed"][_ELITES:] = child // 2
-        return Generation(rows, made, key, Mutation(), split(n, self.config.groups, _ELITES))
+        rows = np.stack([self.centre, other]).astype(np.float32)
+        made["kind"], made["a"] = Kind.STEP, _CENTRE
+        made["kind"][:_ELITES], made["a"][:_ELITES] = Kind.COPY, (_CENTRE, _OTHER)
+        return Generation(rows, made, key, Mutation(sigma=self.sigma))
 
     def _tell(self, asked: Generation, scores: np.ndarray) -> None:
-        if not len(self.centre):  # start from the best score, although groups had different episodes
+        if not len(self.centre):
             self.start_from(self.genomes(np.array([scores.argmax()]))[0])
             return
-        weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
-        effective = 1.0 / float((weights**2).sum())  # mu_eff
-        pairs = (len(weights) - _ELITES) // 2  # an odd last member, without a mirror image, is left out
-        plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
-        genes, shift = len(self._free), plus - minus
-        first, second = moments(np.arange(pairs), shift, plus + minus, asked.key, self.spec)
-        towards = self.steps() * first + weights[1] * (asked.parents[_OTHER] - self.centre)
+        weights = tournament_weights(scores, self.config.tournament)
+        children = weights[_ELITES:]
+        # The mean of all children is chance; equal scores say nothing.
+        children = (children - children.mean()) * (np.ptp(children) > 0.0)
+        noise = noise_sum(asked.recipes["seed"][_ELITES:], children, asked.key, self.spec)
+        towards = self.sigma * noise + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.centre = self.centre + _LEARNING_RATE * towards
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
-        # Under random selection, first / norm is N(0, 1) in each gene for any weights of the pairs.
-        norm = math.sqrt(float((shift**2).sum()))
+        genes, effective = len(self._free), 1.0 / float((weights**2).sum())  # mu_eff
+        rate = (effective + 2.0) / (genes + effective + 5.0)
+        damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
+        expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
+        # Under random selection, noise / (norm * scales) is N(0, 1) in each gene for any weights.
+        norm = math.sqrt(float((children**2).sum()))
         if norm > 0.0:
-            rate = (effective + 2.0) / (genes + effective + 5.0)
-            damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
-            expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
-            self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) / norm * first[self._free]
+            step = (noise / gene_scales(self.spec))[self._free] / norm
+            self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) * step
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
             self.sigma = min(self.sigma, _MAX_GROWTH * self.config.sigma)
-        share = float((plus + minus).sum())
-        if share > 0.0:
-            rate = 2.0 * (effective - 2.0 + 1.0 / effective) / ((genes + 2.0) ** 2 + effective)
-            rate = min(1.0, (genes + 2.0) / 3.0 * max(rate, 0.0))
-            # The variance of a gene without noise (factor 0 in `symmetry`) is kept, or it would shrink to 0.
-            self.variances = self.variances * np.where(second > 0.0, 1.0 - rate + rate * second / share, 1.0)
 
     def state(self) -> tuple[Arrays, dict[str, float]]:
         return {name: getattr(self, name) for name in _ARRAYS}, {"sigma": self.sigma}
