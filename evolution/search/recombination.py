@@ -77,8 +77,6 @@ class Recombination(Search):
             return
         weights = tournament_weights(scores, self.config.tournament)
         children = weights[_ELITES:]
-        # The mean of all children is chance; equal scores say nothing.
-        children = (children - children.mean()) * (np.ptp(children) > 0.0)
         noise = noise_sum(asked.recipes["seed"][_ELITES:], children, asked.key, self.spec)
         towards = self.sigma * noise + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.centre = self.centre + _LEARNING_RATE * towards
