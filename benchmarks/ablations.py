@@ -24,6 +24,7 @@ from evolution.episodes import curriculum
 from evolution.episodes.curriculum import Curriculum, success_rate
 from evolution.search import recombination
 from evolution.search.base import Generation
+from evolution.search.breeding import Kind
 from evolution.search.recombination import Recombination
 from gridsim.config import SimConfig
 
@@ -34,6 +35,37 @@ class FixedStepSize(Recombination):
     def _tell(self, asked: Generation, scores: np.ndarray) -> None:
         super()._tell(asked, scores)
         self.sigma = self.config.sigma
+
+
+class Unpaired(Recombination):
+    """The second child of each pair has noise of its own.
+
+    The update takes it for a mirror image, so noise and step size have to be corrected: to the update each child is a
+    pair of its own, of which the other one never wins.
+    """
+
+    def _ask(self, key: int) -> Generation:
+        asked = super()._ask(key)
+        if len(self.centre):
+            children = asked.recipes[2:]
+            children["kind"], children["seed"] = Kind.STEP, np.arange(len(children))
+        return asked
+
+    def _tell(self, asked: Generation, scores: np.ndarray) -> None:
+        if not len(self.centre):
+            return super()._tell(asked, scores)
+        n = len(scores) - 2
+        standing = recombination.ranks(scores, asked.groups)
+        weights = recombination.tournament_weights(standing, self.config.tournament)
+        doubled = np.zeros(2 + 2 * n)
+        doubled[:2], doubled[2::2] = weights[:2], weights[2:]
+        given = recombination.tournament_weights
+        recombination.tournament_weights = lambda *_: doubled
+        try:
+            super()._tell(asked, scores)
+        finally:
+            recombination.tournament_weights = given
+        return None
 
 
 @dataclass(frozen=True)
@@ -55,6 +87,8 @@ class Variant:
 
 VARIANTS = {
     "as it is": Variant(),
+    "one group": Variant(curriculum={"groups": 1}),
+    "no mirrored pairs": Variant(search=Unpaired),
     "fixed step size": Variant(search=FixedStepSize),
     "to the winners' mean": Variant(constants={"_LEARNING_RATE": 1.0}),
     "tournaments of 8": Variant(settings={"tournament": 8}),
@@ -81,7 +115,8 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     learner.curriculum = Curriculum(
         config, seed, maps.get, episode.target, episode.time_limit, episode.control_period, settings.traffic
     )
-    learner.search = variant.search(learner.spec, settings.search_config(), seed)
+    search = dataclasses.replace(settings.search_config(), groups=config.groups)
+    learner.search = variant.search(learner.spec, search, seed)
     found = []
     for budget in budgets:
         while learner.car_steps < 1e6 * budget:

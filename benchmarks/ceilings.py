@@ -56,7 +56,8 @@ class InstantWorker(Worker):
     def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         goals = targets(task.episodes, task.limits)
-        share = (recipes["seed"].astype(np.int64)[:, None] * 7919 + np.arange(len(goals)) * 104_729) % 512 / 160
+        mark = 2 * recipes["seed"].astype(np.int64) + (recipes["kind"] == Kind.MIRRORED)
+        share = (mark[:, None] * 7919 + np.arange(len(goals)) * 104_729) % 512 / 160
         results["distance"] = np.floor(np.minimum(share, 1.0) * goals)
         results["paced"] = np.floor(results["distance"] / 2)
         results["steps"] = results["distance"]
@@ -119,8 +120,8 @@ def learn(this: Session) -> None:
 def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, float]:
     """Members per second that the default search asks for, the pool sends and collects, and the search recombines.
 
-    With InstantWorkers. Also the coordinator thread's CPU seconds for a member, in which waiting for the workers does
-    not count.
+    With InstantWorkers, whose results come in groups as in a run. Also the coordinator thread's CPU seconds for a
+    member, in which waiting for the workers does not count.
     """
     search = Recombination(PolicySpec.parse(POLICY), EvolveSettings(population=children).search_config(), 0)
     rng = np.random.default_rng(0)
@@ -128,8 +129,10 @@ def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, f
     for _ in range(6):
         begun, before = time.perf_counter(), time.thread_time()
         asked = search.ask()
-        task = make_task(asked.parents, asked.key, EPISODES)
-        driven = pool.evaluate(task, asked.recipes).results
+        parts = [Chunk(group, slice(g * EPISODES, (g + 1) * EPISODES)) for g, group in enumerate(asked.groups)]
+        task = make_task(asked.parents, asked.key, EPISODES * len(parts))
+        results = pool.evaluate(task, asked.recipes, asked=parts).results
+        driven = np.concatenate([results[part] for part in parts])
         search.tell(fitness.scalar(driven, task.limits.target) + 1e-6 * rng.random(children))
         rates.append(children / (time.perf_counter() - begun))
         times.append((time.thread_time() - before) / children)
@@ -199,21 +202,21 @@ def ray_costs(waiting: int = WAITING) -> tuple[float, float]:
 
 
 def gene_costs() -> tuple[float, float]:
-    """Seconds to breed a gene of a member, and to recombine it."""
-    spec, members = PolicySpec.parse(POLICY), 2_000
-    recipes = some_recipes(members)
-    recipes["kind"] = Kind.STEP
-    weights = np.random.default_rng(0).normal(size=members)
+    """Seconds to breed a gene of a member, and to recombine it: members come in pairs that share their noise."""
+    spec, pairs = PolicySpec.parse(POLICY), 1_000
+    recipes = some_recipes(2 * pairs)
+    recipes["kind"], recipes["seed"] = [Kind.STEP, Kind.MIRRORED] * pairs, np.arange(2 * pairs) // 2
+    weights = np.random.default_rng(0).normal(size=pairs)
     bred, recombined = [], []
     for _ in range(6):
         times = [time.perf_counter()]
         breed(rows(1), recipes, 1, spec, Mutation())
         times.append(time.perf_counter())
-        noise_sum(recipes["seed"], weights, 1, spec)
+        noise_sum(np.arange(pairs), weights, 1, spec)
         times.append(time.perf_counter())
         bred.append(times[1] - times[0])
         recombined.append(times[2] - times[1])
-    genes = members * spec.size
+    genes = 2 * pairs * spec.size
     return statistics.median(bred[1:]) / genes, statistics.median(recombined[1:]) / genes
 
 

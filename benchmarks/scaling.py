@@ -158,10 +158,10 @@ def last_generations(
     learn(this)
     n, goals = settings.population, targets(pool.task.episodes, pool.task.limits)
     seconds = learning.outcomes[0].results["steps"] * curriculum.period  # driven; `at` scales them to evaluation
-    members = next(part for part in pool.asked if part.rows.stop == n)
+    groups = [part for part in pool.asked if part.rows.stop <= n]
     leader = next(part for part in pool.asked if part.rows.start == n)
     load = Load(
-        goals[members.columns], seconds[members],
+        goals[groups[0].columns], np.concatenate([seconds[part] for part in groups]),
         goals[leader.columns], seconds[leader][0], learning.spec.size,
     )  # fmt: skip
     return {name: values[1:] for name, values in figures.items()}, load  # the first one only times metres

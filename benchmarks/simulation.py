@@ -3,7 +3,7 @@
 The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to free workers, looks at all busy
 ones, and takes in their answers. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the
 network's latency and the bandwidth of its own link, the search's few rows on their way to the nodes, and the evaluation
-of the members and of the leader, whose long episodes go out first. Not simulated:
+of the members and of the leader, whose long episodes go out first. All members count as one group. Not simulated:
 trials of candidates for champion, maps, deaths of workers, and other users' load.
 
 Efficiency is the time of evaluation over the time of all workers: 1 means that none ever waited.

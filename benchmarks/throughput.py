@@ -10,7 +10,7 @@ counted:
     vector_env_grid          the same with `observation="grid"`
     ..._traffic              the same with 8 other cars in each car's world, by a policy that learned in traffic
     breed_512x1000_ms        512 children of about 1,000 genes, half of them of two parents, 3 % of the genes mutated
-    breed_step_512x1000_ms   the same around a centre, as the default search breeds
+    breed_step_512x1000_ms   the same around a centre in mirrored pairs, as the default search breeds
     map_<scenario>_ms, _mib  a new map from its seed: time to build it, and its memory
 
 `--json` prints these and the speeds driven as one flat object of numbers. `--peers` adds the steps per second of other
@@ -126,7 +126,7 @@ def vector_env(
 
 
 def breed_ms(runs: int, crossed: bool) -> float:
-    """Milliseconds to breed 512 children of 1,011 genes by Kind.CROSS, or by Kind.STEP.
+    """Milliseconds to breed 512 children of 1,011 genes by Kind.CROSS, or by Kind.STEP and MIRRORED.
 
     Rows of a mating pool of 64 are crossed: half of the children have two parents, half have one and are only mutated;
     3 % of all genes mutate. Steps are taken from one row.
@@ -140,7 +140,7 @@ def breed_ms(runs: int, crossed: bool) -> float:
         recipes["a"] = rng.integers(64, size=512)
         recipes["b"] = np.where(np.arange(512) % 2, recipes["a"], (recipes["a"] + 1) % 64)
     else:
-        recipes["kind"] = Kind.STEP
+        recipes["kind"], recipes["seed"] = [Kind.STEP, Kind.MIRRORED] * 256, np.arange(512) // 2
     mutation = Mutation(rate=0.03)
     breed(parents, recipes, 1, spec, mutation)
     return 1e3 * median_s(lambda: breed(parents, recipes, 1, spec, mutation), 4 * runs)

@@ -23,6 +23,7 @@ MAX_SEED = (1 << 63) - 1
 MAX_TRAFFIC = 100
 MAX_ELITES = 10_000
 MAX_REPLAY = 10_000_000
+LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
 # Evolution's default budgets.
@@ -204,7 +205,13 @@ class EvolveSettings(RunSettings):
 
     def search_config(self) -> SearchConfig:
         """The search's parameters."""
-        return SearchConfig(self.population, self.tournament, self.sigma, self.elites, self.mutation_rate)
+        return SearchConfig(
+            self.population, self.curriculum().groups, self.tournament, self.sigma, self.elites, self.mutation_rate
+        )
+
+    def curriculum(self) -> CurriculumConfig:
+        usual = super().curriculum()
+        return replace(usual, groups=max(1, min(usual.groups, self.population // LEAST_GROUP)))
 
     def extending(self, base: RunSettings) -> Self:
         longer = isinstance(base, EvolveSettings) and self.generations > base.generations

@@ -78,11 +78,12 @@ class Evolution(Learning):
         leader = self.search.leader()
         candidate = leader if self._promising() else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.generation)
-        n, goals = len(asked.recipes), targets(episodes.rows, limits)
-        members = Chunk(slice(0, n), slice(0, len(goals)))
+        n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
+        goals = targets(episodes.rows, limits)[:e]  # the same in each group
+        groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
 
-        call = _Call(asked, episodes, [members])
+        call = _Call(asked, episodes, list(groups))
         if leader is not None:
             followed = curriculum.leader_episodes(self.generation)
             leading = call.add(leader, followed)
@@ -90,9 +91,9 @@ class Evolution(Learning):
             trial = call.add(candidate, curriculum.validation())
         driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self.meanwhile)
         check_any_left(driven.lost[:n], "evolve")
-        results = driven.results[members]
+        results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
-        curriculum.learn_from_members(self.generation, results)
+        curriculum.learn_from_members(self.generation, [driven.results[part] for part in groups])
 
         if leader is None:  # in the first generation, the best member takes its place
             best = int(score.argmax())
@@ -184,7 +185,7 @@ class Evolution(Learning):
 
 @dataclass
 class _Call:
-    """What one call of the pool drives: the members, and single genomes on episodes of their own."""
+    """What one call of the pool drives: members on their groups' episodes, and single genomes on their own."""
 
     members: Generation
     episodes: Episodes

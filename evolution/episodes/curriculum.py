@@ -3,8 +3,8 @@
 Distance and speed alone are deceptive under limited grip: at first, the best members drive into the first bend at full
 speed. So episodes begin short, and their length doubles when the leader (the best genome known before a generation)
 succeeds. Half of them start shortly before a crash of a recent leader, mostly where half of the members crash again:
-there is most to learn. All members of a generation drive the same few episodes. The champion is chosen on validation
-maps, which are not used in training.
+there is most to learn. The groups of a generation have different episodes, so that selection uses many although
+each member drives few. The champion is chosen on validation maps, which are not used in training.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
@@ -12,13 +12,14 @@ The state is arrays and numbers; random numbers depend only on (seed, generation
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from evolution.episodes.rollout import EPISODE, Limits
 from evolution.episodes.starts import Episodes, lane_starts
+from evolution.search.base import SearchConfig
 from gridsim.car.ego import End
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
@@ -37,7 +38,8 @@ class CurriculumConfig:
     maps: int = 32  # training maps
     first_maps: int = 4  # of these, how many the first generation uses ...
     map_generations: int = 4  # ... and generations after which one more is used, so that maps are built in time
-    starts: int = 1  # new episodes in each generation
+    groups: int = SearchConfig.groups  # of members, each with episodes of its own
+    starts: int = 1  # new episodes for each group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, target of crash starts
     crash_memory: int = 64  # crashes that are remembered
@@ -126,9 +128,13 @@ class Curriculum:
         return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
 
     def episodes(self, generation: int) -> Episodes:
-        """A generation's episodes: first new starts, then crash starts."""
+        """A generation's episodes, group by group: first new starts, then crash starts.
+
+        All groups have the same number of each.
+        """
         config, rng = self.config, self._rng(generation, 0)
-        fresh = self._new_starts(self._some_maps(generation, config.starts, rng), rng)
+        maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
+        fresh = self._new_starts(np.concatenate(maps), rng)
         if not len(self.crashes) or not config.crash_starts:
             return fresh
         chosen = self._choose_crashes(generation)
@@ -139,25 +145,32 @@ class Curriculum:
         used = sorted({*fresh.maps, *seeds})
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
         crashes["map"] = np.searchsorted(used, seeds)
-        return Episodes(used, np.concatenate([fresh.rows, crashes]), np.concatenate([fresh.worlds, worlds]))
+        return Episodes(used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, worlds))
 
     def _choose_crashes(self, generation: int) -> np.ndarray:
-        """Indices of a generation's crash starts: likeliest where half of the members failed."""
-        count = self.config.crash_starts
+        """Indices of a generation's crash starts, group by group: likeliest where half of the members failed."""
+        count = self.config.groups * self.config.crash_starts
         weights = np.maximum(4.0 * self.failures * (1.0 - self.failures), LEAST_CRASH_WEIGHT)
         chosen = self._rng(generation, 1).choice(
             len(weights), count, replace=count > len(weights), p=weights / weights.sum()
         )
         return chosen.astype(np.intp)
 
-    def learn_from_members(self, generation: int, results: np.ndarray) -> None:
-        """Learn from RESULT [members, e] how hard the crash starts of a generation's `episodes` are."""
+    def learn_from_members(self, generation: int, results: Sequence[np.ndarray]) -> None:
+        """Learn how hard the crash starts of a generation's `episodes` are, from each group's RESULT [members, e]."""
         if not len(self.crashes) or not self.config.crash_starts:
             return
-        chosen = self._choose_crashes(generation)
-        failed = (results["end"][:, -len(chosen) :] != End.SUCCESS).mean(axis=0)
+        chosen = self._choose_crashes(generation).reshape(len(results), -1)
         self.failures = self.failures.copy()  # a checkpoint may still be writing the old array
-        self.failures[chosen] = (self.failures[chosen] + failed) / 2.0
+        for crashes, result in zip(chosen, results, strict=True):
+            failed = (result["end"][:, -len(crashes) :] != End.SUCCESS).mean(axis=0)
+            self.failures[crashes] = (self.failures[crashes] + failed) / 2.0
+
+    def _by_group(self, *kinds: np.ndarray) -> np.ndarray:
+        """Distribute each kind [e, ...] over the groups, and concatenate group by group."""
+        n = self.config.groups
+        parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
+        return np.concatenate(np.concatenate(parts, axis=1))
 
     def starts(self, batch: int, count: int) -> Episodes:
         """`count` new episodes on the training maps, for the DQN's batches."""

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ class SearchConfig:
     """Parameters of a search; only `two_parents` uses `elites` and `mutation_rate`."""
 
     population: int = 256  # members of a generation
+    groups: int = 8  # of members; each group has its own episodes
     tournament: int = 4  # members of a tournament
     sigma: float = Mutation.sigma  # standard deviation of mutation at the beginning, in units of `policy.gene_scales`
     elites: int = 8  # best members, kept unmodified
@@ -31,6 +33,8 @@ class SearchConfig:
         """Raises: ValueError with one line for invalid parameters."""
         if self.population < 4:
             raise ValueError(f"population must be 4 or more, not {self.population}")
+        if not 1 <= self.groups <= self.population // 2:
+            raise ValueError(f"a population of {self.population} has no {self.groups} groups of 2 or more")
         if self.tournament < 1:
             raise ValueError(f"tournament size must be 1 or more, not {self.tournament}")
         if not 0.0 < self.sigma < np.inf:
@@ -46,9 +50,10 @@ class Generation(NamedTuple):
     recipes: np.ndarray  # RECIPE [population]
     key: int = 0  # 64 bits, seed of the generation's random numbers
     mutation: Mutation = Mutation()
+    groups: Sequence[slice] = ()  # the members of each group, which are consecutive
 
     def and_copies(self, genomes: np.ndarray) -> Generation:
-        """These members, followed by copies of genomes float32 [k, genes]."""
+        """These members, followed by copies of genomes float32 [k, genes], which are in no group."""
         copies = recipes(len(genomes))
         copies["kind"], copies["a"] = Kind.COPY, np.arange(len(self.parents), len(self.parents) + len(genomes))
         return self._replace(
@@ -98,8 +103,9 @@ class Search(ABC):
         return self.asked
 
     def tell(self, scores: np.ndarray) -> None:
-        """Take the members' scores float64 [population]; higher is better. NaN counts as the worst score.
+        """Take the members' scores float64 [population]; higher is better. They are compared only within groups.
 
+        NaN counts as the worst score.
         Raises: RuntimeError if no generation was asked for; ValueError for a wrong number of scores.
         """
         if self.asked is None:
@@ -119,6 +125,26 @@ class Search(ABC):
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, self.generation, purpose]))
+
+
+def split(members: int, groups: int, first: int = 0) -> list[slice]:
+    """Split members into groups of about equal size, without splitting pairs; pairs begin after the `first` members."""
+    pairs = (members - first + 1) // 2
+    bounds = first + 2 * np.round(np.linspace(0, pairs, groups + 1)).astype(int)
+    bounds[0], bounds[-1] = 0, members
+    return [slice(a, b) for a, b in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)]
+
+
+def ranks(scores: np.ndarray, groups: Sequence[slice]) -> np.ndarray:
+    """Rank of each member in its group, float64 [n] in (0, 1): the share of lower scores plus half the share of ties.
+
+    Ranks of members can be compared even if their groups had easier or harder episodes.
+    """
+    standing = np.empty(len(scores))
+    for group in groups:
+        _, place, count = np.unique(scores[group], return_inverse=True, return_counts=True)
+        standing[group] = ((np.cumsum(count) - count / 2) / count.sum())[place]
+    return standing
 
 
 def tournament_weights(scores: np.ndarray, size: int) -> np.ndarray:

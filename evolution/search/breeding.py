@@ -23,14 +23,15 @@ class Kind(IntEnum):
     """How a child is made from the rows a and b of `parents` in its recipe."""
 
     COPY = 0  # parents[a], unmodified
-    NEW = 1  # a random genome, left-right symmetric (`symmetry`), like the noise of STEP
-    STEP = 2  # parents[a], and all genes mutated
-    CROSS = 3  # uniform crossover of parents[a] and parents[b], then mutation of some genes
+    NEW = 1  # a random genome, left-right symmetric (`symmetry`), like the noise of STEP and MIRRORED
+    STEP = 2  # parents[a], and noise in each gene
+    MIRRORED = 3  # parents[a], less that noise: with the same seed, the opposite of a STEP
+    CROSS = 4  # uniform crossover of parents[a] and parents[b], then mutation of some genes
 
 
 RECIPE = np.dtype([("kind", "u1"), ("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
 
-_COPY, _NEW, _STEP = int(Kind.COPY), int(Kind.NEW), int(Kind.STEP)
+_COPY, _NEW, _STEP, _MIRRORED = int(Kind.COPY), int(Kind.NEW), int(Kind.STEP), int(Kind.MIRRORED)
 _F, _U = np.float32, np.uint64
 _LEVELS = 1 << 12
 
@@ -104,10 +105,11 @@ def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, chil
                 child[i] = a[i]
         elif kind == _NEW:
             _normals(quantiles, stream, scales, symmetry, child)
-        elif kind == _STEP:
+        elif kind in (_STEP, _MIRRORED):
             _normals(quantiles, stream, scales, symmetry, child)
+            size = sigma if kind == _STEP else -sigma
             for i in range(genes):
-                child[i] = a[i] + sigma * child[i]
+                child[i] = a[i] + size * child[i]
         else:
             _cross(a, b, stream, threshold, child, marked)
             for i in range(genes):

@@ -1,9 +1,10 @@
 """The default search: tournament winners are recombined into one centre, around which the next generation is sampled.
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
-adaptation (Hansen and Ostermeier 2001). Noise is left-right symmetric (`symmetry`). The elites are the centre and the
-champion (before the first champion, the average of centres). They are evaluated unmodified, and can win like other
-members.
+adaptation (Hansen and Ostermeier 2001). Noise is left-right symmetric (`symmetry`). Children come in mirrored pairs
+(Brockhoff et al. 2010), the centre plus and minus the same noise, which drive the same episodes. The elites are the
+centre and the champion (before the first champion, the average of centres). They are evaluated unmodified, and can win
+like other members.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
-from evolution.search.base import Arrays, Generation, Search, SearchConfig, recipes, tournament_weights
+from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournament_weights
 from evolution.search.breeding import Kind, Mutation, noise_sum
 
 _CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
@@ -64,30 +65,37 @@ class Recombination(Search):
         made = recipes(n)
         if not len(self.centre):
             made["kind"] = Kind.NEW
-            return Generation(np.zeros((0, self.spec.size), dtype=np.float32), made, key)
+            none = np.zeros((0, self.spec.size), dtype=np.float32)
+            return Generation(none, made, key, Mutation(), split(n, self.config.groups))
         other = self.average if self.champion is None else self.champion
         rows = np.stack([self.centre, other]).astype(np.float32)
-        made["kind"], made["a"] = Kind.STEP, _CENTRE
-        made["kind"][:_ELITES], made["a"][:_ELITES] = Kind.COPY, (_CENTRE, _OTHER)
-        return Generation(rows, made, key, Mutation(sigma=self.sigma))
+        made["kind"], made["seed"] = Kind.COPY, 0
+        made["a"][:_ELITES] = _CENTRE, _OTHER
+        child = np.arange(n - _ELITES)
+        made["kind"][_ELITES:] = np.where(child % 2, Kind.MIRRORED, Kind.STEP)
+        made["a"][_ELITES:] = _CENTRE
+        made["seed"][_ELITES:] = child // 2
+        return Generation(rows, made, key, Mutation(sigma=self.sigma), split(n, self.config.groups, _ELITES))
 
     def _tell(self, asked: Generation, scores: np.ndarray) -> None:
-        if not len(self.centre):
+        if not len(self.centre):  # start from the best score, although groups had different episodes
             self.start_from(self.genomes(np.array([scores.argmax()]))[0])
             return
-        weights = tournament_weights(scores, self.config.tournament)
-        children = weights[_ELITES:]
-        noise = noise_sum(asked.recipes["seed"][_ELITES:], children, asked.key, self.spec)
+        weights = tournament_weights(ranks(scores, asked.groups), self.config.tournament)
+        effective = 1.0 / float((weights**2).sum())  # mu_eff
+        pairs = (len(weights) - _ELITES) // 2  # an odd last member, without a mirror image, is left out
+        plus, minus = weights[_ELITES : _ELITES + 2 * pairs].reshape(pairs, 2).T
+        genes, shift = len(self._free), plus - minus
+        noise = noise_sum(np.arange(pairs), shift, asked.key, self.spec)
         towards = self.sigma * noise + weights[1] * (asked.parents[_OTHER] - self.centre)
         self.centre = self.centre + _LEARNING_RATE * towards
         self.average = _KEPT * self.average + (1.0 - _KEPT) * self.centre
-        genes, effective = len(self._free), 1.0 / float((weights**2).sum())  # mu_eff
-        rate = (effective + 2.0) / (genes + effective + 5.0)
-        damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
-        expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
-        # Under random selection, noise / (norm * scales) is N(0, 1) in each gene for any weights.
-        norm = math.sqrt(float((children**2).sum()))
+        # Under random selection, noise / (norm * scales) is N(0, 1) in each gene for any weights of the pairs.
+        norm = math.sqrt(float((shift**2).sum()))
         if norm > 0.0:
+            rate = (effective + 2.0) / (genes + effective + 5.0)
+            damping = 1.0 + 2.0 * max(0.0, math.sqrt((effective - 1.0) / (genes + 1.0)) - 1.0) + rate
+            expected = math.sqrt(genes) * (1.0 - 1.0 / (4.0 * genes) + 1.0 / (21.0 * genes**2))
             step = (noise / gene_scales(self.spec))[self._free] / norm
             self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) * step
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))

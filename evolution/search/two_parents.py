@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import Arrays, Generation, Search, SearchConfig, recipes, tournaments
+from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournaments
 from evolution.search.breeding import Kind, Mutation
 
 PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
@@ -41,11 +41,13 @@ class TwoParents(Search):
             made["a"], made["b"] = rng.choice(pool, n), rng.choice(pool, n)
         for name, values in (("kind", Kind.COPY), ("a", np.arange(self.elites)), ("b", 0)):
             made[name][: self.elites] = values
-        return Generation(self.parents, made, key, Mutation(config.mutation_rate, config.sigma))
+        groups = split(n, config.groups)
+        return Generation(self.parents, made, key, Mutation(config.mutation_rate, config.sigma), groups)
 
     def _tell(self, asked: Generation, scores: np.ndarray) -> None:
-        best = np.argsort(-scores, kind="stable")[: self.config.elites]
-        winners = tournaments(scores, self.config.tournament, PARENTS, self._rng(2))
+        standing = np.where(np.isneginf(scores), -1.0, ranks(scores, asked.groups))
+        best = np.argsort(-standing, kind="stable")[: self.config.elites]
+        winners = tournaments(standing, self.config.tournament, PARENTS, self._rng(2))
         self.parents = self.genomes(np.concatenate([best, winners]))
         self.elites = len(best)
 

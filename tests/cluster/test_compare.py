@@ -27,7 +27,7 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
     make_run(tmp_path / "a")
     for arguments, said in [
         (["nowhere"], "no such folder"),
-        ([tmp_path / "a" / "config.json"], "no folder"),
+        ([tmp_path / "a" / "config.json"], "is not a folder"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
         (["--workers", -1], "--workers"),

@@ -179,13 +179,13 @@ def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers(
     assert abs(busy[0] - busy[1]) <= WORTH_SENDING_S
 
 
-def test_a_parcel_may_hold_several_chunks() -> None:
-    """So the number of parcels does not grow with the number of chunks."""
-    chunks = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
+def test_a_parcel_holds_members_of_several_groups() -> None:
+    """So that the number of parcels does not grow with the number of groups."""
+    groups = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
     task = make_task(episodes=goals(*[400.0] * 16))
-    assert len(cut(task, chunks, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
+    assert len(cut(task, groups, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
     pool = SerialPool(never_built, Answering)
-    outcome = pool.evaluate(make_task(episodes=task.episodes), make_recipes(512), asked=chunks)
+    outcome = pool.evaluate(make_task(episodes=task.episodes), make_recipes(512), asked=groups)
     assert np.array_equal(outcome.results["distance"].sum(axis=1), make_recipes(512)["seed"] * 32.0)
 
 
@@ -283,11 +283,11 @@ def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
 
 def test_a_member_is_identified_by_its_recipe() -> None:
     recipes = make_recipes(9)
-    recipes["kind"][8] = Kind.STEP
+    recipes["kind"][8] = Kind.MIRRORED
     assert [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes) for k in (1, 7, 8)] == [
         "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
         "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",
-        "member 8 (step of rows 0 and 0, seed 8, key 0x3039)",
+        "member 8 (mirrored of rows 0 and 0, seed 8, key 0x3039)",
     ]
 
 
@@ -313,8 +313,8 @@ def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
     episodes, recipes = task.episodes.copy(), make_recipes(40)
     episodes["rewind"] = 8
     task = dataclasses.replace(task, policy=policy, parents=parents, episodes=episodes)
-    for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (35, Kind.COPY)):
-        recipes["kind"][first:] = kind
+    for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (30, Kind.MIRRORED), (35, Kind.COPY)):
+        recipes["kind"][first : first + 5] = kind
     outcome = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes)
     whole, rewound, _, seconds = Worker().evaluate(task, maps, recipes)
     assert outcome.results.tobytes() == whole.tobytes()

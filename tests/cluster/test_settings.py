@@ -78,7 +78,15 @@ def test_more_generations_of_a_run_of_the_default_budget_are_not_cut_short_by_it
 def test_the_search_s_parameters_are_the_settings():
     settings = EvolveSettings(recombination="two", population=64, tournament=3, sigma=0.7, elites=2, mutation_rate=0.1)
     settings.check()
-    assert settings.search_config() == SearchConfig(64, 3, 0.7, 2, 0.1)
+    assert settings.search_config() == SearchConfig(64, 4, 3, 0.7, 2, 0.1)
+
+
+@pytest.mark.parametrize(("population", "groups"), [(4, 1), (31, 1), (32, 2), (127, 7), (1000, 8)])
+def test_there_are_no_more_groups_than_members_for_them(population, groups):
+    """The best of a group's members are to be good."""
+    settings = EvolveSettings(population=population)
+    settings.check()
+    assert settings.curriculum().groups == settings.search_config().groups == groups
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from cluster.training.evolution import Evolution
 from cluster.training.trainer import Champion, Maps
 from cluster.workers.pool import PoolError, SerialPool
 from evolution.episodes.rollout import targets
+from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import Kind, breed
 from evolution.search.recombination import Recombination
@@ -117,6 +118,7 @@ def test_a_search_is_what_was_asked_for(maps):
     for settings in (SETTINGS, TWO, RANDOM):
         evolution = begin(maps, settings)
         assert evolution.search.config == settings.search_config()
+        assert len(evolution.search.ask().groups) == evolution.curriculum.config.groups == 2
         assert evolution.search.seed == settings.seed
 
 
@@ -139,8 +141,8 @@ class Watching(SerialPool):
 
 @pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
 @pytest.mark.parametrize("after", [0, 1, 2])
-def test_members_results_are_those_of_each_driving_alone(maps, settings, after):
-    """Also with leader and candidate beside them."""
+def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(maps, settings, after):
+    """Also with leader and candidate beside them: results are those of each driving alone."""
     evolution = begin(maps, dataclasses.replace(settings, population=50))
     for _ in range(after):
         go_on(evolution)
@@ -154,13 +156,23 @@ def test_members_results_are_those_of_each_driving_alone(maps, settings, after):
     episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
     row = evolution.step()
     recipes, outcome = pool.seen
-    e = len(episodes.rows)
-    assert e == config.starts + (after == 2) * config.crash_starts  # the first generation has no leader
+    asked = evolution.search.asked
+    groups, e = asked.groups, len(episodes.rows) // len(asked.groups)
+    assert len(groups) == config.groups == 3
+    assert e == config.starts + (after == 2) * config.crash_starts  # nobody led the first
+    fresh = [row for k, row in enumerate(episodes.rows) if k % e < config.starts]  # crashes are drawn with repetition
+    assert len({row.tobytes() for row in fresh}) == len(fresh) == config.starts * len(groups)
     genomes = evolution.search.genomes(np.arange(50))
-    alone = evolution.drive("alone", genomes, episodes, limits)
-    assert alone.results.tobytes() == outcome.results[:50, :e].tobytes()
-    score = evolution._score(alone.results, targets(episodes.rows, limits))
+    score = np.zeros(50)
+    for g, group in enumerate(groups):
+        own = Episodes(episodes.maps, episodes.rows[g * e : g * e + e], episodes.worlds[g * e : g * e + e])
+        alone = evolution.drive("alone", genomes[group], own, limits)
+        assert alone.results.tobytes() == outcome.results[group, g * e : g * e + e].tobytes()
+        score[group] = evolution._score(alone.results, targets(own.rows, limits))
     assert told["score"].tobytes() == score.tobytes()
+    others = np.ones(len(episodes.rows), dtype=bool)
+    others[:e] = False
+    assert not outcome.results[groups[0], : len(episodes.rows)][:, others]["steps"].any()  # nor anybody else's
     if leader is None:
         assert len(recipes) == 50
         assert evolution.elites[after].tobytes() == genomes[score.argmax()].tobytes()

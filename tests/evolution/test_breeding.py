@@ -30,7 +30,7 @@ def many(kind, a, b, n, first_seed=0):
 def everything():
     """Children of every kind."""
     return np.concatenate([
-        many(Kind.CROSS, 1, 2, 12), many(Kind.NEW, 0, 0, 4), many(Kind.STEP, 3, 0, 10),
+        many(Kind.CROSS, 1, 2, 12), many(Kind.NEW, 0, 0, 4), many(Kind.STEP, 3, 0, 5), many(Kind.MIRRORED, 3, 0, 5),
         many(Kind.COPY, 0, 0, 2),
     ])  # fmt: skip
 
@@ -83,9 +83,11 @@ def test_a_step_is_the_centre_and_its_seed_s_noise_at_the_scale_of_each_gene(spe
     made["seed"] = rng.integers(1 << 32, size=30)
     weights[[3, 5]] = 0.0
     z = breed(np.zeros_like(centre), made, 99, spec, Mutation(sigma=1.0)).astype(float)
+    assert is_normal((z / gene_scales(spec))[:, symmetry(spec).free])
     np.testing.assert_allclose(breed(centre, made, 99, spec, Mutation(sigma=0.25)), centre + 0.25 * z, atol=1e-6)
     np.testing.assert_allclose(noise_sum(made["seed"], weights, 99, spec), weights @ z, atol=3e-5)
-    assert is_normal((z / gene_scales(spec))[:, symmetry(spec).free])
+    made["kind"] = Kind.MIRRORED
+    np.testing.assert_allclose(breed(centre, made, 99, spec, Mutation(sigma=0.25)), centre - 0.25 * z, atol=1e-6)
 
 
 def test_a_child_of_two_has_each_gene_of_one_of_both(parents):
@@ -123,13 +125,13 @@ def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data)
     assert breed(parents, made[chosen], key, SPEC, Mutation(rate=0.1)).tobytes() == whole[chosen].tobytes()
 
 
-@pytest.mark.parametrize("row", [(4, 5, 0, 1), (2, 0, 5, 1), (0, 5, 5, 0), (2, 65_534, 0, 1), (1, 5, 0, 1)])
+@pytest.mark.parametrize("row", [(4, 5, 0, 1), (2, 0, 5, 1), (0, 5, 5, 0), (3, 65_534, 0, 1), (1, 5, 0, 1)])
 def test_a_parent_that_is_not_there_is_refused(parents, row):
     with pytest.raises(ValueError, match="beyond the 5 there are"):
         breed(parents, recipes((0, 0, 0, 1), row), 1, SPEC, STILL)
 
 
-@pytest.mark.parametrize("kind", [Kind.COPY, Kind.STEP, Kind.CROSS])
+@pytest.mark.parametrize("kind", [Kind.COPY, Kind.STEP, Kind.MIRRORED, Kind.CROSS])
 def test_without_parents_all_are_new(kind):
     with pytest.raises(ValueError, match="needs parents"):
         breed(NOBODY, recipes((1, 0, 0, 1), (kind, 0, 0, 1)), 1, SPEC, STILL)

@@ -8,7 +8,7 @@ from evolution.episodes.rollout import RESULT
 from gridsim.car.ego import End
 from gridsim.maps.scenarios import build
 
-CONFIG = CurriculumConfig(maps=3, first_maps=2, starts=6, crash_starts=6, crash_memory=10, leader_episodes=8)
+CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
 
 
 def new(config=CONFIG, traffic=2):
@@ -70,16 +70,16 @@ def test_the_task_doubles_as_the_leader_succeeds():
         assert curriculum.target == CONFIG.last_target
 
 
-def test_a_generation_has_new_starts_and_then_crash_starts():
+def test_each_group_has_as_many_new_starts_and_crashes():
     curriculum = new()
     fresh = curriculum.episodes(0)
-    assert len(fresh.rows) == 6
+    assert len(fresh.rows) == 3 * 2
     led(curriculum, 0, End.COLLISION)
     remembered = {crash["start"].tobytes() for crash in curriculum.crashes}
     episodes = curriculum.episodes(1)
-    assert len(episodes.rows) == len(episodes.worlds) == 12
+    assert len(episodes.rows) == len(episodes.worlds) == 3 * 4
     of_crash = [row["start"].tobytes() in remembered for row in episodes.rows]
-    assert of_crash == [False] * 6 + [True] * 6
+    assert of_crash == [False, False, True, True] * 3
     assert (episodes.rows["target"][of_crash] == CONFIG.crash_target).all()
     assert (episodes.rows["steps"][of_crash] > 0).all()
     assert episodes.maps == sorted(set(episodes.maps))
@@ -97,15 +97,19 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again():
     led(curriculum, 0, np.full(8, End.COLLISION))
     easy = curriculum.crashes["start"][4:, 0]
     for generation in range(1, 40):
-        starts = curriculum.episodes(generation).rows["start"][6:, 0]
-        results = np.zeros((8, 12), dtype=RESULT)  # of members, episodes
+        starts = (
+            curriculum.episodes(generation).rows["start"].reshape(3, 4, 5)[:, 2:, 0]
+        )  # of each group's crash starts
+        results = np.zeros((3, 6, 4), dtype=RESULT)  # of groups, members, episodes
         results["end"] = End.COLLISION
-        results["end"][::2, 6:] = End.SUCCESS  # half of the members avoid the hard ones
-        results["end"][:, 6:][:, np.isin(starts, easy)] = End.SUCCESS
-        curriculum.learn_from_members(generation, results)
+        results["end"][:, ::2, 2:] = End.SUCCESS  # half of the members avoid the hard ones
+        results["end"][:, :, 2:][np.broadcast_to(np.isin(starts, easy)[:, None], (3, 6, 2))] = End.SUCCESS
+        curriculum.learn_from_members(generation, list(results))
     assert curriculum.failures[:4] == pytest.approx(0.5)
     assert (curriculum.failures[4:] < 0.05).all()
-    drawn = np.concatenate([curriculum.episodes(k).rows["start"][6:, 0] for k in range(40, 90)])
+    drawn = np.concatenate(
+        [curriculum.episodes(k).rows["start"].reshape(3, 4, 5)[:, 2:, 0].ravel() for k in range(40, 90)]
+    )
     # Of 6 starts without repetition, 4 are hard ones nearly always.
     assert 0.58 < 1.0 - np.isin(drawn, easy).mean() < 0.67
     led(curriculum, 1, np.full(8, End.COLLISION))

@@ -1,11 +1,11 @@
-"""The default search: the centre, its step size, elites, and how fast it is beside CMA-ES."""
+"""The default search: the centre, mirrored pairs, elites, and how fast it is beside CMA-ES."""
 
 import numpy as np
 import pytest
 from searching import first_gene, leader, told
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import SearchConfig, tournament_weights
+from evolution.search.base import SearchConfig, ranks, tournament_weights
 from evolution.search.breeding import Kind, Mutation, breed
 from evolution.search.recombination import Recombination
 
@@ -23,8 +23,13 @@ def begun(config, seed=1, spec=SPEC, genome=None):
     return search
 
 
+def snapshot(search):
+    arrays, numbers = search.state()
+    return {name: array.tobytes() for name, array in arrays.items()}, numbers
+
+
 def test_the_first_centre_is_the_best_of_a_random_generation():
-    search = Recombination(SPEC, SearchConfig(population=40), seed=1)
+    search = Recombination(SPEC, SearchConfig(population=40, groups=4), seed=1)
     members = told(search, first_gene)
     best = members[first_gene(members).argmax()]
     assert leader(search).tobytes() == best.tobytes()
@@ -32,7 +37,7 @@ def test_the_first_centre_is_the_best_of_a_random_generation():
 
 
 def test_the_champion_is_the_second_member_bit_for_bit():
-    search = begun(SearchConfig(population=16))
+    search = begun(SearchConfig(population=16, groups=2))
     champion = np.random.default_rng(3).normal(size=GENES).astype(F)
     champion[:2] = -0.0, 1e-42
     search.keep_champion(champion)
@@ -40,8 +45,9 @@ def test_the_champion_is_the_second_member_bit_for_bit():
     members = search.genomes(np.arange(16))
     assert members[0].tobytes() == search.centre.astype(F).tobytes()
     assert members[1].tobytes() == champion.tobytes()
-    assert asked.recipes["kind"].tolist() == [Kind.COPY] * 2 + [Kind.STEP] * 14
-    assert len(set(asked.recipes["seed"][2:].tolist())) == 14
+    assert asked.recipes["kind"].tolist() == [Kind.COPY] * 2 + [Kind.STEP, Kind.MIRRORED] * 7
+    assert asked.recipes["seed"][2:].tolist() == [k // 2 for k in range(14)]
+    assert asked.groups == [slice(0, 10), slice(10, 16)]  # which cut no pair
     search.tell(np.arange(16) == 1.0)  # who alone wins is the next centre, but for those it ties with by chance
     moved, way = search.centre - members[0], champion - members[0]
     assert moved @ way / np.linalg.norm(moved) / np.linalg.norm(way) > 0.95
@@ -49,23 +55,34 @@ def test_the_champion_is_the_second_member_bit_for_bit():
 
 @pytest.mark.parametrize("champion", [False, True])
 def test_the_centre_moves_twice_as_far_as_to_the_weighted_mean_of_the_members(champion):
-    search = begun(SearchConfig(population=40, tournament=3))
+    search = begun(SearchConfig(population=40, groups=4, tournament=3))
     if champion:
         search.champion = np.random.default_rng(4).normal(size=GENES).astype(F)
-    search.ask()
+    asked = search.ask()
     members, scores = search.genomes(np.arange(40)).astype(float), np.random.default_rng(5).random(40)
     before = search.centre
     search.tell(scores)
-    mean = tournament_weights(scores, 3) @ members
+    mean = tournament_weights(ranks(scores, asked.groups), 3) @ members
     np.testing.assert_allclose(search.centre, before + 2.0 * (mean - before), rtol=2e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize(("population", "tournament"), [(17, 8), (65, 8), (64, 2)])
-def test_where_chance_decides_sigma_does_not_drift(population, tournament):
+@pytest.mark.parametrize("population", [17, 41])
+def test_equal_scores_move_nothing(population):
+    search = begun(SearchConfig(population=population, groups=2))
+    before = snapshot(search)
+    for score in (0.0, -np.inf, np.nan):
+        told(search, lambda genomes: np.full(len(genomes), score))  # noqa: B023
+        after = snapshot(search)
+        assert all(after[0][name] == before[0][name] for name in ("centre", "path"))
+        assert after[1] == before[1]
+
+
+@pytest.mark.parametrize(("population", "groups", "tournament"), [(17, 1, 8), (65, 2, 8), (64, 4, 2)])
+def test_where_chance_decides_sigma_does_not_drift(population, groups, tournament):
     """The path is N(0, 1) in each gene; the step size does as a random walk does."""
     squares, ends = [], []
     for seed in range(24):
-        search = begun(SearchConfig(population=population, tournament=tournament), seed)
+        search = begun(SearchConfig(population=population, groups=groups, tournament=tournament), seed)
         rng = np.random.default_rng(seed)
         for _ in range(150):
             told(search, lambda genomes: rng.random(len(genomes)))  # noqa: B023
@@ -79,7 +96,7 @@ def test_where_chance_decides_sigma_does_not_drift(population, tournament):
 @pytest.mark.parametrize("axis", [True, False])
 def test_on_a_slope_sigma_grows_to_twice_its_size(axis):
     way = np.eye(GENES)[3] if axis else np.random.default_rng(2).normal(size=GENES)
-    search, sizes = begun(SearchConfig(population=33)), []
+    search, sizes = begun(SearchConfig(population=33, groups=1)), []
     for _ in range(120):
         told(search, lambda genomes: genomes @ way)
         sizes.append(search.sigma)
@@ -97,7 +114,7 @@ REFERENCE = 7_821
 def test_on_a_sphere_it_is_about_as_fast_as_cma_es(tournament):
     needed = []
     for seed in range(1, 6):
-        search = begun(SearchConfig(population=33, tournament=tournament), seed)
+        search = begun(SearchConfig(population=33, groups=1, tournament=tournament), seed)
         goal = 1e-9 * (search.centre**2).sum()
         while (search.centre**2).sum() > goal and search.generation < 1000:
             told(search, lambda genomes: -(genomes.astype(float) ** 2).sum(axis=1))
@@ -107,7 +124,7 @@ def test_on_a_sphere_it_is_about_as_fast_as_cma_es(tournament):
 
 def test_a_run_may_begin_with_a_genome():
     genome = np.random.default_rng(1).normal(size=GENES).astype(F)
-    search = Recombination(SPEC, SearchConfig(population=20, sigma=0.25), seed=12)
+    search = Recombination(SPEC, SearchConfig(population=20, groups=1, sigma=0.25), seed=12)
     search.start_from(genome)
     genome[0] += 1.0  # it is a copy
     assert leader(search)[1:].tobytes() == genome[1:].tobytes()
@@ -122,7 +139,7 @@ def test_a_run_may_begin_with_a_genome():
 
 def test_the_state_is_not_changed_by_what_comes_after():
     """It is saved while the workers are at the next generation."""
-    search = begun(SearchConfig(population=20))
+    search = begun(SearchConfig(population=20, groups=2))
     told(search, first_gene)
     arrays, _ = search.state()
     before = {name: array.copy() for name, array in arrays.items()}

@@ -1,23 +1,36 @@
-"""What searches share: tournaments in closed form, the order of ask and tell."""
+"""What searches share: ranks within groups, tournaments in closed form, groups of pairs, the order of ask and tell."""
 
 import itertools
 from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 from searching import first_gene, told
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import SearchConfig, tournament_weights, tournaments
+from evolution.search.base import SearchConfig, ranks, split, tournament_weights, tournaments
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 
 SPEC = PolicySpec.parse("mlp:1")
 SEARCHES = [Recombination, TwoParents]
 few = st.integers(0, 4)  # scores that are often equal
+
+
+@settings(max_examples=60, derandomize=True)
+@given(scores=st.lists(few | st.just(-np.inf), min_size=2, max_size=40).map(np.array), data=st.data())
+def test_a_rank_is_the_share_of_its_group_with_lower_scores_equals_by_half(scores, data):
+    cuts = sorted(data.draw(st.sets(st.integers(1, len(scores) - 1), max_size=4)))
+    groups = [slice(a, b) for a, b in itertools.pairwise([0, *cuts, len(scores)])]
+    standing = ranks(scores, groups)
+    for group in groups:
+        for own, score in zip(standing[group], scores[group], strict=True):
+            lower, equal = (scores[group] < score).sum(), (scores[group] == score).sum()
+            assert own == pytest.approx((lower + equal / 2) / len(scores[group]))
+    assert ((standing > 0.0) & (standing < 1.0)).all()
 
 
 @given(scores=st.lists(few, min_size=1, max_size=5), size=st.integers(1, 4))
@@ -44,9 +57,24 @@ def test_tournaments_are_won_at_their_weights(n, size):
     assert stats.chisquare(seen[expected > 0], expected[expected > 0]).pvalue > 1e-3
 
 
+@given(data=st.data())
+def test_pairs_stay_together_in_groups_of_about_as_many(data):
+    members = data.draw(st.integers(4, 300))
+    groups = data.draw(st.integers(1, members // 2))
+    first = data.draw(st.integers(0, 2))
+    parts = split(members, groups, first)
+    assert len(parts) == groups
+    assert [k for part in parts for k in range(part.start, part.stop)] == list(range(members))
+    for part in parts[1:]:
+        assert (part.start - first) % 2 == 0  # no pair is cut
+    sizes = np.array([part.stop - part.start for part in parts])
+    sizes[0] -= first
+    assert np.ptp((sizes + 1) // 2) <= 1
+
+
 @pytest.mark.parametrize("kind", SEARCHES)
 def test_out_of_order_raises(kind):
-    search = kind(SPEC, SearchConfig(population=40), seed=9)
+    search = kind(SPEC, SearchConfig(population=40, groups=2), seed=9)
     with pytest.raises(RuntimeError, match="without ask"):
         search.tell(np.zeros(40))
     with pytest.raises(RuntimeError, match="asked for"):
@@ -64,18 +92,19 @@ def test_out_of_order_raises(kind):
 
 
 @pytest.mark.parametrize("kind", SEARCHES)
-def test_the_first_generation_is_new(kind):
-    search = kind(SPEC, SearchConfig(population=41), seed=4)
+def test_the_first_generation_is_new_and_its_groups_cover_it(kind):
+    search = kind(SPEC, SearchConfig(population=41, groups=3), seed=4)
     assert search.leader() is None
     asked = search.ask()
     assert asked.parents.shape == (0, SPEC.size)
     assert len({genome.tobytes() for genome in search.genomes(np.arange(41))}) == 41
     assert 0 <= asked.key < 2**63
+    assert asked.groups == split(41, 3)
 
 
 @pytest.mark.parametrize("kind", SEARCHES)
 def test_each_generation_has_a_key_of_its_own(kind):
-    search, keys = kind(SPEC, SearchConfig(population=8), seed=4), []
+    search, keys = kind(SPEC, SearchConfig(population=8, groups=1), seed=4), []
     for _ in range(50):
         keys.append(search.ask().key)
         search.tell(np.arange(8.0))
@@ -88,7 +117,7 @@ def test_a_score_that_is_not_a_number_loses(kind, bad):
     """The search goes as if it were lower than all others'."""
     states = []
     for spoilt in (bad, -1e300):
-        search = kind(SPEC, SearchConfig(population=16, tournament=4), seed=6)
+        search = kind(SPEC, SearchConfig(population=16, groups=2, tournament=4), seed=6)
         for generation in range(4):
             search.ask()
             scores = np.random.default_rng(generation).normal(size=16)
@@ -102,7 +131,7 @@ def test_a_score_that_is_not_a_number_loses(kind, bad):
 @pytest.mark.parametrize("kind", [Recombination, TwoParents, partial(TwoParents, random=True)])
 @pytest.mark.parametrize("generations", [0, 1, 4])
 def test_a_restored_search_goes_on_bit_for_bit(kind, generations):
-    search, again, other = (kind(SPEC, SearchConfig(population=20), seed=seed) for seed in (10, 10, 11))
+    search, again, other = (kind(SPEC, SearchConfig(population=20, groups=2), seed=seed) for seed in (10, 10, 11))
     for _ in range(generations):
         told(search, first_gene)
     arrays, numbers = search.state()
@@ -117,6 +146,8 @@ def test_a_restored_search_goes_on_bit_for_bit(kind, generations):
     ("wrong", "text"),
     [
         ({"population": 3}, "population must be 4 or more"),
+        ({"population": 10, "groups": 6}, "no 6 groups"),
+        ({"groups": 0}, "no 0 groups"),
         ({"tournament": 0}, "tournament"),
         ({"sigma": 0.0}, "sigma"),
         ({"sigma": np.nan}, "sigma"),

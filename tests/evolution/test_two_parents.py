@@ -5,12 +5,12 @@ import pytest
 from searching import first_gene, leader, told
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import SearchConfig
+from evolution.search.base import SearchConfig, ranks
 from evolution.search.breeding import Kind, Mutation
 from evolution.search.two_parents import PARENTS, TwoParents
 
 SPEC = PolicySpec.parse("mlp:3")
-CONFIG = SearchConfig(population=40, tournament=3, sigma=0.5, elites=4)
+CONFIG = SearchConfig(population=40, groups=1, tournament=3, sigma=0.5, elites=4)
 EVERYONE = np.arange(CONFIG.population)
 
 
@@ -30,8 +30,20 @@ def test_elites_go_on_bit_identical_best_first(random, kind):
         before = now
 
 
+def test_elites_are_the_best_of_their_groups():
+    """A group that met easier episodes has no more of them."""
+    search = TwoParents(SPEC, SearchConfig(population=40, groups=4, tournament=3, elites=8), seed=1)
+    asked = search.ask()
+    members = search.genomes(EVERYONE)
+    scores = first_gene(members) + 100.0 * np.repeat(np.arange(4), 10)
+    search.tell(scores)
+    best = np.argsort(-ranks(scores, asked.groups), kind="stable")[:8]
+    assert sorted(best // 10) == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert search.parents[:8].tobytes() == members[best].tobytes()
+
+
 def test_both_parents_come_from_the_pool():
-    search = TwoParents(SPEC, SearchConfig(population=4000, tournament=2, elites=3), seed=5)
+    search = TwoParents(SPEC, SearchConfig(population=4000, groups=1, tournament=2, elites=3), seed=5)
     told(search, first_gene)
     assert len(search.parents) == PARENTS + 3
     asked = search.ask()
@@ -43,13 +55,14 @@ def test_both_parents_come_from_the_pool():
 
 
 def test_mutation_is_as_asked_for():
-    search = TwoParents(SPEC, SearchConfig(population=8, sigma=0.7, mutation_rate=0.2, elites=1), seed=5)
+    search = TwoParents(SPEC, SearchConfig(population=8, groups=1, sigma=0.7, mutation_rate=0.2, elites=1), seed=5)
     assert search.ask().mutation == Mutation(rate=0.2, sigma=0.7)
 
 
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_who_has_no_score_is_neither_elite_nor_parent(bad):
-    search = TwoParents(SPEC, SearchConfig(population=40, tournament=20, elites=25), seed=3)
+    """Not even where all of its group is spoilt, and so equal."""
+    search = TwoParents(SPEC, SearchConfig(population=40, groups=4, tournament=20, elites=25), seed=3)
     search.ask()
     members = search.genomes(EVERYONE)
     scores = first_gene(members)
