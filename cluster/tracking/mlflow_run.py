@@ -298,11 +298,12 @@ def write_model(folder: Path, model: Model) -> None:
     module, example = model.build()
     built = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(built, ignore_errors=True)
-    with warnings.catch_warnings():
+    # In the temporary folder first: if the disk becomes full while PyTorch writes, it aborts the process.
+    with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch and MLflow cause them themselves
         mlflow.pytorch.save_model(
             module,
-            str(built),
+            f"{scratch}/model",
             input_example=example,
             signature=infer_signature(example, module(torch.from_numpy(example)).numpy()),
             serialization_format="pt2",
@@ -310,6 +311,7 @@ def write_model(folder: Path, model: Model) -> None:
             pip_requirements=[f"mlflow=={mlflow.__version__}", f"torch=={torch.__version__.partition('+')[0]}"],
             metadata={**model.tags, CHAMPION_TAG: model.champion_sha256},
         )
+        shutil.copytree(f"{scratch}/model", built)
     shutil.rmtree(folder, ignore_errors=True)
     built.rename(folder)
 
