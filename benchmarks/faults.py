@@ -206,7 +206,8 @@ class Campaign:
                     FAULTS[fault](self, process)
             if process.returncode == 0:
                 break
-            if process.returncode not in (-signal.SIGKILL, 130, 1) or "Traceback" in self.said():
+            refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
+            if "Traceback" in self.said() or not (refused or process.returncode in (-signal.SIGKILL, 130, 1)):
                 raise Wrong(f"{name} ends with {process.returncode}: {self.last_words()}")
         if "not logged to MLflow" in self.said() and self.start("--resume", f"runs/{name}").wait(LONG_S):
             raise Wrong(f"{name} cannot be sent later: {self.last_words()}")
