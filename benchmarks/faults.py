@@ -178,9 +178,14 @@ class Campaign:
             raise Wrong(f"the undisturbed run fails: {self.last_words()}")
         self._check("undisturbed")
 
-    def run(self, number: int, faults: int) -> int:
-        """One run to its end, with faults until there were so many in all. Returns how many there were now."""
-        name, begun, happened = f"run-{number}", 0, 0
+    @property
+    def happened(self) -> int:
+        """Faults so far."""
+        return sum(self.counts.values())
+
+    def run(self, number: int, faults: int) -> None:
+        """One run to its end, with faults until there were so many in all."""
+        name, begun = f"run-{number}", 0
         uri = f"http://127.0.0.1:{self.gate.port}"
         resumable = self.disk / "runs" / name / "checkpoint.npz"
         while True:
@@ -188,7 +193,7 @@ class Campaign:
                 process = self.start("--workers", "2", "--patience", str(PATIENCE_S), "--resume", f"runs/{name}")
             else:
                 begun += 1
-                name = f"run-{number}-{begun}"  # one that was killed early keeps its name
+                name = f"run-{number}-{begun}"  # a run killed before its first checkpoint keeps the name
                 resumable = self.disk / "runs" / name / "checkpoint.npz"
                 flags = ("--patience", str(PATIENCE_S), "--name", name, "--tracking-uri", uri)
                 process = self.start("--workers", "2", *flags, *SMALL)
@@ -199,10 +204,9 @@ class Campaign:
                 if time.monotonic() > ends:
                     os.killpg(process.pid, signal.SIGKILL)
                     raise Wrong(f"{name} hangs; it last said: {self.last_words()}")
-                if process.poll() is None and sum(self.counts.values()) < faults:
+                if process.poll() is None and self.happened < faults:
                     fault = self.rng.choice(self.faults)
                     self.counts[fault] += 1
-                    happened += 1
                     FAULTS[fault](self, process)
             if process.returncode == 0:
                 break
@@ -215,7 +219,6 @@ class Campaign:
         shutil.rmtree(self.disk / "runs" / name)
         (self._folder / "said.log").write_text("")
         self.finished += 1
-        return happened
 
     def said(self) -> str:
         """What the commands of this run wrote to the terminal's error stream."""
@@ -360,18 +363,19 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the faults and their moments (0)")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # inherited by the runs, which a shell's job ignores
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # runs inherit it; jobs in a shell's background ignore it
     folder = Path(tempfile.mkdtemp(prefix="gsf", dir="/tmp"))  # Ray's sockets need a short path
-    campaign, wrong, happened, runs = Campaign(folder, options.seed), "", 0, 0
+    campaign, wrong = Campaign(folder, options.seed), ""
     begun = time.monotonic()
     try:
         campaign.undisturbed()
-        while happened < options.faults:
-            happened += campaign.run(runs, options.faults)
-            runs += 1
+        while campaign.happened < options.faults:
+            campaign.run(campaign.finished, options.faults)
             if not options.json:
+                seconds = time.monotonic() - begun
                 print(
-                    f"{happened} of {options.faults} faults, {runs} runs, {time.monotonic() - begun:.0f} s", flush=True
+                    f"{campaign.happened} of {options.faults} faults, {campaign.finished} runs, {seconds:.0f} s",
+                    flush=True,
                 )
     except Wrong as error:
         wrong = str(error)
@@ -381,7 +385,7 @@ def main() -> int:
         left = campaign.leftovers()
         campaign.close()
     figures = {
-        "faults": sum(campaign.counts.values()),
+        "faults": campaign.happened,
         "runs": campaign.finished,
         "champions": len(campaign.champions),
         "seconds": round(time.monotonic() - begun),
