@@ -125,7 +125,7 @@ def look(road, constants, fan, car, world, ranges, closing):
     """
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
-    sense(road, fan, constants.ray_first, constants.ray_range, x, y, car[COS], car[SIN], ranges)
+    sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
     if world is not None:
         velocity = (_ZERO, _ZERO)
         if closing is not None:

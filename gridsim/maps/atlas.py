@@ -16,11 +16,9 @@ class Atlas(NamedTuple):
     """Concatenated maps; all arrays read-only and C-contiguous."""
 
     field: np.ndarray  # `Road.field` of all maps
-    start_row: np.ndarray  # `Road.start_row` of all maps
-    start: np.ndarray  # `Road.start` of all maps
-    bounds: np.ndarray  # int64 [maps + 1, 3], where each map begins in these three arrays
-    sides: np.ndarray  # uint32 [maps, 3], columns, rows and `Road.thin`
-    sizes: np.ndarray  # float32 [maps, 4], width and height (m), lower and upper speed (m/s)
+    bounds: np.ndarray  # int64 [maps + 1, 1], where each map begins in it
+    sides: np.ndarray  # uint32 [maps, 2], columns and rows
+    sizes: np.ndarray  # float32 [maps, 5], width and height (m), lower and upper speed (m/s), thinnest wall (m)
     lanes: Network  # the arrays of all maps' networks
     lane_bounds: np.ndarray  # int64 [maps + 1, 3], where each map's points, lanes and crossings begin
 
@@ -33,16 +31,14 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
         columns = {name: [getattr(network, name) for network in networks] for name in names}
         together = {name: freeze(np.concatenate(arrays)) for name, arrays in columns.items()}
         lanes = Network(**together, width=lanes.width, height=lanes.height)
-    parts = [(road.field, road.start_row, road.start) for road in roads]
-    arrays = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
-    field, start_row, start = (freeze(array) for array in arrays)
+    fields = [road.field for road in roads]
     return Atlas(
-        field=field,
-        start_row=start_row,
-        start=start,
-        bounds=_bounds(parts),
-        sides=freeze(np.array([[r.columns, r.rows, r.thin] for r in roads], dtype=np.uint32)),
-        sizes=freeze(np.array([[r.width, r.height, r.speed_low, r.speed_high] for r in roads], dtype=np.float32)),
+        field=fields[0] if len(fields) == 1 else freeze(np.concatenate(fields)),
+        bounds=_bounds([(field,) for field in fields]),
+        sides=freeze(np.array([[r.columns, r.rows] for r in roads], dtype=np.uint32)),
+        sizes=freeze(
+            np.array([[r.width, r.height, r.speed_low, r.speed_high, r.thinnest] for r in roads], dtype=np.float32)
+        ),
         lanes=lanes,
         lane_bounds=_bounds([(network.points, network.steps, network.crossings) for network in networks]),
     )
@@ -60,15 +56,13 @@ def road_of(atlas: Atlas, m: int) -> Road:
     here, there = atlas.bounds[m], atlas.bounds[m + 1]
     return Road(
         atlas.field[here[0] : there[0]],
-        atlas.start_row[here[1] : there[1]],
-        atlas.start[here[2] : there[2]],
         atlas.sides[m, 0],
         atlas.sides[m, 1],
         atlas.sizes[m, 0],
         atlas.sizes[m, 1],
         atlas.sizes[m, 2],
         atlas.sizes[m, 3],
-        atlas.sides[m, 2],
+        atlas.sizes[m, 4],
     )
 
 

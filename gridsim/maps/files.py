@@ -31,17 +31,8 @@ from gridsim.errors import GridSimError
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.raster import OUTSIDE, check_starts, find_starts, road_length, signed_clearance
-from gridsim.maps.roads import (
-    CELLS_PER_M,
-    HEADING_BINS,
-    HEADING_WRAP,
-    START_CELLS_PER_M,
-    Strips,
-    freeze,
-    make_road,
-    power_of_two,
-)
+from gridsim.maps.raster import HALF_WALL, OUTSIDE, check_starts, find_starts, road_length, signed_clearance
+from gridsim.maps.roads import CELLS_PER_M, Strips, freeze, make_road, power_of_two
 
 PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -54,7 +45,6 @@ MAX_YAML = 1 << 16  # bytes
 MAX_IMAGE = 1 << 27  # bytes
 MAX_PIXELS = 1 << 26
 MAX_NODES = 1 << 24  # of the field
-MAX_TABLE = 1 << 28  # bytes of the table of start ranges
 RESOLUTION = (0.01, 1.0)  # m a pixel, from, to
 SHORTEST_SIDE = 16  # m
 MOST_BORDER = 0.5  # share of road on a picture's border from which the picture is taken to be inverted
@@ -321,9 +311,6 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
     try:
         columns, rows = _sides(free, file)
         nodes = signed_clearance(free, file.resolution, columns, rows)
-        area = np.count_nonzero(nodes > 0.0) / CELLS_PER_M**2
-        if area * START_CELLS_PER_M**2 * (HEADING_BINS + HEADING_WRAP) > MAX_TABLE:
-            raise ValueError(f"{area:,.0f} square metres of road are too much; check the resolution, or crop it")
         if file.starts:
             poses = np.array(file.starts) - [*file.origin, 0.0]
             check_starts(nodes, poses, config.vehicle)
@@ -339,7 +326,7 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
     return Map(
         name=name,
         seed=0,
-        road=make_road(nodes, file.speed, config.sensors.range),
+        road=make_road(nodes, file.speed, 2.0 * HALF_WALL),
         lanes=lanes,
         strips=Strips.of(),
         network=make_network(lanes, width, height, 0.0, config),

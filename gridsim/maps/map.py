@@ -13,7 +13,7 @@ from gridsim.config import START_SPEED, SimConfig
 from gridsim.jit import njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network, make_network
-from gridsim.maps.roads import CELLS_PER_M, HEADING_BINS, HEADING_WRAP, START_CELLS_PER_M, Lanes, Road, Strips, freeze
+from gridsim.maps.roads import CELLS_PER_M, THICK_WALL, Lanes, Road, Strips, freeze
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,13 @@ def blank(config: SimConfig) -> Map:
     nodes, f = np.uint32(side * CELLS_PER_M), np.float32
     road = Road(
         field=freeze(np.zeros(nodes * nodes, dtype=np.uint32)),
-        start_row=freeze(np.full((side * START_CELLS_PER_M) ** 2, -1, dtype=np.int32)),
-        start=freeze(np.zeros(HEADING_BINS + HEADING_WRAP, dtype=np.uint8)),
         columns=nodes,
         rows=nodes,
         width=f(side),
         height=f(side),
         speed_low=f(0.0),
         speed_high=f(1.0),
+        thinnest=f(THICK_WALL),
     )
     return Map("blank", 0, road, lanes, Strips.of(), make_network(lanes, side, side, 1.0, config))
 

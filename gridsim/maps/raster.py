@@ -14,8 +14,8 @@ from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
 
 OUTSIDE = -FIELD_FLOOR  # m of wall around the road, at least, so that it does not wrap round the field's sides
 _FINE = 0.25  # m, largest pixels on which distances are measured; larger ones are subdivided
-_WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
-_TIP = 0.25  # m that a corner may extend beyond a disc of radius _WALL without being a thin wall
+HALF_WALL = 0.4  # m, half the thickness of the thinnest wall; above 0.36 m, no speck fits between four nodes
+_TIP = 0.25  # m that a corner may extend beyond a disc of radius HALF_WALL without being a thin wall
 _DEEPEST = 255 / FIELD_UNITS + FIELD_FLOOR  # m, the largest clearance that the field holds
 _HALO = _DEEPEST + 2.0  # m around a tile that can influence it
 _TILE = 128  # nodes
@@ -35,18 +35,18 @@ _BACK = np.array([0.0, 0.0, math.pi])
 def _thickened(free: np.ndarray, depth: np.ndarray, pixel: float) -> np.ndarray | None:
     """The road after thin walls are thickened, so that the nodes of the field do not miss them.
 
-    A wall is thin where no disc of radius _WALL fits into it; such a disc is put on each point of its middle line.
+    A wall is thin where no disc of radius HALF_WALL fits into it; such a disc is put on each point of its middle line.
     `depth` is the distance (m) of a wall's pixels to the road. None if there is no thin wall.
     """
-    middle = ~free & (depth < _WALL) & (depth >= ndimage.maximum_filter(depth, size=3))
+    middle = ~free & (depth < HALF_WALL) & (depth >= ndimage.maximum_filter(depth, size=3))
     if not middle.any():
         return None
-    thick = depth >= _WALL
+    thick = depth >= HALF_WALL
     if thick.any():
-        middle &= ndimage.distance_transform_edt(~thick) * pixel > _WALL + _TIP
+        middle &= ndimage.distance_transform_edt(~thick) * pixel > HALF_WALL + _TIP
         if not middle.any():
             return None
-    return free & (ndimage.distance_transform_edt(~middle) * pixel > _WALL)
+    return free & (ndimage.distance_transform_edt(~middle) * pixel > HALF_WALL)
 
 
 def _signed(free: np.ndarray, pixel: float) -> np.ndarray:

@@ -21,30 +21,23 @@ from gridsim.jit import leaf, njit
 CELLS_PER_M = 2  # nodes of the clearance field per metre
 FIELD_FLOOR = -2.0  # m, clearance of byte 0, also of places deeper inside a wall
 FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
-HEADING_BINS = 90  # bins of heading in the ray start table, 4 degrees each
-HEADING_WRAP = 64  # bins repeated after the last, so that a fan of rays needs no wrapping
-START_UNITS = 4.0  # steps of a start range byte per metre
-START_CELLS_PER_M = 1  # cells of the ray start table per metre
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
-THIN_WALL = 3.0  # m; a plain ray may miss walls that are thinner
+THICK_WALL = 3.0  # m; among walls of this thickness or more, rays need no checks
 
 _F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
-_SIMD_CONES = 64  # cones of the ray start table that are marched in lockstep
 
 
 class Road(NamedTuple):
     """A map as kernels read it; all arrays flat, read-only and C-contiguous. Sides are powers of two."""
 
     field: np.ndarray  # uint32 [rows * columns], bytes of the four corners: (0,0), (1,0), (0,1), (1,1) in (x, y)
-    start_row: np.ndarray  # int32 [cells of 1 m], row of `start`, or -1 off the road
-    start: np.ndarray  # uint8 [rows * (HEADING_BINS + HEADING_WRAP)], lower bound of the range of rays from here
     columns: np.uint32  # nodes along x
     rows: np.uint32  # nodes along y
     width: np.float32  # m along x
     height: np.float32  # m along y
     speed_low: np.float32  # m/s, the speed interval
     speed_high: np.float32  # m/s
-    thin: np.uint32 = _U(1)  # 1 if walls may be thinner than THIN_WALL; then steps of rays are checked
+    thinnest: np.float32  # m; no ray passes a wall that is at least as thick as this
 
 
 class _Arrays:
@@ -189,76 +182,6 @@ def node_clearance(road: Road) -> np.ndarray:
     return units.astype(np.float32) / _F(FIELD_UNITS) + _F(FIELD_FLOOR)
 
 
-def _rows_on_road(nodes: np.ndarray) -> np.ndarray:
-    """For each 1 m cell, its row in the ray start table if a node in it or on its edge is on the road, else -1."""
-    k = CELLS_PER_M // START_CELLS_PER_M
-    road = nodes > 0.0
-    for axis in (0, 1):
-        road = np.logical_or.reduce([np.roll(road, -i, axis=axis) for i in range(k + 1)])
-    cells = road[::k, ::k].ravel()
-    return np.where(cells, np.cumsum(cells) - 1, -1).astype(np.int32)
-
-
-@njit(nogil=True, fastmath=False)
-def _ray_starts(nodes, row_of, ray_range):
-    """The ray start table: for each 1 m cell on the road and each bin of 4 degrees, a lower bound of all rays' ranges.
-
-    A cone that contains every ray of the cell and bin is marched through the field until it may touch an edge. Compiled
-    without fast math, so that every machine computes the same table.
-    Returns: ranges as bytes [table's rows, HEADING_BINS].
-    """
-    k, scale = CELLS_PER_M // START_CELLS_PER_M, _F(CELLS_PER_M)
-    columns, flat = _I(nodes.shape[1]), nodes.reshape(-1)
-    mask_x, mask_y = _I(nodes.shape[1] - 1), _I(nodes.shape[0] - 1)
-    radius = _F(0.5 * math.sqrt(2.0) * (1.0 / START_CELLS_PER_M + 1.0 / CELLS_PER_M) + 0.02)
-    spread = _F(math.sin(math.pi / HEADING_BINS) * 1.02)
-    margin = _F(0.2)  # m; the march ends below it
-    # Whole turns of the torus are added, so that positions are positive and truncation rounds down.
-    turn_x = _F(columns * math.ceil(ray_range * CELLS_PER_M / columns) + 0.5)
-    turn_y = _F(nodes.shape[0] * math.ceil(ray_range * CELLS_PER_M / nodes.shape[0]) + 0.5)
-    cells = np.flatnonzero(row_of >= 0)
-    count, across = len(cells), nodes.shape[1] // k
-    x, y = np.zeros(count + _SIMD_CONES, dtype=np.float32), np.zeros(count + _SIMD_CONES, dtype=np.float32)
-    for row in range(count):
-        x[row] = _F((cells[row] % across + 0.5) * k) + turn_x
-        y[row] = _F((cells[row] // across + 0.5) * k) + turn_y
-    ranges = np.empty((count, HEADING_BINS), dtype=np.uint8)
-    first, t = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.float32)
-    free, at = np.empty(_SIMD_CONES, dtype=np.float32), np.empty(_SIMD_CONES, dtype=np.uint32)
-    # Cones of neighbouring cells in one direction are about equally long. They are marched in lockstep, by loops that
-    # are vectorised except the one that reads the field; finished cones do not move.
-    lanes = _N(_SIMD_CONES)
-    for block in range(0, count, _SIMD_CONES):
-        here, any_free = _N(block), _I(0)
-        for r in range(lanes):  # the first step is the same in all directions
-            at[r] = (_I(y[here + r]) & mask_y) * columns + (_I(x[here + r]) & mask_x)
-        for r in range(lanes):
-            room = flat[at[r]] - radius
-            first[r] = room if room > margin else _F(0.0)
-            any_free |= _I(room > margin)
-        for b in range(HEADING_BINS):
-            angle = (b + 0.5) * 2.0 * math.pi / HEADING_BINS
-            c, s = _F(math.cos(angle)) * scale, _F(math.sin(angle)) * scale
-            t[:] = first
-            going = any_free
-            while going:
-                # The nearest node is at most 0.36 m away, and clearance changes no faster than distance.
-                for r in range(lanes):
-                    column, line = _I(x[here + r] + t[r] * c) & mask_x, _I(y[here + r] + t[r] * s) & mask_y
-                    at[r] = line * columns + column
-                for r in range(lanes):
-                    free[r] = flat[at[r]]
-                going = _I(0)
-                for r in range(lanes):
-                    room = free[r] - radius - spread * t[r]
-                    goes = (room > margin) & (t[r] < ray_range)
-                    t[r] += room if goes else _F(0.0)
-                    going |= _I(goes)
-            for r in range(min(_SIMD_CONES, count - block)):
-                ranges[block + r, b] = np.uint8(min(t[r], ray_range) * _F(START_UNITS))
-    return ranges
-
-
 @leaf
 def clearance(road, x, y):
     """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, also outside the torus."""
@@ -312,20 +235,16 @@ def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
     return nodes
 
 
-def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], ray_range: float, thin: bool = True) -> Road:
-    """The Road of a clearance field (m) [rows, columns]; thin: whether walls may be thinner than THIN_WALL."""
+def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float) -> Road:
+    """The Road of a clearance field (m) [rows, columns]; thinnest: of its walls, m."""
     rows, columns = nodes.shape
-    start_row = _rows_on_road(nodes)
-    start = _ray_starts(nodes, start_row, _F(ray_range))
     return Road(
         field=pack_field(nodes),
-        start_row=freeze(start_row),
-        start=freeze(np.concatenate([start, start[:, :HEADING_WRAP]], axis=1).ravel()),
         columns=np.uint32(columns),
         rows=np.uint32(rows),
         width=_F(columns / CELLS_PER_M),
         height=_F(rows / CELLS_PER_M),
         speed_low=_F(speed_interval[0]),
         speed_high=_F(speed_interval[1]),
-        thin=_U(thin),
+        thinnest=_F(thinnest),
     )

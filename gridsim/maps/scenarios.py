@@ -19,7 +19,7 @@ from gridsim.maps.generators.roundabout import roundabout_layout
 from gridsim.maps.generators.seamless import seamless_layout
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.roads import Lanes, Strips, clearance_nodes, clearances, make_road
+from gridsim.maps.roads import THICK_WALL, Lanes, Strips, clearance_nodes, clearances, make_road
 
 TRAINING_SEED = 0  # first seed of the training maps
 VALIDATION_SEED = 1_000_000  # ... of the maps on which the champion is chosen
@@ -32,16 +32,16 @@ class Scenario:
 
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int  # default number of other cars
-    thin_walls: bool  # whether there are walls thinner than `roads.THIN_WALL`
+    thinnest: float  # m, of its walls and parked cars
     layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
 
 
 REGISTRY: dict[str, Scenario] = {
-    "highway": Scenario((15.0, 25.0), 8, False, highway_layout),
-    "curved": Scenario((6.0, 15.0), 0, False, curved_layout),
-    "seamless": Scenario((5.0, 12.0), 0, False, seamless_layout),
-    "roundabout": Scenario((5.0, 10.0), 4, True, roundabout_layout),
-    "city": Scenario((3.0, 10.0), 6, True, city_layout),
+    "highway": Scenario((15.0, 25.0), 8, THICK_WALL, highway_layout),
+    "curved": Scenario((6.0, 15.0), 0, THICK_WALL, curved_layout),
+    "seamless": Scenario((5.0, 12.0), 0, THICK_WALL, seamless_layout),
+    "roundabout": Scenario((5.0, 10.0), 4, 1.0, roundabout_layout),
+    "city": Scenario((3.0, 10.0), 6, 1.0, city_layout),
 }
 
 
@@ -94,7 +94,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
     strips, lanes, width, height = spec.layout(rng)
     nodes = clearance_nodes(strips, width, height)
-    road = make_road(nodes, spec.speed_interval, config.sensors.range, spec.thin_walls)
+    road = make_road(nodes, spec.speed_interval, spec.thinnest)
     top = TRAFFIC_PACE * sum(spec.speed_interval)
     network = make_network(lanes, width, height, top, config, partial(clearances, road))
     return Map(name, seed, road, lanes, strips, network)

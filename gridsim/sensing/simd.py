@@ -26,30 +26,23 @@ _NEAR = _F(2.0)  # m of clearance below which Newton steps are taken
 _STRETCH = _F(1.5)  # length of a step above it, in clearances
 _CLOSE = _F(0.04)  # m of clearance at which a ray has arrived
 _SLOPE_MIN = _F(0.1)  # a Newton step is at most ten times the clearance, and at most a stretched step plus a leap
-_GAP = _F(0.95)  # m of a step that may be blind, among thin walls
-# How to march without and with thin walls: maximum number of steps, leap in m (too short to jump over an island),
-# whether steps are checked for blind parts. PLAIN may pass walls of less than 3 m.
-PLAIN = (16, _F(2.0), False)
-AMONG_THIN_WALLS = (24, _F(0.9), True)
+LEAP = _F(2.0)  # m by which a step may be longer than a stretched one, too short to jump over an island
+MARGIN = _F(0.1)  # m; among thin walls, leaps and blind parts are that much shorter than a wall is thick
 
 
-def vector_march(how: tuple[int, np.float32, bool]) -> Any:
-    """Build the intrinsic that moves each of SIMD_RAYS rays from its start range to the edge of the road.
+def vector_march(steps: int, look_back: bool) -> Any:
+    """Build the intrinsic that moves each of SIMD_RAYS rays to the edge of the road, in at most `steps` steps.
 
     Its arguments: packed field with its sides; origin in cells; reach m; the heading as cosine and sine; fan of
-    `rays.fan` and the index of the first ray to march; the ray start table, where in it the origin's row begins, the
-    bin of the fan's first ray, and metres per unit, or 0 if the origin has no row; ranges float32 [rays], written from
-    that ray on, in [0, reach]. It runs until the last ray has arrived. `how` is PLAIN or AMONG_THIN_WALLS. Where steps
-    are not checked for blind parts, no code for that is emitted.
+    `rays.fan` and the index of the first ray to march; the leap m; ranges float32 [rays], written from that ray on, in
+    [0, reach]. It runs until the last ray has arrived. With `look_back`, a ray goes back to see the blind part of a
+    step that is longer than the leap; without, no code for that is emitted, and walls thinner than 3 m may be passed.
     """
-    steps, leap, look_back = how
 
     @intrinsic
-    def march(
-        typingctx, field, columns, rows, px0, py0, reach, cosine, sine, fan, ray, start, row_at, bin0, unit, ranges
-    ):  # fmt: skip
+    def march(typingctx, field, columns, rows, px0, py0, reach, cosine, sine, fan, ray, leap, ranges):
         f, u, n = types.float32, types.uint32, types.int64
-        signature = types.void(field, u, u, f, f, f, f, f, fan, n, start, n, f, f, ranges)
+        signature = types.void(field, u, u, f, f, f, f, f, fan, n, f, ranges)
 
         def codegen(context, builder, sig, args):
             f32, i32 = ir.FloatType(), ir.IntType(32)
@@ -100,7 +93,7 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
                 builder.module, ir.FunctionType(vf, [vf]), f"llvm.floor.v{SIMD_RAYS}f32"
             )
 
-            fan, ray = array(8), args[9]
+            fan, ray, leap = array(8), args[9], splat(args[10], vf)
             lanes_in_fan = cgutils.unpack_tuple(builder, fan.shape)[1]
 
             def of_fan(k: int) -> ir.Value:
@@ -111,11 +104,42 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
             dx = sub(mul(cosine, of_fan(0)), mul(sine, of_fan(1)))
             dy = add(mul(sine, of_fan(0)), mul(cosine, of_fan(1)))
             sx, sy = mul(dx, const(_SCALE)), mul(dy, const(_SCALE))
-            bins = builder.fptosi(add(splat(args[12], vf), of_fan(2)), vi)
-            row_data = builder.gep(array(10).data, [args[11]])
-            bounds = gather(row_data, bins, ir.VectorType(ir.IntType(8), SIMD_RAYS))
-            first = mul(builder.uitofp(bounds, vf), splat(args[13], vf))
 
+            def look(t: ir.Value | None) -> tuple[ir.Value, ir.Value]:
+                """Clearances and next steps (m) at ranges `t`, or at the origin, where all rays read the same word."""
+                px, py = (x0, y0) if t is None else (add(x0, mul(t, sx)), add(y0, mul(t, sy)))
+                fx, fy = builder.call(floor_of, [px]), builder.call(floor_of, [py])
+                ux, uy = sub(px, fx), sub(py, fy)
+                column = builder.and_(builder.fptosi(fx, vi), mask_x)
+                row = builder.and_(builder.fptosi(fy, vi), mask_y)
+                index = builder.add(builder.mul(row, columns_v), column)
+                if t is None:
+                    at = builder.zext(builder.extract_element(index, ir.Constant(i32, 0)), ir.IntType(64))
+                    word = splat(builder.load(builder.gep(field_data, [at])), vi)
+                else:
+                    word = gather(field_data, index, vi)
+
+                def byte(shift: int) -> ir.Value:
+                    part = builder.lshr(word, ir.Constant(vi, [shift] * SIMD_RAYS))
+                    return builder.sitofp(builder.and_(part, ir.Constant(vi, [255] * SIMD_RAYS)), vf)
+
+                q00, q10, q01, q11 = byte(0), byte(8), byte(16), byte(24)
+                rise_low, rise_high = sub(q10, q00), sub(q11, q01)
+                low, high = add(q00, mul(ux, rise_low)), add(q01, mul(ux, rise_high))
+                across = sub(high, low)
+                clear = add(mul(add(low, mul(uy, across)), const(_UNIT)), const(_FLOOR))
+                along = add(mul(dx, add(rise_low, mul(uy, sub(rise_high, rise_low)))), mul(dy, across))
+                slope = mul(along, const(-_SLOPE))
+                slope = least(most(slope, const(_SLOPE_MIN)), const(1.0))
+                wide = builder.fcmp_ordered(">", clear, const(_NEAR))
+                stretched = mul(clear, const(_STRETCH))
+                newton = builder.fdiv(clear, slope, flags=flags)
+                bound = most(add(stretched, leap), leap)
+                step = builder.select(wide, stretched, least(newton, bound))
+                return clear, step
+
+            here, first = look(None)
+            first, free_at_first = least(most(first, const(0.0)), limit), most(here, const(0.0))
             before = builder.block
             loop, done = builder.append_basic_block("march"), builder.append_basic_block("marched")
             builder.branch(loop)
@@ -124,39 +148,15 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
             t, safe = builder.phi(vf), builder.phi(vf)
             k.add_incoming(ir.Constant(i32, 0), before)
             t.add_incoming(first, before)
-            safe.add_incoming(first, before)
-            px, py = add(x0, mul(t, sx)), add(y0, mul(t, sy))
-            fx, fy = builder.call(floor_of, [px]), builder.call(floor_of, [py])
-            ux, uy = sub(px, fx), sub(py, fy)
-            column = builder.and_(builder.fptosi(fx, vi), mask_x)
-            row = builder.and_(builder.fptosi(fy, vi), mask_y)
-            index = builder.add(builder.mul(row, columns_v), column)
-            word = gather(field_data, index, vi)
-
-            def byte(shift: int) -> ir.Value:
-                part = builder.lshr(word, ir.Constant(vi, [shift] * SIMD_RAYS))
-                return builder.sitofp(builder.and_(part, ir.Constant(vi, [255] * SIMD_RAYS)), vf)
-
-            q00, q10, q01, q11 = byte(0), byte(8), byte(16), byte(24)
-            rise_low, rise_high = sub(q10, q00), sub(q11, q01)
-            low, high = add(q00, mul(ux, rise_low)), add(q01, mul(ux, rise_high))
-            across = sub(high, low)
-            clear = add(mul(add(low, mul(uy, across)), const(_UNIT)), const(_FLOOR))
-            along = add(mul(dx, add(rise_low, mul(uy, sub(rise_high, rise_low)))), mul(dy, across))
-            slope = mul(along, const(-_SLOPE))
-            slope = least(most(slope, const(_SLOPE_MIN)), const(1.0))
-            wide = builder.fcmp_ordered(">", clear, const(_NEAR))
-            stretched = mul(clear, const(_STRETCH))
-            newton = builder.fdiv(clear, slope, flags=flags)
-            bound = most(add(stretched, const(leap)), const(leap))
-            step = builder.select(wide, stretched, least(newton, bound))
+            safe.add_incoming(free_at_first, before)
+            clear, step = look(t)
             running = builder.fcmp_ordered("<", t, limit)
             t_next = add(t, builder.select(running, step, const(0.0)))
             size = builder.select(builder.fcmp_ordered("<", clear, const(0.0)), builder.fsub(const(0.0), clear), clear)
             active = builder.and_(running, builder.fcmp_ordered(">=", size, const(_CLOSE)))
             safe_next = safe
             if look_back:
-                seen = add(safe, const(_GAP))
+                seen = add(safe, leap)
                 blind = builder.fcmp_ordered(">", sub(t, size), seen)
                 further = add(t, clear)
                 free = builder.fcmp_ordered(">", clear, const(0.0))
@@ -174,10 +174,10 @@ def vector_march(how: tuple[int, np.float32, bool]) -> Any:
             builder.cbranch(more, loop, done)
             builder.position_at_end(done)
             if look_back:
-                t_next = least(t_next, add(safe_next, const(_GAP)))
+                t_next = least(t_next, add(safe_next, leap))
             found = cgutils.alloca_once(builder, vf)
             builder.store(least(most(t_next, const(0.0)), limit), found)
-            ranges = array(14)
+            ranges = array(11)
             left = builder.sub(cgutils.unpack_tuple(builder, ranges.shape)[0], ray)
             lanes = ir.Constant(left.type, SIMD_RAYS)
             count = builder.select(builder.icmp_signed("<", left, lanes), left, lanes)

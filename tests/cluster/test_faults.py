@@ -30,7 +30,7 @@ from gridsim.maps.map import Map
 pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 
 LONG_S = 300.0  # what takes seconds where nothing else runs
-PATIENCE_S = 25  # a host takes ten to come up
+PATIENCE_S = 45  # a host and its worker take 10 to 30 to come up
 KILLS = int(os.environ.get("GRIDSIM_KILLS", "2"))
 ROAD = ["--scenario", "curved", "--traffic", "2"]
 SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5"]

@@ -198,7 +198,7 @@ def cross():
     strips = Strips.of([[0.0, 128.0, SIDE, 128.0, 10.0], [128.0, 0.0, 128.0, SIDE, 10.0]])
     straight = ((SIDE, 0.0),)
     lanes = lay_lanes([Path(SIDE, 128.0, math.pi, straight), Path(128.0, 0.0, math.pi / 2, straight)], SIDE, SIDE)
-    road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 50.0)
+    road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 1.0)
     network = make_network(lanes, SIDE, SIDE, 30.0, CONFIG)
     return Map("cross", 0, road, lanes, strips, network)
 

@@ -161,7 +161,6 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
     assert read(scenario.road, on).max() < 0.0
     beside = on + 1.0 * np.array([-math.sin(angle), math.cos(angle)])
     assert read(scenario.road, beside).min() > 0.0
-    # From afar a ray takes long steps, and some step over a wall of less than a metre; from near none does.
     away, tilt = np.linspace(3.0, 16.0, 200), np.random.default_rng(1).uniform(-0.6, 0.6, 200)
     starts = np.zeros((200, 5), dtype=np.float32)
     starts[:, 0] = 40 + offset + away * math.sin(angle)
@@ -169,8 +168,7 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
     starts[:, 2] = angle + math.pi / 2 + tilt
     ranges, _ = Simulator([scenario], 200).reset(starts)
     error = (ranges[:, 15] + 1.25) * np.cos(tilt) - away + 0.4  # the wall is 0.8 m thick in the field
-    assert np.abs(error[away < 6.0]).max() < 0.3
-    assert (np.abs(error) > 0.3).mean() < 0.05
+    assert np.abs(error).max() < 0.3
 
 
 def test_the_outside_is_wall(tmp_path):

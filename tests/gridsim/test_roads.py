@@ -9,17 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import read, small_road
 
-from gridsim.maps.roads import (
-    CELLS_PER_M,
-    FIELD_FLOOR,
-    FIELD_UNITS,
-    HEADING_BINS,
-    START_CELLS_PER_M,
-    START_UNITS,
-    Strips,
-    clearance_nodes,
-    freeze,
-)
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, Strips, clearance_nodes, freeze
 
 SIDE = 64.0  # m, of the small maps
 CEILING = FIELD_FLOOR + 255 / FIELD_UNITS  # m, the greatest clearance a field can hold
@@ -28,11 +18,6 @@ CEILING = FIELD_FLOOR + 255 / FIELD_UNITS  # m, the greatest clearance a field c
 @pytest.fixture(scope="module")
 def scenario(maps):
     return maps["seamless"][0]
-
-
-@pytest.fixture(scope="module")
-def exact(scenario):
-    return oracle.ExactRoad(scenario.strips, float(scenario.road.width), float(scenario.road.height))
 
 
 # --- The oracle itself -----------------------------------------------------------------------------------------------
@@ -92,39 +77,6 @@ def test_the_world_is_a_torus(scenario, x, y, i, j):
 def test_sides_that_do_not_fit_are_refused(width, height):
     with pytest.raises(ValueError, match="powers of two"):
         clearance_nodes(Strips.of(), width, height)
-
-
-# --- The start table -------------------------------------------------------------------------------------------------
-
-
-def start_table(road):
-    return road.start.reshape(road.start_row.max() + 1, -1)
-
-
-def start_ranges(road, points, angles):
-    """The table's range (m) for rays from points [n, 2] at angles [n]; nan where it has no row."""
-    x, y = np.floor(points * START_CELLS_PER_M).astype(int).T
-    columns, rows = int(road.width) * START_CELLS_PER_M, int(road.height) * START_CELLS_PER_M
-    row = road.start_row[y % rows * columns + x % columns]
-    bins = (np.floor(angles * HEADING_BINS / (2 * math.pi)) % HEADING_BINS).astype(int)
-    return np.where(row >= 0, start_table(road)[row, bins] / START_UNITS, np.nan)
-
-
-@pytest.mark.parametrize("wide", [False, True])
-def test_no_start_range_exceeds_the_true_range(scenario, exact, wide):
-    rng = np.random.default_rng(5)
-    road, points = scenario.road, rng.uniform(0.0, 256.0, (40_000, 2))
-    if wide:
-        (road, exact), points = small_road(lines=[[0, 32, 64, 32, 16.0]]), points / 4
-    points = points[exact.clearance(points) > 0.0]
-    angles = rng.uniform(-math.pi, math.pi, len(points))
-    true = exact.cast(points, angles[:, None], 50.0)[:, 0]
-    start = start_ranges(road, points, angles)
-    assert not np.isnan(start).any()  # wherever a point is on the road, the table has a row
-    assert (start - true).max() < 0.05
-    # It is there to save steps: on the road's inner metres it covers most of the way.
-    inner = exact.clearance(points) > 1.0
-    assert start[inner].sum() > 0.35 * true[inner].sum()
 
 
 # --- What kernels read -----------------------------------------------------------------------------------------------

@@ -264,17 +264,16 @@ def test_the_registry_is_the_designs_table():
 
 # --- Each of them ----------------------------------------------------------------------------------------------------
 
-# Of field, start table and strips. Since the shipped champion was trained, a T junction has one strip more, and the
-# field more clearance in its middle; a few values of the start table are rounded otherwise; seed 0 had a straight
-# road round the torus and was drawn again; all else is as it was.
-SEAMLESS = {0: "8ae1a93f7f218e29", 7: "ba49f541134b2b18", 2_000_000: "4850a032321ef4e9"}
+# Of field and strips. Since the shipped champion was trained, a T junction has one strip more, and the field more
+# clearance in its middle; seed 0 had a straight road round the torus and was drawn again; all else is as it was.
+SEAMLESS = {0: "3cd0fb77519132c6", 7: "b23c0c627ab8ed64", 2_000_000: "6214ddc76ecd3133"}
 
 
 @pytest.mark.parametrize("seed", SEAMLESS)
 def test_seamless_maps_are_what_they_were(seed):
     arrays = build("seamless", seed).arrays()
     digest = hashlib.sha256()
-    for key in ("field", "start_row", "start", "lines", "arcs", "successors"):
+    for key in ("field", "lines", "arcs", "successors"):
         digest.update(arrays[key].tobytes())
     assert digest.hexdigest()[:16] == SEAMLESS[seed]
 

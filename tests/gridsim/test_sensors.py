@@ -8,7 +8,7 @@ import pytest
 from pictures import small_road
 
 from gridsim.config import SensorConfig, SimConfig, constants
-from gridsim.maps.roads import Strips, clearance_nodes, make_road
+from gridsim.maps.roads import THICK_WALL, Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
 from gridsim.sensing.rays import fan, sense
 
@@ -26,7 +26,7 @@ def look(road, points, headings, k=K, count=31):
     table = fan(count, k.ray_first, k.ray_step)
     ranges = np.full((len(points), count), np.nan, dtype=F)
     for (x, y), heading, row in zip(points, headings, ranges, strict=True):
-        sense(road, table, k.ray_first, k.ray_range, F(x), F(y), F(np.cos(heading)), F(np.sin(heading)), row)
+        sense(road, table, k.ray_range, F(x), F(y), F(np.cos(heading)), F(np.sin(heading)), row)
     return ranges
 
 
@@ -92,17 +92,18 @@ def test_the_first_ray_is_the_rightmost():
 
 
 @pytest.mark.parametrize(
-    ("half", "wall", "thin"),
+    ("half", "wall", "thinnest"),
     [
-        *((half, wall, True) for half in (3.0, 4.0, 8.0) for wall in (1.0, 1.3, 2.0)),
-        (4.0, 2.5, False),
-        (4.0, 4.0, False),
+        *((half, wall, 0.8) for half in (3.0, 4.0, 8.0) for wall in (0.8, 1.3)),
+        *((half, wall, 1.0) for half in (3.0, 4.0, 8.0) for wall in (1.0, 1.3, 2.0)),
+        (4.0, 3.0, THICK_WALL),
+        (4.0, 4.0, THICK_WALL),
     ],
 )
-def test_no_ray_passes_a_wall(half, wall, thin):
+def test_no_ray_passes_a_wall(half, wall, thinnest):
     """Two roads side by side, a wall between them: rays from one never reach the other, from wherever they start."""
     strips = [[0, 20.2, 64, 20.2, half], [0, 20.2 + 2 * half + wall, 64, 20.2 + 2 * half + wall, half]]
-    road = small_road(strips)[0]._replace(thin=np.uint32(thin))
+    road = small_road(strips)[0]._replace(thinnest=F(thinnest))
     rng = np.random.default_rng(3)
     points = np.stack([rng.uniform(0, 64, 1000), 20.2 + (half - 0.5) * rng.uniform(-1, 1, 1000)], axis=1).astype(F)
     headings = rng.uniform(0.1, math.pi - 0.1, 1000)
@@ -128,16 +129,16 @@ def test_rays_see_parked_cars():
     strips = Strips.of(lines, (), blocks)
     exact, inner = oracle.ExactRoad(strips, 128.0, 128.0), oracle.ExactRoad(strips, 128.0, 128.0)
     inner.blocks[:, 3:5] -= 0.36
-    road = make_road(clearance_nodes(strips, 128.0, 128.0), (5.0, 12.0), REACH)
+    road = make_road(clearance_nodes(strips, 128.0, 128.0), (5.0, 12.0), 1.0)
     points = random_points(exact, 1500, rng, margin=0.3, side=128.0)
     headings = rng.uniform(-math.pi, math.pi, len(points))
     angles = headings[:, None] + RAYS
     missed = {}
-    for thin in (True, False):
-        seen = look(road._replace(thin=np.uint32(thin)), points, headings)
-        missed[thin] = (seen > inner.cast(points, angles, REACH) + 0.5).mean()
-    assert missed[True] < 2e-4
-    assert missed[False] > 5 * missed[True]
+    for thinnest in (1.0, THICK_WALL):
+        seen = look(road._replace(thinnest=F(thinnest)), points, headings)
+        missed[thinnest] = (seen > inner.cast(points, angles, REACH) + 0.5).mean()
+    assert missed[1.0] < 2e-4
+    assert missed[THICK_WALL] > 5 * missed[1.0]
 
 
 def test_an_empty_world_and_a_full_one():

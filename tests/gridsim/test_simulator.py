@@ -221,7 +221,7 @@ def plain():
 def straight():
     """A road of 8 m round a torus of 1,024 m, along x."""
     strips = Strips(np.array([[0, 32.0, 1024, 32.0, 4.0]]), np.zeros((0, 6)))
-    return make_road(clearance_nodes(strips, 1024.0, 64.0), INTERVAL, 50.0)
+    return make_road(clearance_nodes(strips, 1024.0, 64.0), INTERVAL, 1.0)
 
 
 @pytest.mark.parametrize(

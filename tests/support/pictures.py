@@ -73,7 +73,7 @@ def read(road, points):
 def small_road(lines=(), arcs=(), side=64.0):
     """A road on a torus of so many metres, for 5 to 12 m/s and rays of 50 m; and the same for the oracle."""
     strips = Strips.of(lines, arcs)
-    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 50.0), oracle.ExactRoad(strips, side, side)
+    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 1.0), oracle.ExactRoad(strips, side, side)
 
 
 def strip(cx, cy, angle, half_width, half_length=45.0):
