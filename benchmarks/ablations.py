@@ -95,8 +95,10 @@ VARIANTS = {
     "the centre leads": Variant(constants={"_KEPT": 0.0}),
     "no crash starts": Variant(curriculum={"starts": 2, "crash_starts": 0}),
     "crash starts alike": Variant(constants={"LEAST_CRASH_WEIGHT": 1.0}),
-    "all maps at once": Variant(curriculum={"first_maps": 32}),
-    "16 maps": Variant(curriculum={"maps": 16}),
+    "all maps at once": Variant(curriculum={"first_maps": 128}),
+    "32 maps": Variant(curriculum={"maps": 32}),
+    "64 crashes": Variant(curriculum={"crash_memory": 64}),
+    "crash starts earlier": Variant(curriculum={"rewind": 64}),
     "128 members": Variant(settings={"population": 128}),
     "256 members": Variant(settings={"population": 256}),
 }

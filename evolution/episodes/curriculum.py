@@ -35,16 +35,15 @@ LEAST_CRASH_WEIGHT = 0.05  # of a crash that all members avoid or none does; one
 class CurriculumConfig:
     """The curriculum's parameters."""
 
-    maps: int = 32  # training maps
-    first_maps: int = 4  # of these, how many the first generation uses ...
-    map_generations: int = 4  # ... and generations after which one more is used, so that maps are built in time
+    maps: int = 128  # training maps
+    first_maps: int = 4  # of these, how many the first generation uses; each later one uses one more
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
     starts: int = 1  # new episodes for each group and generation
     crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
     crash_target: float = 120.0  # m, target of crash starts
-    crash_memory: int = 64  # crashes that are remembered
+    crash_memory: int = 24  # crashes that are remembered
     crowd: float = 2.0  # factor on the number of other cars in training, for more encounters over the same distance
-    rewind: int = 64  # control steps from a crash start to the crash
+    rewind: int = 40  # control steps from a crash start to the crash
     leader_episodes: int = 16  # episodes of the leader in each generation
     leader_stretch: float = 2.5  # target of the leader's episodes, relative to the members'
     first_target: float = 150.0  # m, target of the first episodes
@@ -97,7 +96,7 @@ class Curriculum:
 
     def maps_in_use(self, generation: int) -> int:
         """Number of training maps in use; it grows one by one."""
-        return min(self.config.maps, self.config.first_maps + generation // self.config.map_generations)
+        return min(self.config.maps, self.config.first_maps + generation)
 
     def limits(self) -> Limits:
         """Limits of training episodes."""
