@@ -15,7 +15,7 @@ from cluster.runs.checkpoint import load
 
 SMALL = [
     *("--scenario", "curved", "--traffic", "2", "--policy", "mlp:12", "--seed", "5"),
-    *("--car-steps", "330000", "--evaluate-every", "60000", "--replay", "50000"),
+    *("--car-steps", "330000", "--evaluate-every", "40000", "--replay", "50000"),
 ]
 NOT_OF_THE_CLOCK = ("distance_m/best", "distance_m/mean", "loss", "q/mean", "q/change", "updates", "car_steps")
 
