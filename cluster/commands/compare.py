@@ -8,10 +8,9 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import tyro
 from rich.box import SIMPLE
@@ -33,16 +32,16 @@ from cluster.commands.common import (
     short_path,
     warn_of_many_workers,
 )
-from cluster.commands.progress import Line, clock, progress_of
+from cluster.commands.jobs import How, Kind, train_all
+from cluster.commands.progress import Line, clock
 from cluster.comparison import tables
 from cluster.comparison.page import page
 from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import Run, errors_of, read_run
+from cluster.comparison.results import Run, measured, read_run
 from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
 from cluster.runs.settings import IN_WORDS, check_workers
-from cluster.runs.train import Session, Workers, train
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
@@ -69,13 +68,18 @@ class CompareFlags(WorkFlags, Plan):
     """Name of the comparison; by default made from the time."""
     resume: Annotated[str, IN_WORDS] = ""
     """Folder of a comparison to continue; a larger --seeds adds to it."""
+    jobs: int = 1
+    """Runs that are trained at once, each with --workers of its own. On one machine: as many as it has cores, with
+    --workers 0; on a cluster: as many as it has room for. They share the cores, so give a --budget of car-steps."""
 
     example: ClassVar[str] = "gridsim-compare --scenarios curved city --learners evolution dqn --seeds 5"
     removed: ClassVar[dict[str, str]] = {"--reference": "errors are those against the reference driver; leave it out"}
 
 
 QUICK = CompareFlags(seeds=1, budget="10s")
-MAY_DIFFER = ("resume", "workers", "address", "patience", "tracking_uri", "experiment")  # in a resumed comparison
+# Flags that may differ in a resumed comparison.
+MAY_DIFFER = ("resume", "jobs", "workers", "address", "patience", "tracking_uri", "experiment")
+MAX_JOBS = 256  # each takes some 300 MB here
 WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
 
 
@@ -97,13 +101,15 @@ def _compare(arguments: Sequence[str]) -> int:
         cell.check()
     folder.tracking_uri = check_uri(flags.tracking_uri, folder.tracking_uri)
     lock(folder.path)
-    warn_of_many_workers(PROG, flags.workers, flags.address)
+    warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), flags.address)
     return _train_and_compare(console, folder, cells, flags)
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
     """The comparison's folder, checked; nothing is written yet. Raises GridSimError."""
     check_workers(flags.workers, flags.address, flags.patience)
+    if not 1 <= flags.jobs <= MAX_JOBS:
+        raise UsageError(f"--jobs must be 1 to {MAX_JOBS}, not {flags.jobs}")
     if flags.resume:
         folder = open_comparison(Path(flags.resume))
         before = CompareFlags(**vars(folder.plan), output=str(folder.path.parent), name=folder.path.name)
@@ -120,45 +126,35 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 
 
 def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags) -> int:
-    """Train the unfinished runs, one after the other on one pool of workers; write tables and a picture of all runs."""
+    """Train the unfinished runs; write tables and a picture of all runs."""
     folder.write()
     uri = folder.tracking_uri
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
     tags = {"algorithm": "comparison"}
     tracker = Tracker(Identity(uri, flags.experiment, folder.path.name, params, tags, key=folder.tracking_key))
-    wall_s = limits(folder.plan.budget)[1] or math.inf
-    workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
     results = Results(folder.path, folder.plan)
-    code, failed, problem, parent = 0, 0, "", ""
+    code, problem, parent = 0, "", ""
     status: Status = "FINISHED"
+    shown = Progress(console, folder, cells, flags.jobs, results)
     try:
-        with Progress(console, folder, cells) as shown:
+        with shown:
+            for cell in cells:
+                if cell.finished():
+                    shown.read(cell)
             if shown.left:
                 try:
                     parent = tracker.wait_ready()
                 except TrackingError as error:
                     print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
-            for cell in cells:
-                shown.begin(cell)
-                try:
-                    if cell.finished():
-                        results.add(read_run(cell.folder))
-                        continue
-                    run = cell.open()
-                    train(run, workers, uri, flags.experiment, shown, parent_id=parent, wall_limit_s=wall_s)
-                    shown.note("measuring errors")
-                    shown.done(results.add(read_run(cell.folder)))
-                    results.write_tables()
-                except (GridSimError, FloatingPointError) as error:  # the other runs go on
-                    failed += 1
-                    shown.failed(str(error))
-                    workers.close()  # the next run starts new ones
+            how = How(
+                flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience, uri,
+                flags.experiment, parent, limits(folder.plan.budget)[1] or math.inf,
+            )  # fmt: skip
+            train_all([cell for cell in cells if not cell.finished()], how, flags.jobs, shown.tell)
     except KeyboardInterrupt:
         code, status = INTERRUPTED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
         problem, status = str(error) or type(error).__name__, "FAILED"
-    finally:
-        workers.close()
     if results.runs:
         if not problem:
             with console.status("writing tables and the picture"):
@@ -175,8 +171,8 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
     console.print(f"compare: {tracker.where(command_path('mlflow'))}", soft_wrap=True)
     if code:
         print(f"{PROG}: stopped; continue with: {again}", file=sys.stderr)
-    elif failed:
-        fail(PROG, f"{failed} of {len(cells)} runs failed", f"continue with: {again}", FAILED)
+    elif shown.failed:
+        fail(PROG, f"{shown.failed} of {len(cells)} runs failed", f"continue with: {again}", FAILED)
     return code
 
 
@@ -186,11 +182,6 @@ class Results:
     def __init__(self, path: Path, plan: Plan | None = None):
         self.path, self.plan = path, plan
         self.runs: list[Run] = []
-
-    def add(self, run: Run) -> Run:
-        """Add a run. Returns it with its errors. Raises GridSimError."""
-        self.runs.append(dataclasses.replace(run, figures={**run.figures, **errors_of(run)}))
-        return self.runs[-1]
 
     @property
     def groups(self) -> list[tables.Group]:
@@ -242,7 +233,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     with console.status("measuring errors") as shown:
         for k, run in enumerate(runs):
             shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
-            results.add(run)
+            results.runs.append(measured(run))
         shown.update("writing tables and the picture")
         results.path.mkdir(parents=True)
         results.write()
@@ -251,39 +242,55 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
 
 
 class Progress(Line):
-    """Shows which run is being trained, its progress and ETA: a line on a terminal, plain lines elsewhere."""
+    """Shows the runs that are being trained, and an ETA: a line for each on a terminal, plain lines elsewhere."""
 
-    def __init__(self, console: Console, folder: ComparisonFolder, cells: Sequence[Cell]):
+    def __init__(self, console: Console, folder: ComparisonFolder, cells: Sequence[Cell], jobs: int, results: Results):
         super().__init__(console)
-        self._total, self.left = len(cells), sum(not cell.finished() for cell in cells)
+        self.failed = 0
+        self._results, self._jobs, self._total = results, jobs, len(cells)
+        self.left = sum(not cell.finished() for cell in cells)
         self._run_s = limits(folder.plan.budget)[1] or math.nan  # until the first run is done
+        self._begun: dict[str, float] = {}  # when each run began that is being trained
+        self._lines: dict[str, str] = {}  # of each of them
         there = f", {self._total - self.left} of them finished" if self.left < self._total else ""
         console.print(f"comparing {self._total} runs{there} -> {short_path(folder.path)}", soft_wrap=True)
 
-    def begin(self, cell: Cell) -> None:
-        self.name, self.resume = cell.name, f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
-        self._begun, self._is_new = time.perf_counter(), not cell.finished()
-        self.note("starting" if self._is_new else "reading what is finished")
+    def read(self, cell: Cell) -> None:
+        """Read a finished run; one that is damaged counts as failed."""
+        self.head, self.facts, self.rest = self._counter(), "reading what is finished", cell.name
+        try:
+            self._results.runs.append(measured(read_run(cell.folder)))
+        except GridSimError as error:
+            self._fail(cell, str(error))
 
-    def note(self, text: str, more: str = "") -> None:
-        """Show `text` after counter and ETA, and `more` if there is room."""
-        self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}  {text}", f"{self.name}  {more}"
+    def tell(self, cell: Cell, kind: Kind, content: Any) -> None:
+        """Show what happens to a run."""
+        name, now = cell.name, time.perf_counter()
+        if kind == "begin":
+            self._begun[name], self._lines[name] = now, f"{name}  starting"
+        elif kind == "note":
+            text, more = content
+            self._lines[name] = f"{name}  {text}  {more}"
+        elif kind == "warning":
+            print(f"{name}: warning: {content}", file=sys.stderr, flush=True)
+        else:
+            self.left -= 1
+            self._run_s = now - self._begun.pop(name, now)
+            self._lines.pop(name, None)
+            if kind == "failed":
+                self._fail(cell, content)
+            else:
+                self._done(content)
+        self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}", "\n".join(self._lines.values())
 
-    def compiling(self) -> AbstractContextManager[object]:
-        self.note("compiling the simulator for this machine, once")
-        return nullcontext()
+    def _fail(self, cell: Cell, reason: str) -> None:
+        self.failed += 1
+        print(f"{PROG}: {cell.name} failed: {reason}", file=sys.stderr, flush=True)
 
-    def learning(self, session: Session) -> AbstractContextManager[object]:
-        self._learning = session.learning
-        return nullcontext()
-
-    def row(self, steps: int, row: dict[str, float]) -> None:
-        success = f"success {row['validation/success_rate']:.0%}"
-        self.note(f"{progress_of(self._learning, bound=False)}  {success}", self._learning.describe(row))
-
-    def done(self, run: Run) -> None:
+    def _done(self, run: Run) -> None:
+        self._results.runs.append(run)
+        self._results.write_tables()
         error = run.figures["velocity_error_percent"]
-        self.left, self._run_s, self._begun = self.left - 1, time.perf_counter() - self._begun, time.perf_counter()
         self.console.print(
             f"{self._counter()}  {run.folder.name}: success {run.figures['success_rate']:.0%}, "
             f"{run.figures['distance_m']:,.0f} m, "
@@ -294,14 +301,11 @@ class Progress(Line):
             highlight=False,
         )
 
-    def failed(self, reason: str) -> None:
-        self.left -= self._is_new
-        print(f"{PROG}: {self.name} failed: {reason}", file=sys.stderr, flush=True)
-
     def _counter(self) -> str:
         return f"run {self._total - self.left}/{self._total}"
 
     def _eta(self) -> str:
         """The ETA if each run takes as long as the latest one, or at first as the budget of wall time."""
-        seconds = self._run_s * self.left - (time.perf_counter() - self._begun)
+        now = time.perf_counter()
+        seconds = (self._run_s * self.left - sum(now - begun for begun in self._begun.values())) / self._jobs
         return clock(max(seconds, 0.0)) if math.isfinite(seconds) else "-:--"

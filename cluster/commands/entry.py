@@ -15,6 +15,9 @@ from importlib.metadata import version
 from types import FrameType
 
 STARTED = time.perf_counter()  # when the process started, but for Python's own startup of some 30 ms
+#: MLflow and PyTorch create a million objects that are never freed. With Python's default thresholds, garbage
+#: collection takes a sixth of their import time.
+GC_THRESHOLDS = (200_000, 20, 20)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -29,9 +32,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _enter(module: str, name: str) -> None:
-    # MLflow and PyTorch create a million objects that are never freed. With Python's default thresholds, garbage
-    # collection takes a sixth of their import time.
-    gc.set_threshold(200_000, 20, 20)
+    gc.set_threshold(*GC_THRESHOLDS)
     if "--version" in sys.argv[1:]:
         print(f"gridsim {version('gridsim')}")
         return

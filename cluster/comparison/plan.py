@@ -7,12 +7,13 @@ kept in comparison.json.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -33,6 +34,11 @@ FORMAT = 2
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
 UNBOUND = MAX_STEPS  # generations or car-steps, if a budget ends the run
 EVALUATIONS = 10  # of the DQN, at least
+# Settings that the other flags decide, so that --grid cannot vary them.
+PLANNED = (
+    "scenario", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",
+    "evaluate_every",
+)  # fmt: skip
 
 
 class Cell(NamedTuple):
@@ -91,6 +97,9 @@ class Plan:
     """Members of a generation, of evolution and random search; by default as for gridsim-evolve."""
     generations: Annotated[int, IN_WORDS] = 0
     """Generations at most, of evolution and random search; by default any number within the budget."""
+    grid: Annotated[tuple[str, ...], IN_WORDS] = ()
+    """Settings to vary, as in sigma=0.3,0.5 population=128,256: each combination is compared as a learner of its
+    own."""
 
     def __post_init__(self) -> None:
         absolute = tuple(os.path.abspath(name) if is_map_file(name) else name for name in self.scenarios)
@@ -108,21 +117,46 @@ class Plan:
                 raise ExperimentError(f"--learners: {learner!r:.40} is not a learner; use {', '.join(LEARNERS)}")
         if not 1 <= self.seeds <= MAX_SEEDS:
             raise ExperimentError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
-        if len({file_name(name) for name in self.scenarios}) != len(self.scenarios):
-            raise ExperimentError("--scenarios: two maps have the same name; rename one")
-        for cell in dataclasses.replace(self, seeds=1).cells(Path()):
+        cells = dataclasses.replace(self, seeds=1).cells(Path())
+        if len({cell.name for cell in cells}) != len(cells):
+            raise ExperimentError("two runs would have the same name: rename a map, or name a value of --grid once")
+        for cell in cells:
             cell.settings.check()
 
     def cells(self, folder: Path) -> list[Cell]:
         """All runs of a comparison in that folder, in the order in which they are made."""
         return [
-            Cell(folder / f"{file_name(scenario)}-{learner}-s{seed}", self.settings(scenario, learner, seed))
+            Cell(
+                folder / "-".join([file_name(scenario), learner, *_words(variant), f"s{seed}"]),
+                self.settings(scenario, learner, seed, variant),
+            )
             for seed in range(self.seeds)
             for scenario in self.scenarios
             for learner in self.learners
+            for variant in self.variants(learner)
         ]
 
-    def settings(self, scenario: str, learner: Learner, seed: int) -> RunSettings:
+    def variants(self, learner: Learner) -> list[dict[str, Any]]:
+        """The combinations of `grid` for a learner, by the settings' names. Raises ExperimentError."""
+        plain = self.settings(self.scenarios[0], learner, 0)
+        choices: list[list[tuple[str, Any]]] = []
+        for text in self.grid:
+            flag, _, values = text.partition("=")
+            name = flag.replace("-", "_")
+            if name in PLANNED or name not in vars(plain):
+                what = "the comparison sets it" if name in PLANNED else f"{learner} has no such setting"
+                raise ExperimentError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
+            kind = type(getattr(plain, name))
+            try:  # a name may have commas, and begins with a letter
+                words = re.split(",(?=[a-z])" if kind is str else ",", values)
+                choices.append([(name, kind(float(word)) if kind is int else kind(word)) for word in words])
+            except ValueError:
+                raise ExperimentError(f"--grid {text:.80}: give numbers, as in {flag}=1,2") from None
+        return [dict(chosen) for chosen in itertools.product(*choices)]
+
+    def settings(
+        self, scenario: str, learner: Learner, seed: int, variant: Mapping[str, Any] | None = None
+    ) -> RunSettings:
         """The settings of one run."""
         car_steps, _ = limits(self.budget)
         common: dict[str, Any] = {
@@ -136,16 +170,21 @@ class Plan:
             steps = car_steps or UNBOUND
             usual = DqnSettings.suited[self.observation]["evaluate_every"]
             every = min(usual, max(steps // EVALUATIONS, 1))
-            return DqnSettings(**common, car_steps=steps, evaluate_every=every)
+            return DqnSettings(**common | dict(variant or {}), car_steps=steps, evaluate_every=every)
         if self.population:
             common["population"] = self.population
         return EvolveSettings(
-            **common,
+            **common | dict(variant or {}),
             search="random" if learner == "random" else "evolution",
             recombination="two" if learner == "two-parents" else "all",
             car_steps=car_steps,
             generations=self.generations or UNBOUND,
         )
+
+
+def _words(variant: Mapping[str, Any]) -> list[str]:
+    """A variant as parts of a folder's name."""
+    return [file_name(f"{name}={value}") for name, value in variant.items()]
 
 
 def limits(budget: str) -> tuple[int, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
@@ -81,6 +82,11 @@ def read_run(folder: Path) -> Run:
     if found != (settings.scenario, settings.seed, champion.sha256):
         raise ExperimentError(f"{folder}: {CONFIG}, {CHAMPION} and {SUMMARY} do not belong together; one was edited")
     return Run(folder, settings, champion.sha256, figures)
+
+
+def measured(run: Run) -> Run:
+    """A run with its errors. Raises ExperimentError."""
+    return dataclasses.replace(run, figures={**run.figures, **errors_of(run)})
 
 
 def errors_of(run: Run) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +21,8 @@ from gridsim.maps.scenarios import REGISTRY, label
 
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}
 COLUMNS = (
-    "scenario", "traffic", "observation", "learner", "seed", *RUN_FIGURES, *ERROR_FIGURES, "champion_sha256", "run",
+    "scenario", "traffic", "observation", "learner", "variant", "seed",
+    *RUN_FIGURES, *ERROR_FIGURES, "champion_sha256", "run",
 )  # fmt: skip
 """Columns of table.csv."""
 NOTHING = "–"
@@ -46,8 +48,9 @@ class Group:
     """The runs of one learner on one road with all seeds.
 
     Attributes:
+        variant: its settings, in words, in which others of this learner on this road differ.
         road: the scenario's name, with the traffic if the comparison has several amounts of it.
-        name: the learner's name, with the observation if the comparison has both.
+        name: the learner's name with its variant, and with the observation if the comparison has both.
         runs: the finished ones.
         seeds: all of the plan's.
     """
@@ -56,6 +59,7 @@ class Group:
     traffic: int
     observation: str
     learner: str
+    variant: str
     road: str
     name: str
     runs: tuple[Run, ...]
@@ -74,26 +78,47 @@ def group(runs: Sequence[Run], plan: Plan | None = None) -> list[Group]:
     """Runs by road and learner, in the order of the registry and of NAMES; with a plan, also the missing ones."""
     settings = [each.settings for each in (plan.cells(Path()) if plan else runs)]
 
-    def order(key: tuple[str, int, str, str]) -> tuple[int, str, int, int, str]:
-        scenario, traffic, observation, learner = key
+    def order(kind: Kind) -> tuple[int, str, int, int, str]:
+        scenario, traffic, observation, learner = kind
         return [*REGISTRY, scenario].index(scenario), scenario, traffic, [*NAMES].index(learner), observation
 
-    keys = sorted({_key(each) for each in settings}, key=order)
-    several_observations = len({observation for _, _, observation, _ in keys}) > 1
+    kinds = sorted({_kind(each) for each in settings}, key=order)
+    several_observations = len({observation for _, _, observation, _ in kinds}) > 1
     found = []
-    for key in keys:
-        scenario, traffic, observation, learner = key
-        several_traffics = len({other[1] for other in keys if other[0] == scenario}) > 1
+    for kind in kinds:
+        scenario, traffic, observation, learner = kind
+        several_traffics = len({other[1] for other in kinds if other[0] == scenario}) > 1
         road = label(scenario) + (f", {traffic} cars" if several_traffics else "")
         name = NAMES[learner] + (f" on {observation}" if several_observations else "")
-        finished = sorted((run for run in runs if _key(run.settings) == key), key=lambda run: run.settings.seed)
-        seeds = sorted(each.seed for each in settings if _key(each) == key)
-        found.append(Group(*key, road, name, tuple(finished), tuple(seeds)))
+        asked = [each for each in settings if _kind(each) == kind]
+        varied = _varied(asked)
+        for variant in dict.fromkeys(_variant(each, varied) for each in asked):
+            seeds = sorted(each.seed for each in asked if _variant(each, varied) == variant)
+            finished = [
+                run for run in runs if _kind(run.settings) == kind and _variant(run.settings, varied) == variant
+            ]
+            finished.sort(key=lambda run: run.settings.seed)
+            full_name = f"{name}, {variant}" if variant else name
+            found.append(Group(*kind, variant, road, full_name, tuple(finished), tuple(seeds)))
     return found
 
 
-def _key(settings: RunSettings) -> tuple[str, int, str, str]:
+Kind = tuple[str, int, str, str]
+
+
+def _kind(settings: RunSettings) -> Kind:
     return settings.scenario, settings.traffic, settings.observation, settings.learner
+
+
+def _varied(settings: Sequence[RunSettings]) -> list[str]:
+    """In which of their settings runs of one kind differ, besides seeds and limits."""
+    values = [dataclasses.asdict(each) for each in settings]
+    left_out = {"seed", "until", *settings[0].unbound}
+    return [name for name in values[0] if name not in left_out and len({each[name] for each in values}) > 1]
+
+
+def _variant(settings: RunSettings, varied: Sequence[str]) -> str:
+    return ", ".join(f"{name} {getattr(settings, name)}" for name in varied)
 
 
 def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
@@ -108,6 +133,7 @@ def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
             "traffic": each.traffic,
             "observation": each.observation,
             "learner": each.learner,
+            "variant": each.variant,
         }
         for run in each.runs:
             where = run.folder.relative_to(folder) if run.folder.is_relative_to(folder) else run.folder

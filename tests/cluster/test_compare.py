@@ -7,16 +7,18 @@ import json
 import os
 import signal
 
+import psutil  # type: ignore[import-untyped]
 import pytest
 import tracked
-from commands import call, finish, refused, start, wait_until
+from commands import call, finish, refused, start, summary, wait_until
 from finished_runs import make_run
 
-from cluster.commands import compare
+from cluster.commands import compare, jobs
 from cluster.commands.compare import compare_main
 from cluster.comparison import results
 from cluster.comparison.plan import ComparisonFolder, Plan
 from cluster.workers.pool import PoolError
+from gridsim import evolve
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
@@ -31,6 +33,7 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
         (["--workers", -1], "--workers"),
+        (["--jobs", 0], "--jobs must be 1 to 256, not 0"),
         (["--workers", 0, "--address", "auto"], "--address"),
         (["--resume", "nowhere"], "no such folder"),
         (["--resume", "a"], "not a comparison's folder"),
@@ -66,8 +69,8 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
         make_run(run.path, settings=run.settings)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compare, "train", train)
-    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(jobs, "train", train)
+    monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     run = functools.partial(call, compare_main, monkeypatch, capsys)
     asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
@@ -100,8 +103,8 @@ def test_a_finished_run_that_is_damaged_counts_as_failed_and_stops_no_other(tmp_
         make_run(cell.folder, settings=cell.settings)
     folder.write()
     (damaged.folder / "champion.npz").write_text("PK")
-    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
-    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(jobs, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     monkeypatch.chdir(tmp_path)
     code, out, err = call(compare_main, monkeypatch, capsys, "--resume", "c", "--workers", 0)
@@ -117,8 +120,8 @@ def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, m
     folder = ComparisonFolder(tmp_path / "c", Plan(("curved",), ("evolution",), 1, budget="1k"), away)
     folder.path.mkdir()
     folder.write()
-    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
-    monkeypatch.setattr(compare, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
+    monkeypatch.setattr(jobs, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     code, _, err = call(compare_main, monkeypatch, capsys, "--resume", folder.path, "--workers", 0)
     assert code == 0
     nested, unsent = err.splitlines()
@@ -168,3 +171,43 @@ def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_wha
     assert all(found[path.name].data.tags["mlflow.parentRunId"] == parent for path in (first, second))
     assert found["c"].info.status == "FINISHED"
     assert found["c"].data.metrics["runs_done"] == 2
+
+
+@pytest.mark.e2e
+def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_each_alone(tmp_path):
+    folder = tmp_path / "runs" / "c"
+    asked = ["--scenarios", "curved", "seamless", "--learners", "evolution", "--seeds", "2", "--population", "64"]
+    plan = Plan(("curved", "seamless"), ("evolution",), 2, budget="1h", population=64, generations=12)
+    cells = plan.cells(folder)
+    at_once = ["--workers", "0", "--jobs", "2"]
+
+    def processes():
+        return [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+
+    def both_saved():
+        return all((cell.folder / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
+
+    process = start("gridsim-compare", *asked, "--budget", "1h", "--generations", "12", *at_once, "--name", "c",
+                    cwd=tmp_path)  # fmt: skip
+    try:
+        wait_until(both_saved, 240)
+        children = processes()
+        process.send_signal(signal.SIGINT)
+        errors = process.communicate(timeout=120)[1]
+        assert process.returncode == 130, errors
+        assert len(children) == 2
+        assert not any(child.is_running() for child in children)
+        process = start("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path)
+        wait_until(lambda: len(processes()) == 2, 60)
+        processes()[0].kill()
+        errors = process.communicate(timeout=240)[1]
+        assert process.returncode == 1, errors
+        assert "failed: its process ended with exit code -9" in errors
+        assert "gridsim-compare: error: 1 of 4 runs failed" in errors
+    finally:
+        process.kill()
+        process.communicate()
+    done = finish("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    for cell in cells:
+        assert summary(cell.folder)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256

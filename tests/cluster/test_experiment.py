@@ -10,6 +10,7 @@ from finished_runs import make_run
 
 from cluster.comparison.plan import ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import LEARNERS, ExperimentError
+from cluster.comparison.tables import group
 from cluster.runs.settings import DqnSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
@@ -46,6 +47,13 @@ def test_budget_that_makes_no_sense(text):
         ({"seeds": 0}, "--seeds"),
         ({"traffic": -2}, "--traffic"),
         ({"population": -1}, "population"),
+        ({"grid": ("sigma",)}, "--grid sigma: give numbers, as in sigma=1,2"),
+        ({"grid": ("population=64,x",)}, "--grid population=64,x: give numbers"),
+        ({"grid": ("sigma=-1",)}, "sigma"),
+        ({"grid": ("sigma=1,1.0",)}, "same name"),
+        ({"grid": ("seed=1,2",)}, "the comparison sets it"),
+        ({"grid": ("check=1",)}, "evolution has no such setting"),
+        ({"grid": ("sigma=1",), "learners": ("evolution", "dqn")}, "dqn has no such setting"),
     ],
 )
 def test_plan_that_makes_no_sense(change, said):
@@ -60,6 +68,26 @@ def test_a_comparison_that_was_stopped_has_something_of_everything(tmp_path):
     found = {(cell.settings.scenario, cell.settings.learner) for cell in cells[:20]}
     assert found == set(itertools.product(roads, LEARNERS))
     assert cells[0].folder == tmp_path / f"{roads[0]}-evolution-s0"
+
+
+def test_each_combination_of_a_grid_is_compared(tmp_path):
+    plan = Plan(("curved",), ("evolution",), 2, grid=("policy=mlp:64,mlp:6,7", "tournament=2,8"))
+    plan.check()
+    cells = plan.cells(tmp_path)
+    assert [cell.name for cell in cells[:4]] == [
+        f"curved-evolution-policy=mlp_{policy}-tournament={size}-s0" for policy in ("64", "6_7") for size in (2, 8)
+    ]
+    assert {(cell.settings.policy, vars(cell.settings)["tournament"]) for cell in cells} == {
+        ("mlp:64", 2), ("mlp:64", 8), ("mlp:6,7", 2), ("mlp:6,7", 8),
+    }  # fmt: skip
+    make_run(cells[2].folder, settings=cells[2].settings)
+    groups = group(read_runs([cells[2].folder]), plan)
+    assert [(each.name, len(each.runs), each.seeds) for each in groups] == [
+        ("evolution, policy mlp:64, tournament 2", 0, (0, 1)),
+        ("evolution, policy mlp:64, tournament 8", 0, (0, 1)),
+        ("evolution, policy mlp:6,7, tournament 2", 1, (0, 1)),
+        ("evolution, policy mlp:6,7, tournament 8", 0, (0, 1)),
+    ]
 
 
 @pytest.mark.parametrize(("observation", "traffic"), [("rays", 0), ("rays", 4), ("grid", 4)])

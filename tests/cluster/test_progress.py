@@ -35,7 +35,7 @@ def drawn(shown, width):
     """The live line as such a terminal shows it."""
     console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
     lines = ["".join(segment.text for segment in line) for line in console.render_lines(shown.text(), pad=False)]
-    assert len(lines) == 2
+    assert len(lines) == 2 + shown.rest.count("\n")  # none is wrapped
     assert max(map(len, lines)) <= width
     return "\n".join(lines)
 
@@ -97,14 +97,17 @@ def test_a_comparison_shows_the_same(width):
     plan = Plan(("roundabout",), ("two-parents",), 3, budget="3700s")
     cells = plan.cells(Path("runs/c"))
     console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
-    shown = compare.Progress(console, ComparisonFolder(Path("runs/c"), plan), cells)
-    shown.begin(cells[0])
+    folder = ComparisonFolder(Path("runs/c"), plan)
+    shown = compare.Progress(console, folder, cells, 2, compare.Results(folder.path, plan))
     learner = learning((12, 10**15, "generations"))
-    shown.note(f"{progress.progress_of(learner, bound=False)}  success 37%", learner.describe(ROW))
+    note = f"{progress.progress_of(learner, bound=False)}  success 37%", learner.describe(ROW)
+    for cell in cells[:2]:
+        shown.tell(cell, "begin", None)
+        shown.tell(cell, "note", note)
     line = drawn(shown, width)
-    assert line.startswith("run 0/3  ETA 3:0")
-    assert "  12 generations  success 37%" in line
-    assert "\nroundabout-two-parents-s0" in line
+    assert line.startswith("run 0/3  ETA 1:3")
+    assert "\nroundabout-two-parents-s0  12 generations  success 37%" in line
+    assert "\nroundabout-two-parents-s1  12 generations  success 37%" in line
 
 
 def test_a_terminal_shows_it_live():

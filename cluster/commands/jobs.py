@@ -1,0 +1,220 @@
+"""A comparison's runs: one after another in this process, or several at once, each in a process of its own.
+
+Such a process trains one run after another, so that its imports and its workers serve all of them. It is told a run and
+tells what happens through a pipe; files, locks and resuming are those of any run. When this process dies, the others
+notice at their next message, save their runs and end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import multiprocessing
+import os
+import signal
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.connection import Connection, wait
+from typing import Any, Literal
+
+from cluster.commands.common import command_path, short_path
+from cluster.commands.entry import GC_THRESHOLDS, interrupt
+from cluster.commands.progress import progress_of
+from cluster.comparison.plan import Cell
+from cluster.comparison.results import measured, read_run
+from cluster.runs.train import Reporter, Session, Workers, train
+from cluster.workers import kernels
+from gridsim.errors import GridSimError
+
+CLOSING_S = 90.0  # for a run to be saved and closed after a signal; Ray takes most of it
+Kind = Literal["begin", "note", "warning", "done", "failed"]
+Tell = Callable[[Cell, Kind, Any], None]
+"""Receives what happens to a run: "begin"; "note" with two texts; "warning" or "failed" with a text; "done" with its
+`Run`."""
+
+
+class StoppedError(GridSimError):
+    """What stops all runs, such as a full disk; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class How:
+    """How runs are trained: the flags of `Workers`, MLflow's address, experiment and parent run, the limit in s."""
+
+    workers: int
+    address: str | None
+    patience_s: float
+    uri: str
+    experiment: str
+    parent_id: str
+    wall_limit_s: float
+
+
+def train_all(cells: Iterable[Cell], how: How, jobs: int, tell: Tell) -> None:
+    """Train runs, as many at once as `jobs` says. A run that fails does not stop the others.
+
+    Raises: KeyboardInterrupt, once all are saved; StoppedError; MemoryError and OSError with `jobs` = 1.
+    """
+    if jobs > 1:
+        _at_once(deque(cells), how, jobs, tell)
+        return
+    workers = Workers(how.workers, how.address, how.patience_s)
+    try:
+        for cell in cells:
+            _train(cell, how, workers, tell)
+    finally:
+        workers.close()
+
+
+def _train(cell: Cell, how: How, workers: Workers, tell: Tell) -> None:
+    tell(cell, "begin", None)
+    try:
+        reporter = _Teller(cell, tell)
+        run = cell.open()
+        train(run, workers, how.uri, how.experiment, reporter, parent_id=how.parent_id, wall_limit_s=how.wall_limit_s)
+        reporter.note("measuring errors")
+        tell(cell, "done", measured(read_run(cell.folder)))
+    except (GridSimError, FloatingPointError) as error:  # the other runs go on
+        tell(cell, "failed", str(error))
+        workers.close()  # the next run starts new ones
+
+
+class _Teller(Reporter):
+    """Tells how one run goes, in words."""
+
+    def __init__(self, cell: Cell, tell: Tell):
+        self._tell = partial(tell, cell)
+        self._resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
+
+    def note(self, text: str, more: str = "") -> None:
+        self._tell("note", (text, more))
+
+    def warn(self, text: str) -> None:
+        self._tell("warning", text)
+
+    def compiling(self) -> AbstractContextManager[object]:
+        self.note("compiling the simulator for this machine, once")
+        return nullcontext()
+
+    def learning(self, session: Session) -> AbstractContextManager[object]:
+        self._learning = session.learning
+        return nullcontext()
+
+    def row(self, steps: int, row: dict[str, float]) -> None:
+        success = f"success {row['validation/success_rate']:.0%}"
+        self.note(f"{progress_of(self._learning, bound=False)}  {success}", self._learning.describe(row))
+
+    def unsent(self, text: str, finished: bool) -> None:
+        self.warn(f"{text}; send it later with: {self._resume}" if finished else text)
+
+
+@dataclass
+class _Job:
+    """A process that trains runs, and the one that it is training."""
+
+    process: Any
+    pipe: Connection
+    cell: Cell | None = None
+
+    def give(self, cells: deque[Cell]) -> None:
+        """Have it train the next run, or end."""
+        self.cell = cells.popleft() if cells else None
+        with contextlib.suppress(OSError):  # it has died, which its sentinel tells
+            self.pipe.send(self.cell)
+
+
+def _at_once(cells: deque[Cell], how: How, number: int, tell: Tell) -> None:
+    _compile(cells, tell)
+    jobs: list[_Job] = []
+    try:
+        for _ in range(min(number, len(cells))):
+            jobs.append(_start(how))
+            jobs[-1].give(cells)
+        while jobs:
+            ready = wait([job.pipe for job in jobs] + [job.process.sentinel for job in jobs])
+            for job in list(jobs):
+                if job.pipe in ready and _hear(job, tell):
+                    if job.cell is None:
+                        job.give(cells)
+                elif job.pipe in ready or job.process.sentinel in ready:
+                    jobs.remove(job)
+                    job.process.join()
+                    if job.cell is not None:
+                        tell(job.cell, "failed", f"its process ended with exit code {job.process.exitcode}")
+                        if cells:
+                            jobs.append(_start(how))
+                            jobs[-1].give(cells)
+    finally:
+        for job in jobs:
+            job.process.terminate()
+        for job in jobs:
+            job.process.join(CLOSING_S)
+            job.process.kill()
+
+
+def _compile(cells: Iterable[Cell], tell: Tell) -> None:
+    """Compile the runs' kernels, once for all processes."""
+    for cell in cells:
+        warming = kernels.begin(cell.settings)
+        try:
+            if warming.processes:
+                tell(cell, "note", ("compiling the simulator for this machine, once", ""))
+                warming.wait()
+        finally:
+            warming.stop()
+
+
+def _start(how: How) -> _Job:
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    process = context.Process(target=_main, args=(there, how))
+    process.start()
+    there.close()
+    return _Job(process, here)
+
+
+def _hear(job: _Job, tell: Tell) -> bool:
+    """Pass on the next message of a job. Returns whether there was one. Raises StoppedError."""
+    try:
+        kind, content = job.pipe.recv()
+    except (EOFError, OSError):
+        return False
+    if kind == "stopped":
+        raise StoppedError(content)
+    cell = job.cell
+    assert cell is not None
+    if kind in ("done", "failed"):
+        job.cell = None
+    tell(cell, kind, content)
+    return True
+
+
+def _main(pipe: Connection, how: How) -> None:
+    """A job's process: train the runs that come through the pipe. SIGTERM stops it; Ctrl-C is for its parent."""
+    gc.set_threshold(*GC_THRESHOLDS)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, interrupt)
+
+    def tell(cell: Cell, kind: Kind, content: Any) -> None:
+        try:
+            pipe.send((kind, content))
+        except OSError:
+            raise KeyboardInterrupt from None  # the parent has died
+
+    workers = Workers(how.workers, how.address, how.patience_s)
+    try:
+        while (cell := pipe.recv()) is not None:
+            warnings.showwarning = lambda message, *_, cell=cell, **__: tell(cell, "warning", str(message))
+            _train(cell, how, workers, tell)
+    except (KeyboardInterrupt, EOFError):
+        pass
+    except (MemoryError, OSError) as error:
+        with contextlib.suppress(OSError):
+            pipe.send(("stopped", str(error) or type(error).__name__))
+    finally:
+        workers.close()
+    os._exit(0)  # at once, as commands do (`entry`)
