@@ -27,7 +27,7 @@ from cluster.tracking.address import shown
 from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import REGISTRY, is_map_file
+from gridsim.maps.scenarios import REGISTRY, is_map_file, label
 
 COMPARISON = "comparison.json"
 FORMAT = 2
@@ -127,7 +127,7 @@ class Plan:
         """All runs of a comparison in that folder, in the order in which they are made."""
         return [
             Cell(
-                folder / "-".join([file_name(scenario), learner, *_words(variant), f"s{seed}"]),
+                folder / "-".join([file_name(label(scenario)), learner, *_words(variant), f"s{seed}"]),
                 self.settings(scenario, learner, seed, variant),
             )
             for seed in range(self.seeds)

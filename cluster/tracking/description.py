@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from cluster.runs.run import RunFolder
 
 
-def file_name(scenario: str) -> str:
-    """A scenario's name as part of a folder's name."""
-    return re.sub(r"[^\w.+=@-]", "_", label(scenario))
+def file_name(words: str) -> str:
+    """A scenario's label, or other words, as part of a folder's name."""
+    return re.sub(r"[^\w.+=@-]", "_", words)
 
 
 def default_name(settings: RunSettings) -> str:
     """Scenario, algorithm and seed in one word, with which the default name of a run begins."""
-    return f"{file_name(settings.scenario)}-{settings.algorithm}-s{settings.seed}"
+    return f"{file_name(label(settings.scenario))}-{settings.algorithm}-s{settings.seed}"
 
 
 def group(settings: RunSettings) -> str:

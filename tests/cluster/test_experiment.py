@@ -71,22 +71,22 @@ def test_a_comparison_that_was_stopped_has_something_of_everything(tmp_path):
 
 
 def test_each_combination_of_a_grid_is_compared(tmp_path):
-    plan = Plan(("curved",), ("evolution",), 2, grid=("policy=mlp:64,mlp:6,7", "tournament=2,8"))
+    plan = Plan(("curved",), ("evolution",), 2, grid=("policy=mlp:64,mlp:6,7", "sigma=0.3,0.5"))
     plan.check()
     cells = plan.cells(tmp_path)
     assert [cell.name for cell in cells[:4]] == [
-        f"curved-evolution-policy=mlp_{policy}-tournament={size}-s0" for policy in ("64", "6_7") for size in (2, 8)
+        f"curved-evolution-policy=mlp_{policy}-sigma={sigma}-s0" for policy in ("64", "6_7") for sigma in (0.3, 0.5)
     ]
-    assert {(cell.settings.policy, vars(cell.settings)["tournament"]) for cell in cells} == {
-        ("mlp:64", 2), ("mlp:64", 8), ("mlp:6,7", 2), ("mlp:6,7", 8),
+    assert {(cell.settings.policy, vars(cell.settings)["sigma"]) for cell in cells} == {
+        ("mlp:64", 0.3), ("mlp:64", 0.5), ("mlp:6,7", 0.3), ("mlp:6,7", 0.5),
     }  # fmt: skip
     make_run(cells[2].folder, settings=cells[2].settings)
     groups = group(read_runs([cells[2].folder]), plan)
     assert [(each.name, len(each.runs), each.seeds) for each in groups] == [
-        ("evolution, policy mlp:64, tournament 2", 0, (0, 1)),
-        ("evolution, policy mlp:64, tournament 8", 0, (0, 1)),
-        ("evolution, policy mlp:6,7, tournament 2", 1, (0, 1)),
-        ("evolution, policy mlp:6,7, tournament 8", 0, (0, 1)),
+        ("evolution, policy mlp:64, sigma 0.3", 0, (0, 1)),
+        ("evolution, policy mlp:64, sigma 0.5", 0, (0, 1)),
+        ("evolution, policy mlp:6,7, sigma 0.3", 1, (0, 1)),
+        ("evolution, policy mlp:6,7, sigma 0.5", 0, (0, 1)),
     ]
 
 
