@@ -225,8 +225,7 @@ class ComparisonFolder:
             "command": "gridsim-compare",
             "gridsim": version("gridsim"),
             "plan": dataclasses.asdict(self.plan),
-            # This file is logged to MLflow, so it must not hold a password.
-            "tracking_uri": self.tracking_uri if self.tracking_uri == shown(self.tracking_uri) else "",
+            "tracking_uri": shown(self.tracking_uri),  # MLflow gets this file, so it must not hold a password
             "tracking_key": self.tracking_key,
         }
         checkpoint.write_atomic(self.path / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
+from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, CheckpointError
 from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict
 from cluster.tracking import description
 from gridsim.config import SimConfig
@@ -193,7 +193,7 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
 
 def is_finished(run: RunFolder) -> bool:
     """Whether nothing is left to do: learning has ended and all files are there. An extended run has steps.part."""
-    concluded = (run.path / SUMMARY).is_file() and not (run.path / STEPS).exists()
+    concluded = all((run.path / name).is_file() for name in (SUMMARY, CHAMPION)) and not (run.path / STEPS).exists()
     return run.saved is not None and concluded and run.settings.ended(run.saved[1])
 
 

@@ -29,7 +29,7 @@ from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError
 from cluster.runs.run import ELITES, HISTORY, PAGE, SUMMARY, RunError, RunFolder, lock, write_summary
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
-from cluster.tracking.address import TrackingError, check_uri, shown
+from cluster.tracking.address import TrackingError, check_uri, shown, with_password
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
@@ -298,7 +298,8 @@ class Session:
             steps.append(path / STEPS, saved, new)
             sha256 = self._sha256.copy()
             sha256.update(new.tobytes())
-            tracking = {"uri": self.tracker.uri, "run_id": self.tracker.run_id, "key": self.run.tracking_key}
+            # MLflow gets the checkpoint, so it must not hold a password.
+            tracking = {"uri": shown(self.tracker.uri), "run_id": self.tracker.run_id, "key": self.run.tracking_key}
             meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, "tracking": tracking}
             meta |= {"steps": done, "steps_sha256": sha256.hexdigest()}
             checkpoint.save(path / CHECKPOINT, {k: v for k, v in arrays.items() if k != "history"}, meta)
@@ -423,7 +424,7 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
         history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
         model = description.torch_model(load_champion(run.path), run.settings, summary["held_out"])
         note, started = description.describe(run, summary), ended - summary["wall_s"]
-        uri = check_uri(uri or meta["tracking"]["uri"] or None)
+        uri = check_uri(uri or with_password(meta["tracking"]["uri"]))
     except GridSimError as error:
         return "", f"what MLflow lacks is not sent: {error}"
     except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited by hand

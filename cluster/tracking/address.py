@@ -31,12 +31,13 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     """The tracking address made absolute and probed, without MLflow.
 
     None stands for the address that a resumed run was begun with; its server need not answer, as the run goes on and
-    the tracker reports it. For a new run it is MLFLOW_TRACKING_URI, or `sqlite:///mlflow.db` in the working directory.
+    the tracker reports it. Its password, which no file holds, comes from MLFLOW_TRACKING_URI. For a new run it is
+    MLFLOW_TRACKING_URI, or `sqlite:///mlflow.db` in the working directory.
     Raises TrackingError for a server that does not answer, a database that cannot be written, a folder (MLflow 3
     stores nothing in folders) and anything unknown.
     """
     resumed = not uri and bool(begun_with)
-    uri = uri or begun_with or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
+    uri = uri or with_password(begun_with) or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
     scheme = uri.partition("://")[0].partition("+")[0].lower() if "://" in uri else ""
     if resumed and scheme in ("http", "https", *_DATABASES):
         return uri
@@ -57,6 +58,12 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     if scheme in ("", "file"):
         raise TrackingError(f"{uri}: MLflow 3 keeps no runs in folders; use sqlite:///mlflow.db or http://host:port")
     raise TrackingError(f"{shown(uri)}: not a tracking address; use sqlite:///mlflow.db or http://host:port")
+
+
+def with_password(saved: str) -> str:
+    """The address that a run was begun with, with the user and password that MLFLOW_TRACKING_URI may have for it."""
+    usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
+    return usual if shown(usual) == saved else saved
 
 
 def _check_sqlite(uri: str) -> str:
@@ -107,8 +114,8 @@ def server_problem(uri: str) -> str:
 
 
 def shown(uri: str) -> str:
-    """An address without its password."""
-    return re.sub(r"//[^/@\s]*@", "//", uri)
+    """An address, or a text that may hold one, without user and password."""
+    return re.sub(r"(?<=:)//[^/@\s]*@", "//", uri)
 
 
 def one_line(error: BaseException) -> str:

@@ -181,10 +181,11 @@ class LoggedRun:
             self._client.update_run(run_id, status="RUNNING")
         for name in data.metrics:
             self._logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
-        # MLflow does not let parameters change; what differs is added as a tag.
+        # MLflow does not let parameters change; what differs in a run that goes on is added as a tag.
         resumed: dict[str, str] = {}
         for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
-            resumed |= {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
+            changed = {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
+            resumed |= {} if self._identity.finished else changed
         params = [Param(*param) for param in self._identity.params.items() if param[0] not in data.params]
         tags = {name: value for name, value in self._tags().items() if name not in data.tags} | resumed
         self._client.log_batch(run_id, params=params, tags=[RunTag(*tag) for tag in tags.items()])

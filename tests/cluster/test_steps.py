@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from cluster.runs import checkpoint, steps, train
-from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError, load, save
+from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError, load, save
 from cluster.runs.run import ELITES, RunError, is_finished, new_run, open_run
 from cluster.runs.settings import EvolveSettings
 from cluster.runs.steps import read_elites
+from cluster.tracking.address import check_uri
 from cluster.training.evolution import COLUMNS, Evolution
 from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool
@@ -40,11 +41,11 @@ def every_step(monkeypatch):
     monkeypatch.setattr(Evolution, "save_every_s", 0.0)
 
 
-def session(run, maps):
+def session(run, maps, uri=""):
     """A run that validates a candidate in every generation, in few episodes."""
     run.path.mkdir(parents=True, exist_ok=True)
     run.write_config()
-    made = train.Session(run, SerialPool(maps.build), maps, f"sqlite:///{run.path.parent}/m.db", "test")
+    made = train.Session(run, SerialPool(maps.build), maps, uri or f"sqlite:///{run.path.parent}/m.db", "test")
     curriculum = made.learning.curriculum
     curriculum.config = dataclasses.replace(
         curriculum.config, validation=8, promising=0.0, latest=0, validation_share=1.0
@@ -118,6 +119,17 @@ def test_a_checkpoint_is_as_small_after_many_steps(maps, tmp_path):
     assert (made.run.path / "history.csv").read_text().splitlines()[-1].startswith("399,399.1,")
 
 
+def test_no_file_holds_the_password_of_mlflow(maps, tmp_path, monkeypatch):
+    made = session(new_run(tmp_path, "secret", SETTINGS), maps, "http://someone:s3cret@127.0.0.1:1")
+    made.learn()
+    saved = load(made.run.path / CHECKPOINT)[1]["tracking"]["uri"]
+    assert saved == "http://127.0.0.1:1"
+    assert check_uri(begun_with=saved) == saved
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://someone:s3cret@127.0.0.1:1/")
+    assert check_uri(begun_with=saved) == "http://someone:s3cret@127.0.0.1:1"
+    assert check_uri(begun_with="http://127.0.0.1:2") == "http://127.0.0.1:2"
+
+
 def test_an_ended_run_has_its_elites_once_and_can_be_extended(maps, straight, tmp_path):
     ended = session(new_run(tmp_path, "ended", dataclasses.replace(SETTINGS, generations=2)), maps)
     path = ended.run.path
@@ -126,6 +138,8 @@ def test_an_ended_run_has_its_elites_once_and_can_be_extended(maps, straight, tm
     ended._conclude()
     assert not (path / STEPS).exists()
     assert len(read_elites(path, SETTINGS.policy)) == len(load(path / CHECKPOINT)[0]["history"]) == 2
+    assert not is_finished(open_run(path)), "it has no champion.npz"
+    (path / CHAMPION).touch()
     assert is_finished(open_run(path))
     run = open_run(path)
     run.settings = SETTINGS
