@@ -24,7 +24,9 @@ from packaging.requirements import Requirement
 
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
+from cluster.comparison.plan import Plan
 from cluster.workers.ray_session import PACKAGES, runtime_env
+from gridsim import evolve
 from gridsim.jit import CACHE_FOLDER
 
 CLOUDS = ("aws", "gcp")
@@ -247,6 +249,16 @@ def test_the_same_run_as_a_job(up: Machines, tmp_path: Path) -> None:
     assert reference.communicate(timeout=UP_S)[1] == ""
     ours, theirs = summary(up.head.home / "runs/j"), summary(tmp_path / "runs/r")
     assert ours["champion_sha256"] == theirs["champion_sha256"]
+
+
+@pytest.mark.e2e
+def test_runs_at_once_have_the_champions_of_each_alone(up: Machines) -> None:
+    plan = Plan(("curved",), ("evolution",), 2, budget="1G", population=48, generations=6)
+    asked = "--scenarios curved --learners evolution --seeds 2 --budget 1G --population 48 --generations 6 --name c"
+    command = f"gridsim-compare --address auto --jobs 2 --workers 1 {asked}"
+    up.laptop.run(RAY, "exec", up.config, command, timeout=UP_S)
+    for cell in plan.cells(up.head.home / "runs/c"):
+        assert summary(cell.folder)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
 
 
 @pytest.mark.e2e
