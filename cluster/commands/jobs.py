@@ -172,7 +172,9 @@ def _start(how: How) -> _Job:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_main, args=(there, how))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it
     process.start()
+    signal.signal(signal.SIGINT, before)
     there.close()
     return _Job(process, here)
 
@@ -194,9 +196,8 @@ def _hear(job: _Job, tell: Tell) -> bool:
 
 
 def _main(pipe: Connection, how: How) -> None:
-    """A job's process: train the runs that come through the pipe. SIGTERM stops it; Ctrl-C is for its parent."""
+    """A job's process: train the runs that come through the pipe. SIGTERM stops it."""
     gc.set_threshold(*GC_THRESHOLDS)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, interrupt)
 
     def tell(cell: Cell, kind: Kind, content: Any) -> None:

@@ -319,7 +319,7 @@ class Session:
 
         self.reporter.note("measuring the champion on held-out drives")
         learning, path, settings = self.learning, self.run.path, self.run.settings
-        learning.validate_last()
+        learning.choose_last()
         assert learning.champion is not None
         champion = Champion(
             learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic

@@ -22,8 +22,10 @@ from cluster.runs.settings import RunSettings
 from cluster.workers.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.workers.worker import Task
 from evolution.episodes.curriculum import (
+    FINAL_SEEDS,
     HELD_OUT_EPISODES,
     HELD_OUT_SEEDS,
+    VALIDATION_SEEDS,
     Curriculum,
     spread_starts,
     success_rate,
@@ -175,18 +177,25 @@ class Learning(ABC):
     def candidate(self) -> np.ndarray | None:
         """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
-    def validate_last(self) -> None:
-        """Validate the last candidate when a run ends.
+    def choose_last(self) -> None:
+        """Choose between the champion and the last candidate when an unsolved run ends, on maps of their own.
 
+        A champion is the best of many on the same maps, so that its score there is too high, in traffic by some
+        percent, and later candidates that drive better do not reach it.
         This is not in the checkpoint: a run that is extended goes on as if it had never ended.
         """
-        candidate = self.candidate()
-        if candidate is not None and not self.solved and not self._is_tried(candidate):
-            driven = self.drive(
-                "validate", candidate[None], self.curriculum.validation(), self.curriculum.goal_limits()
-            )
-            if not driven.lost[0]:
-                self._judge(candidate, driven.results, self.steps - 1)
+        candidate, before = self.candidate(), self.champion
+        if candidate is not None and not self.solved and not (before and np.array_equal(candidate, before.genome)):
+            finalists = [(before.genome, before.step)] if before else []
+            finalists.append((candidate, self.steps - 1))
+            episodes = self.curriculum.validation(FINAL_SEEDS if before else VALIDATION_SEEDS)
+            genomes = np.stack([genome for genome, _ in finalists])
+            driven = self.drive("validate", genomes, episodes, self.curriculum.goal_limits())
+            self.champion = None
+            for k, (genome, step) in enumerate(finalists):
+                if not driven.lost[k]:
+                    self._judge(genome, driven.results[k : k + 1], step)
+            self.champion = self.champion or before
         if self.champion is None:
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
 

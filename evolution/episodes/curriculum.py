@@ -28,6 +28,7 @@ from gridsim.traffic.world import FIELDS, LANE
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
+FINAL_SEEDS = range(VALIDATION_SEED + 48, VALIDATION_SEED + 96)  # of maps, for the choice that ends a run
 LEAST_CRASH_WEIGHT = 0.05  # of a crash that all members avoid or none does; one that half of them avoid has weight 1
 
 
@@ -85,7 +86,7 @@ class Curriculum:
         self.target = min(config.first_target, target_m)
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
         self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
-        self._validation: Episodes | None = None
+        self._validation: dict[range, Episodes] = {}
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
         self.map_seeds = [
             int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
@@ -206,18 +207,18 @@ class Curriculum:
         if (results["distance"] >= self.target).mean() >= self.config.growth:
             self.target = min(2.0 * self.target, self.config.last_target, self.goal)
 
-    def validation(self) -> Episodes:
-        """Validation's episodes, the same for all runs of a scenario with the same traffic.
+    def validation(self, seeds: range = VALIDATION_SEEDS) -> Episodes:
+        """Validation's episodes on maps of `seeds`, the same for all runs of a scenario with the same traffic.
 
         They share a task with a generation's episodes, so their worlds are padded with absent cars to the same size.
         """
-        if self._validation is None:
-            maps, rows, worlds = spread_starts(self.build, VALIDATION_SEEDS, self.config.validation, self.traffic)
+        if seeds not in self._validation:
+            maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic)
             absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
             episodes = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
-            self._validation = episodes.with_limits(self.goal_limits())
-        return self._validation
+            self._validation[seeds] = episodes.with_limits(self.goal_limits())
+        return self._validation[seeds]
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:
         """Scores in [0, 1] of members from validation's results [n, e]: success rate, reduced below champion_pace."""

@@ -14,6 +14,7 @@ from cluster.runs.train import Reporter, Session
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Champion, Maps
 from cluster.workers.pool import PoolError, SerialPool
+from evolution.episodes.curriculum import FINAL_SEEDS, HELD_OUT_SEEDS
 from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
@@ -97,7 +98,7 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
         for step, elite in resumed.elites.items():
             assert elite.tobytes() == straight.elites[step].tobytes()
     for run in (straight, resumed):
-        run.validate_last()
+        run.choose_last()
     assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
     assert resumed.champion.score == straight.champion.score
 
@@ -215,6 +216,23 @@ def test_a_candidate_is_validated_when_the_leader_does_well(maps):
         setattr(evolution, name, value)
         assert not evolution._promising()
         setattr(evolution, name, before)
+
+
+def test_a_run_that_ends_chooses_between_champion_and_last_candidate_on_other_maps(maps):
+    evolution = begin(maps)
+    go_on(evolution)
+    two = np.stack([evolution.candidate(), np.zeros(GENES, np.float32)])
+    curriculum = evolution.curriculum
+    finals = curriculum.validation(FINAL_SEEDS)
+    assert not set(finals.maps) & {*curriculum.validation().maps, *HELD_OUT_SEEDS}
+    metres = evolution.drive("alone", two, finals, curriculum.goal_limits()).results["distance"].mean(axis=1)
+    assert metres[0] != metres[1]
+    for champion, candidate in (two, two[::-1]):
+        evolution.champion = Champion(champion, 0.9, 0.9, 1000.0, 0)
+        evolution.candidate = lambda candidate=candidate: candidate
+        evolution.choose_last()
+        assert evolution.champion.genome.tobytes() == two[metres.argmax()].tobytes()
+        assert (evolution.champion.score, evolution.champion.distance_m) == (0.0, metres.max())
 
 
 def test_training_is_among_more_cars_than_validation(maps):
@@ -356,5 +374,5 @@ def test_a_candidate_lost_in_validation_is_no_champion(maps):
     evolution = losing(maps, validate=slice(0, None))
     go_on(evolution)
     with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
-        evolution.validate_last()
+        evolution.choose_last()
     assert evolution.champion is None
