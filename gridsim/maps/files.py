@@ -28,11 +28,9 @@ from PIL import Image
 
 from gridsim.config import FILE_SPEEDS, START_SPEED, SimConfig, VehicleConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.lanes import lay_lanes
-from gridsim.maps.map import Map
-from gridsim.maps.network import make_network
+from gridsim.maps.map import Map, without_lanes
 from gridsim.maps.raster import HALF_WALL, OUTSIDE, check_starts, find_starts, road_length, signed_clearance
-from gridsim.maps.roads import CELLS_PER_M, Strips, freeze, make_road, power_of_two
+from gridsim.maps.roads import CELLS_PER_M, power_of_two
 
 PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -321,15 +319,4 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
     _warn(path.stem, file, free, nodes, config.episode.revisit)
     starts = np.zeros((len(poses), 5), dtype=np.float32)
     starts[:, :3], starts[:, 3] = poses, START_SPEED
-    width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
-    lanes = lay_lanes([], width, height)
-    return Map(
-        name=name,
-        seed=0,
-        road=make_road(nodes, file.speed, 2.0 * HALF_WALL),
-        lanes=lanes,
-        strips=Strips.of(),
-        network=make_network(lanes, width, height, 0.0, config),
-        torus=False,
-        starts=freeze(starts),
-    )
+    return without_lanes(name, nodes, file.speed, 2.0 * HALF_WALL, config, starts)

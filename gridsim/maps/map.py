@@ -13,7 +13,7 @@ from gridsim.config import START_SPEED, SimConfig
 from gridsim.jit import njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network, make_network
-from gridsim.maps.roads import CELLS_PER_M, THICK_WALL, Lanes, Road, Strips, freeze
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Lanes, Road, Strips, freeze, make_road
 
 
 @dataclass(frozen=True)
@@ -77,21 +77,25 @@ class Map:
         return self
 
 
+def without_lanes(
+    name: str,
+    nodes: np.ndarray,
+    speed_interval: tuple[float, float],
+    thinnest: float,
+    config: SimConfig,
+    starts: np.ndarray,
+) -> Map:
+    """A map that is all one clearance field (m) [rows, columns], not a torus, with starts [n, 5] in place of lanes."""
+    height, width = (side / CELLS_PER_M for side in nodes.shape)
+    lanes, road = lay_lanes([], width, height), make_road(nodes, speed_interval, thinnest)
+    network = make_network(lanes, width, height, 0.0, config)
+    return Map(name, 0, road, lanes, Strips.of(), network, torus=False, starts=freeze(starts))
+
+
 def blank(config: SimConfig) -> Map:
     """A map of 8 m x 8 m without any road, used to compile kernels before the first map is built."""
-    side, lanes = 8, lay_lanes([], 8.0, 8.0)
-    nodes, f = np.uint32(side * CELLS_PER_M), np.float32
-    road = Road(
-        field=freeze(np.zeros(nodes * nodes, dtype=np.uint32)),
-        columns=nodes,
-        rows=nodes,
-        width=f(side),
-        height=f(side),
-        speed_low=f(0.0),
-        speed_high=f(1.0),
-        thinnest=f(THICK_WALL),
-    )
-    return Map("blank", 0, road, lanes, Strips.of(), make_network(lanes, side, side, 1.0, config))
+    nodes = np.full((8 * CELLS_PER_M, 8 * CELLS_PER_M), FIELD_FLOOR, dtype=np.float32)
+    return without_lanes("blank", nodes, (0.0, 1.0), THICK_WALL, config, np.zeros((0, 5), dtype=np.float32))
 
 
 @njit
