@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from gridsim.config import VehicleConfig
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS
@@ -138,15 +136,6 @@ def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return across + math.pi / 2, np.hypot(xx - yy, 2.0 * xy) / np.maximum(xx + yy, 1e-6)
 
 
-def _components(wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Connected components, also across the field's sides: labels of nodes (0 is none), and each label's component."""
-    labels, count = ndimage.label(wide)
-    seams = np.concatenate([np.stack([labels[0], labels[-1]]), np.stack([labels[:, 0], labels[:, -1]])], axis=1)
-    seams = seams[:, (seams > 0).all(axis=0)]
-    joined = coo_array((np.ones(seams.shape[1]), (seams[0], seams[1])), shape=(count + 1, count + 1))
-    return labels, connected_components(joined, directed=False)[1]
-
-
 def _window(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The part of a field that has road, with wall around it, as a torus, and its corner: x, y (m).
 
@@ -166,21 +155,20 @@ def road_length(nodes: np.ndarray) -> float:
     """Estimated length (m) of the largest connected road: area over width. Within 10 % for a ring."""
     nodes, _ = _window(nodes)
     road = nodes > 0.0
-    labels, group = _components(road)
+    labels, _ = ndimage.label(road)
     middle = road & (nodes >= ndimage.maximum_filter(nodes, size=5, mode="wrap") - 0.1)
-    area = np.bincount(group[labels[road]]) * _NODE**2
-    part = group[labels[middle]]
-    width = 2.0 * np.bincount(part, nodes[middle]) / np.maximum(np.bincount(part), 1)
+    area = np.bincount(labels[road]) * _NODE**2
+    part, count = labels[middle], len(area)
+    width = 2.0 * np.bincount(part, nodes[middle], count) / np.maximum(np.bincount(part, minlength=count), 1)
     return float((area / np.maximum(width, _NODE)).max())
 
 
 def _large(wide: np.ndarray) -> np.ndarray:
     """Which nodes belong to a connected component of _EXTENT m or more."""
-    labels, group = _components(wide)
+    labels, _ = ndimage.label(wide)
     boxes = ndimage.find_objects(labels)
-    size = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
-    extent = np.bincount(group, weights=size)
-    return wide & (extent[group] >= _EXTENT)[labels]
+    extent = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
+    return (np.array(extent) >= _EXTENT)[labels]
 
 
 def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
