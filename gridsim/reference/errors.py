@@ -28,16 +28,6 @@ class Series(NamedTuple):
     steering: np.ndarray  # rad, left positive, the agent's
     reference_steering: np.ndarray  # rad
 
-    @property
-    def velocity_error(self) -> np.ndarray:
-        """float64 [n], m/s, positive where the agent is faster."""
-        return self.speed - self.reference_speed
-
-    @property
-    def steering_error(self) -> np.ndarray:
-        """float64 [n], degrees, positive where the agent steers further to the left."""
-        return np.degrees(self.steering - self.reference_steering)
-
 
 def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     """The errors of several drives together, by name: means over the metres (trapezoidal rule) and maxima of |e|.
@@ -55,8 +45,8 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     def mean(values: Sequence[np.ndarray]) -> float:
         return sum(float(np.trapezoid(each, part.arc)) for each, part in zip(values, parts, strict=True)) / metres
 
-    velocity = [np.abs(part.velocity_error) for part in parts]
-    steering = [np.abs(part.steering_error) for part in parts]
+    velocity = [np.abs(part.speed - part.reference_speed) for part in parts]
+    steering = [np.abs(np.degrees(part.steering - part.reference_steering)) for part in parts]
     velocity_mean, velocity_max = mean(velocity), max(float(each.max()) for each in velocity)
     steering_mean, steering_max = mean(steering), max(float(each.max()) for each in steering)
     reference = mean([part.reference_speed for part in parts])
