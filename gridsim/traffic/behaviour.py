@@ -70,7 +70,7 @@ _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
 
 
 class Drivers(NamedTuple):
-    """`TrafficConfig` as kernels read it, with the cars' size and the control period."""
+    """Fields of `TrafficConfig` by their names, as kernels read them, with the cars' size and the control period."""
 
     acceleration: np.float32  # m/s2
     comfort: np.float32  # m/s2, deceleration
@@ -79,10 +79,10 @@ class Drivers(NamedTuple):
     jam: np.float32  # m
     politeness: np.float32
     threshold: np.float32  # m/s2
-    safe: np.float32  # m/s2
+    safe_braking: np.float32  # m/s2
     lateral: np.float32  # m/s2
     give_way: np.float32  # m
-    shift: np.float32  # m/s
+    lane_change_speed: np.float32  # m/s
     half_length: np.float32  # m
     half_width: np.float32  # m
     dt: np.float32  # s
@@ -91,24 +91,9 @@ class Drivers(NamedTuple):
 
 def drivers(sim: SimConfig) -> Drivers:
     """The configuration for the kernels."""
-    f, config = np.float32, sim.traffic
-    return Drivers(
-        acceleration=f(config.acceleration),
-        comfort=f(config.comfort),
-        braking=f(config.braking),
-        headway=f(config.headway),
-        jam=f(config.jam),
-        politeness=f(config.politeness),
-        threshold=f(config.threshold),
-        safe=f(config.safe_braking),
-        lateral=f(config.lateral),
-        give_way=f(config.give_way),
-        shift=f(config.lane_change_speed),
-        half_length=f(sim.vehicle.length / 2),
-        half_width=f(sim.vehicle.width / 2),
-        dt=f(sim.episode.control_period),
-        ego=constants(sim),
-    )
+    traffic = {name: np.float32(value) for name, value in vars(sim.traffic).items() if name in Drivers._fields}
+    k = constants(sim)
+    return Drivers(**traffic, half_length=k.half_length, half_width=k.half_width, dt=k.dt, ego=k)
 
 
 @leaf
@@ -156,7 +141,7 @@ def _swerve(drivers, speed, shift, sway, place, way):
     The path bends no harder than SWERVE_RADIUS and the lateral acceleration of traffic in bends allow.
     """
     bend = min(_ONE / SWERVE_RADIUS, drivers.lateral / max(speed * speed, _ONE))
-    steepest = min(STEEPEST_SWERVE, drivers.shift / max(speed, _ONE))
+    steepest = min(STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, _ONE))
     left = place - shift
     # With this slope it would end up parallel to the lane, using half the bend.
     wanted = math.copysign(min(math.sqrt(bend * abs(left)), steepest), left)
@@ -385,7 +370,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             gap = left_behind - drivers.half_length + car[GAP]
             others += idm(drivers, left_speed, left_desired, gap, car[LEAD_SPEED])
             others -= idm(drivers, left_speed, left_desired, left_behind - own_length, car[SPEED])
-        if new_follower < -drivers.safe or there < -drivers.safe:
+        if new_follower < -drivers.safe_braking or there < -drivers.safe_braking:
             continue
         advantage = there - car[ACCELERATION] + drivers.politeness * others
         if advantage > gain:
@@ -406,7 +391,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
                 update_gap(network, drivers, car, world[j], False)
         if is_there(ego):
             update_gap(network, drivers, car, ego, True)
-        if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe:
+        if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe_braking:
             car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO
             car[GAP], car[LEAD_SPEED] = nearest, lead_speed
 

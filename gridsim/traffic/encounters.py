@@ -91,7 +91,7 @@ def way_to_ego_collision(network, drivers, car, ego):
             length = lane_length(network, lane)
         k = _N(network.offsets[_N(lane)]) + _N(_I((way - begin) / network.steps[_N(lane)]))
         k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
-        right = min(network.room[k], drivers.shift * t - car[SHIFT])
+        right = min(network.room[k], drivers.lane_change_speed * t - car[SHIFT])
         px, py = shifted_right(network, k, k + _N(1), right)
         x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
         dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
