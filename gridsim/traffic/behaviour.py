@@ -30,14 +30,7 @@ from gridsim.config import (
 )
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
-from gridsim.traffic.encounters import (
-    is_there,
-    meets_ego,
-    room_to_right,
-    shifted_right,
-    touches_ego,
-    way_to_ego_collision,
-)
+from gridsim.traffic.encounters import is_there, meets_ego, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import (
     ACCELERATION,
@@ -402,7 +395,7 @@ def _move(network, drivers, car, ego):
     before, after = car[SPEED], max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
     car[ALONG] += _HALF * (before + after) * drivers.dt
     car[SPEED] = after
-    place = -room_to_right(network, car) if meets_ego(network, drivers, car, ego) else _ZERO
+    place = -network.room[point_at(network, car)] if meets_ego(network, drivers, car, ego) else _ZERO
     shift = car[SHIFT]
     if shift != place or car[SWAY] != _ZERO:
         way = _HALF * (before + after) * drivers.dt

@@ -12,7 +12,7 @@ from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, wrapped, wrapped_any
 from gridsim.sensing.boxes import boxes_touch
-from gridsim.traffic.world import ALONG, COS, LANE, SHIFT, SIN, SPEED, X, Y, lane_after, point_at
+from gridsim.traffic.world import ALONG, COS, LANE, SHIFT, SIN, SPEED, X, Y, lane_after
 
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
@@ -42,12 +42,6 @@ def touches_ego(network, drivers, car, ego):
         return False
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
     return boxes_touch(drivers, dx, dy, car[COS], car[SIN], ego[COS], ego[SIN])
-
-
-@leaf
-def room_to_right(network, car):
-    """`Network.room` (m) at a car's place."""
-    return network.room[point_at(network, car)]
 
 
 @leaf
