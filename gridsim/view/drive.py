@@ -41,10 +41,6 @@ _ENDLESS = 10_000_000  # control steps
 HELP = "arrows drive   space brakes   R restarts   Esc ends"
 
 
-class DriveError(GridSimError):
-    """A recorded drive that cannot be written, read or replayed; the message is one line for the user."""
-
-
 @dataclass(frozen=True)
 class Drive:
     """A recorded drive; n control steps of one or more episodes on one map.
@@ -100,27 +96,27 @@ class Recorder:
     """Writes a drive to a new file row by row, so that an interrupted drive is kept too."""
 
     def __init__(self, path: str | os.PathLike[str], road_map: Map, period: float, traffic: int = 0):
-        """Create the file. Raises: DriveError with one line if it exists or cannot be created."""
+        """Create the file. Raises: GridSimError with one line if it exists or cannot be created."""
         self._map = (traffic, road_map.name, road_map.seed)
         self._period = period
         self.path, self.rows = Path(path), 0
         try:
             self._file = open(path, "x", newline="", encoding="utf-8", buffering=1)  # noqa: SIM115, closed by close()
         except FileExistsError:
-            raise DriveError(f"{path} exists already; name another file") from None
+            raise GridSimError(f"{path} exists already; name another file") from None
         except OSError as error:
-            raise DriveError(f"{path}: cannot be written: {error.strerror or error}") from error
+            raise GridSimError(f"{path}: cannot be written: {error.strerror or error}") from error
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow(COLUMNS)
 
     def write(self, step: int, pose: np.ndarray, action: int, episode: int) -> None:
-        """Write one row: control steps since the episode's start; pose float32 [5]. Raises DriveError."""
+        """Write one row: control steps since the episode's start; pose float32 [5]. Raises GridSimError."""
         # Nine digits represent a float32 exactly.
         numbers = [f"{value:.9g}" for value in (round(step * self._period, 6), *pose.tolist())]
         try:
             self._writer.writerow([*numbers, int(action), episode, *self._map])
         except OSError as error:
-            raise DriveError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+            raise GridSimError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         self.rows += 1
 
     def close(self) -> None:
@@ -137,20 +133,20 @@ class Recorder:
 def read_drive(path: str | os.PathLike[str]) -> Drive:
     """Read a drive that `gridsim-drive --record` wrote.
 
-    Raises: DriveError with one line that names the first problem and its place.
+    Raises: GridSimError with one line that names the first problem and its place.
     """
     try:
         if os.stat(path).st_size > MAX_BYTES:
-            raise DriveError(f"{path}: too large for a recorded drive")
+            raise GridSimError(f"{path}: too large for a recorded drive")
         with open(path, newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, restval="", strict=True)
             try:
                 return _drive_of(reader)
             except (csv.Error, ValueError) as error:
                 place = f"{path}, line {max(reader.line_num, 1)}"
-                raise DriveError(f"{place}: not a recorded drive, or incomplete: {str(error)[:200]}") from error
+                raise GridSimError(f"{place}: not a recorded drive, or incomplete: {str(error)[:200]}") from error
     except OSError as error:
-        raise DriveError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise GridSimError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _drive_of(reader: csv.DictReader[str]) -> Drive:
@@ -189,7 +185,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
 
     Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
     traffic float32 [n, others, world.FIELDS]).
-    Raises: DriveError with one line if an episode ends too early, which means that the map is another one.
+    Raises: GridSimError with one line if an episode ends too early, which means that the map is another one.
     """
     simulator = manual(road_map, drive.traffic)
     n = len(drive)
@@ -201,7 +197,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
         else:
             ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
             if ends[0] != End.RUNNING:
-                raise DriveError(f"the replay ends at row {k} of {n}: the drive was recorded on another map")
+                raise GridSimError(f"the replay ends at row {k} of {n}: the drive was recorded on another map")
         rows.append((simulator.state.cars[0].copy(), ranges[0].copy(), simulator.state.worlds[0].copy()))
     cars, views, worlds = (np.stack(column) for column in zip(*rows, strict=True))
     return np.where(begins[:, None], drive.poses, poses_of(cars)), cars, views, worlds
@@ -225,7 +221,7 @@ def drive(
 
     Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
-    Raises: DriveError with one line if the recording cannot be written.
+    Raises: GridSimError with one line if the recording cannot be written.
     """
     simulator = manual(road_map, traffic)
     period = simulator.config.episode.control_period

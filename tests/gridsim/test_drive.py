@@ -16,11 +16,11 @@ from commands import call
 from cluster.commands.watch import drive_main
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
+from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.view.drive import (
     COLUMNS,
-    DriveError,
     Recorder,
     action_for,
     manual,
@@ -99,10 +99,10 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
 
 def test_recorder_overwrites_nothing(scenario, recorded, tmp_path):
     before = recorded[0].read_bytes()
-    with pytest.raises(DriveError, match="exists already"):
+    with pytest.raises(GridSimError, match="exists already"):
         Recorder(recorded[0], scenario, 0.1)
     assert recorded[0].read_bytes() == before
-    with pytest.raises(DriveError, match="cannot be written"):
+    with pytest.raises(GridSimError, match="cannot be written"):
         Recorder(tmp_path / "nowhere" / "drive.csv", scenario, 0.1)
 
 
@@ -131,7 +131,7 @@ def _edit(text, row, column, value):
 
 def test_a_missing_file_is_one_clear_line(tmp_path):
     for path in (tmp_path / "nothing.csv", tmp_path):
-        with pytest.raises(DriveError, match="cannot be read"):
+        with pytest.raises(GridSimError, match="cannot be read"):
             read_drive(path)
 
 
@@ -141,7 +141,7 @@ def test_damaged_file_is_one_clear_line(recorded, tmp_path, name):
     damaged = change(recorded[0].read_text())
     path = tmp_path / "drive.csv"
     path.write_bytes(damaged if isinstance(damaged, bytes) else damaged.encode())
-    with pytest.raises(DriveError) as error:
+    with pytest.raises(GridSimError) as error:
         read_drive(path)
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
