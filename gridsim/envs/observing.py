@@ -9,7 +9,7 @@ from gridsim.car.ego import STEERING
 from gridsim.car.reward import reward
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.sensing.grid import CELLS, GridTable, grid_table, grids, push_frames
+from gridsim.sensing.grid import CELLS, GridTable, grid_table, grids
 
 _F = np.float32
 _ALL = slice(None)
@@ -83,8 +83,11 @@ class Observer:
         table = self.table
         if table is None or self._stack.shape[1] == 1:
             return
-        stack = self._stack[which]
-        push_frames(stack, grids(table, ranges), begun)
+        stack, newest = self._stack[which], grids(table, ranges)
+        for k in range(stack.shape[1] - 1):
+            stack[:, k] = stack[:, k + 1]
+        stack[:, -1] = newest
+        stack[begun] = newest[begun, None]
         if not isinstance(which, slice):  # then it is a copy
             self._stack[which] = stack
 

@@ -102,15 +102,3 @@ def grids(table: GridTable, ranges: np.ndarray) -> np.ndarray:
     made = np.empty((len(ranges), CELLS, CELLS), dtype=np.uint8)
     _fill_grids(table, np.ascontiguousarray(ranges, dtype=np.float32), made.reshape(len(ranges), CELLS * CELLS))
     return made
-
-
-def push_frames(stacked: np.ndarray, grids: np.ndarray, begun: np.ndarray) -> None:
-    """Append each car's new grid to its stack and drop the oldest; the newest is last.
-
-    Args: stacked uint8 [n, frames, 80, 80], changed in place; grids uint8 [n, 80, 80]; begun bool [n], whether an
-    episode has just begun; then all frames become the first grid.
-    """
-    for k in range(stacked.shape[1] - 1):
-        stacked[:, k] = stacked[:, k + 1]
-    stacked[:, -1] = grids
-    stacked[begun] = grids[begun, None]
