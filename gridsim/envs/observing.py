@@ -9,7 +9,7 @@ from gridsim.car.ego import STEERING
 from gridsim.car.reward import reward
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
-from gridsim.sensing.grid import CELLS, GridTable, grid_table, grids
+from gridsim.sensing.grid import CELLS, grid_table, grids
 
 _F = np.float32
 _ALL = slice(None)
@@ -72,18 +72,11 @@ class Observer:
         elif observation == "grid":
             self.space = Dict({"grid": image, "speed": Box(self._slowest, 1.0, (1,), dtype=np.float32)})
 
-    @property
-    def table(self) -> GridTable | None:
-        """The grid's table, or None if the observation is rays."""
-        # Not stored, because copies of it would be writable, and kernels would be compiled again for them.
-        return None if self._observation == "rays" else grid_table(self.config)
-
     def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
         """Add `ranges` [k, rays] as the newest frames of cars `which` [k], or as all frames where they have `begun`."""
-        table = self.table
-        if table is None or self._stack.shape[1] == 1:
+        if self._observation == "rays" or self._stack.shape[1] == 1:
             return
-        stack, newest = self._stack[which], grids(table, ranges)
+        stack, newest = self._stack[which], self._grids(ranges)
         for k in range(stack.shape[1] - 1):
             stack[:, k] = stack[:, k + 1]
         stack[:, -1] = newest
@@ -93,15 +86,18 @@ class Observer:
 
     def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
         """Observations of cars `which` from ranges [k, rays] and speeds [k], after `take`; the caller owns them."""
-        table = self.table
-        if table is None:
+        if self._observation == "rays":
             return self._rays(ranges, speeds, which)
         one = self._stack.shape[1] == 1
-        image = grids(table, ranges)[:, None] if one else self._stack[which].copy()
+        image = self._grids(ranges)[:, None] if one else self._stack[which].copy()
         if self._observation == "image":
             return image
         share = np.clip(speeds / _F(self.config.vehicle.speed_limit), self._slowest, _F(1.0))
         return {"grid": image, "speed": share[:, None]}
+
+    def _grids(self, ranges: np.ndarray) -> np.ndarray:
+        # The table is not stored: copies of it would be writable, and kernels would be compiled again for them.
+        return grids(grid_table(self.config), ranges)
 
     def _rays(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice) -> np.ndarray:
         vehicle = self.config.vehicle
