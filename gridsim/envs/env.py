@@ -258,7 +258,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Begin the current episodes of cars `which`. Returns: ranges [k, rays] and speeds [k]."""
         maps, starts, keys = self._episodes.draw(which, map_seed, start)
         ranges, speeds = self.simulator.reset(starts, maps, which, keys)
-        self._fastest[which] = self._episodes.upper_speeds(maps)
+        self._fastest[which] = [self._episodes.maps[m].road.speed_high for m in maps]
         return ranges, speeds
 
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:

@@ -20,16 +20,6 @@ _U = np.uint64
 _SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDictionary()
 
 
-def shared_map(scenario: str, seed: int, config: SimConfig) -> Map:
-    """A map that all environments of this process share; a map file is read again, because it may change."""
-    if is_map_file(scenario):
-        return build(scenario, seed, config)
-    found = _SHARED.get((scenario, seed, config))
-    if found is None:
-        found = _SHARED[scenario, seed, config] = build(scenario, seed, config)
-    return found
-
-
 @njit
 def _draw(keys, episodes, which, numbers, drawn):
     """For the episodes of cars `which` [k]: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
@@ -73,15 +63,13 @@ class Episodes:
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
-            drawn = (numbers[:, 0] * len(self._seeds)).astype(np.intp)
-            index = {k: self._map(self._seeds[k]) for k in np.unique(drawn)}
-            maps = np.array([index[k] for k in drawn])
+            seeds = [self._seeds[k] for k in (numbers[:, 0] * len(self._seeds)).astype(np.intp)]
         else:
-            seeds = np.asarray(map_seed)
-            every = self.keys.shape
-            if seeds.dtype.kind not in "iu" or seeds.shape not in ((), every) or seeds.min() < 0:
+            given, every = np.asarray(map_seed), self.keys.shape
+            if given.dtype.kind not in "iu" or given.shape not in ((), every) or given.min() < 0:
                 raise ValueError(f"map_seed must be a whole number from 0, or {every[0]} of them, not {map_seed!r}")
-            maps = np.array([self._map(int(seed)) for seed in np.broadcast_to(seeds, every)[which]])
+            seeds = np.broadcast_to(given, every)[which].tolist()
+        maps = np.array([self._map(seed) for seed in seeds])
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is None:
             for m in np.unique(maps):
@@ -90,10 +78,6 @@ class Episodes:
         else:
             starts[:] = self._checked_start(start, which, maps)
         return maps, starts, keys
-
-    def upper_speeds(self, maps: np.ndarray) -> np.ndarray:
-        """Upper speed (m/s) of each of maps [k]."""
-        return np.array([s.road.speed_high for s in self.maps], dtype=np.float32)[maps]
 
     def keep_own_maps(self) -> None:
         """Forget maps that a reset asked for, unless episodes are drawn from them."""
@@ -105,7 +89,9 @@ class Episodes:
         """Index in `maps` of the map with a seed; built if missing."""
         seed = seed_of_map(self.scenario, seed)
         if seed not in self._index:
-            self.maps.append(shared_map(self.scenario, seed, self.config))
+            key = self.scenario, seed, self.config
+            found = _SHARED[key] = _SHARED.get(key) or build(*key)
+            self.maps.append(found)
             self._index[seed] = len(self.maps) - 1
         return self._index[seed]
 
