@@ -128,7 +128,7 @@ class Simulator:
         self.state = State(
             cars=np.zeros((cars, FIELDS), dtype=np.float32),
             visits=np.zeros((cars, 0), dtype=np.float32),
-            maps=np.full(cars, -1, dtype=np.int32),
+            maps=np.full(cars, -1, dtype=np.int32),  # -1 before a car's first reset
             ends=np.zeros(cars, dtype=np.uint8),
             worlds=np.zeros((cars, traffic, TRAFFIC_FIELDS), dtype=np.float32),
         )
@@ -136,8 +136,7 @@ class Simulator:
         self.closing = np.zeros((cars, rays), dtype=np.float32)
         self._physics: Physics | None = None  # made when a kernel first needs it
         self._charted: list[Map] = []  # the maps in the atlas
-        self._rows = np.full(cars, -1, dtype=np.int64)  # each car's map in the atlas, -1 before its first reset
-        self._groups = _by_map(self._rows)
+        self._groups = _by_map(self.state.maps)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without read-only arrays: their copies would be writable, and kernels would be compiled again for them."""
@@ -181,7 +180,7 @@ class Simulator:
         if not len(cars):
             return ranges, starts[:, 3]
         traffic = self._traffic(starts, maps, keys, worlds) if self.state.worlds.shape[1] else None
-        rows = self._chart(maps, everyone=len(cars) == n)
+        rows = self._chart(maps)
         cells = max(visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
             more = ((0, 0), (0, cells - self.state.visits.shape[1]))
@@ -191,11 +190,10 @@ class Simulator:
             state.worlds[cars] = traffic
         physics, around = self._kernel_physics(), self._kernel_worlds()
         _place_all(physics, *_by_map(rows), cars, starts, state.cars, state.visits, around, ranges, self.closing)
-        state.maps[cars] = maps
         state.ends[cars] = End.RUNNING
-        if (self._rows[cars] != rows).any():
-            self._rows[cars] = rows
-            self._groups = _by_map(self._rows)
+        if (state.maps[cars] != maps).any():
+            state.maps[cars] = maps
+            self._groups = _by_map(state.maps if n > 1 else rows)
         return ranges, starts[:, 3].copy()
 
     def _kernel_worlds(self) -> np.ndarray | None:
@@ -225,19 +223,13 @@ class Simulator:
             spawned[of] = spawn(self.scenarios[m].network, starts[of], shape[1], keys[of], self.config)
         return spawned
 
-    def _chart(self, maps: np.ndarray, everyone: bool) -> np.ndarray:
-        """Rows int64 [k] of maps [k] in the atlas, rebuilt if one is missing: of these alone if `everyone` is reset.
-
-        One car alone always has an atlas of one map, which is not copied.
-        """
-        wanted = {m: self.scenarios[m] for m in np.unique(maps).tolist()}
-        kept = [] if len(self) == 1 else self._charted
-        missing = [scenario for scenario in wanted.values() if not any(scenario is other for other in kept)]
-        if missing:
-            self._charted = list(wanted.values()) if everyone else kept + missing
-            self._physics = None
-        row = {id(scenario): k for k, scenario in enumerate(self._charted)}
-        return np.array([row[id(wanted[m])] for m in maps.tolist()], dtype=np.int64)
+    def _chart(self, maps: np.ndarray) -> np.ndarray:
+        """Rows of maps [k] in the atlas, which has all scenarios; for one car alone its map, which is not copied."""
+        alone = len(self) == 1
+        wanted = [self.scenarios[maps[0]]] if alone else self.scenarios
+        if [id(scenario) for scenario in wanted] != [id(scenario) for scenario in self._charted]:
+            self._charted, self._physics = list(wanted), None
+        return np.zeros_like(maps) if alone else maps
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
@@ -248,7 +240,7 @@ class Simulator:
         Raises: ValueError with one line for invalid actions; RuntimeError before the first reset.
         """
         n, state = len(self), self.state
-        if self._rows.min() < 0:
+        if state.maps.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
         actions = checked_actions(actions, n)
         ranges = np.empty_like(self.closing)
