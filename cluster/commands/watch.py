@@ -294,7 +294,7 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     drives = _drives(flags, SimConfig().episode.time_limit)
     first = next(drives)  # raises errors before the window opens
     shown = 0.0
-    with Window(size, f"GridSim: {flags.source}") as window:
+    with contextlib.closing(Window(size, f"GridSim: {flags.source}")) as window:
         for drive, title in itertools.chain([first], drives):
             before = checkpoint_time(run)
             renderer = Renderer(drive.scenario, size)
@@ -322,10 +322,10 @@ def _drive() -> int:
     traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic
     recorder: Recorder | None = None
     with contextlib.ExitStack() as stack:
-        window = stack.enter_context(Window(size, f"GridSim: {flags.scenario}"))
+        window = stack.enter_context(contextlib.closing(Window(size, f"GridSim: {flags.scenario}")))
         if flags.record:
             period = config.episode.control_period
-            recorder = stack.enter_context(Recorder(flags.record, scenario, period, traffic))
+            recorder = stack.enter_context(contextlib.closing(Recorder(flags.record, scenario, period, traffic)))
             stack.callback(_print_recorded, recorder)  # also if the drive is interrupted
         done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
         print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")

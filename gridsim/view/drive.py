@@ -123,12 +123,6 @@ class Recorder:
         """Close the file."""
         self._file.close()
 
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def read_drive(path: str | os.PathLike[str]) -> Drive:
     """Read a drive that `gridsim-drive --record` wrote.

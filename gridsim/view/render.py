@@ -283,9 +283,3 @@ class Window:
         """Close it."""
         self._pygame.display.quit()
         self.closed = True
-
-    def __enter__(self) -> Window:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import time
+from contextlib import closing
 from hashlib import sha256
 from pathlib import Path
 
@@ -130,7 +131,7 @@ def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
     scenario = build("seamless", 3)
     simulator = manual(scenario)
     start = sample_starts(scenario, 1, np.random.default_rng(1))[0]
-    with Recorder(tmp_path / "drive.csv", scenario, 0.1) as recorder:
+    with closing(Recorder(tmp_path / "drive.csv", scenario, 0.1)) as recorder:
         for episode, steps in enumerate((16, 11)):
             simulator.reset(start[None])
             for k in range(steps):

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def recorded(scenario, tmp_path_factory):
     start = sample_starts(scenario, 1, rng)[0]
     simulator = manual(scenario)
     poses = []
-    with Recorder(path, scenario, 0.1) as recorder:
+    with closing(Recorder(path, scenario, 0.1)) as recorder:
         for episode in range(2):
             simulator.reset(start[None])
             for step in range(60):
