@@ -51,9 +51,7 @@ class Observer:
     Attributes: space, the observation space of one car.
     """
 
-    def __init__(
-        self, simulator: Simulator, observation: str, frames: int = 1, motion: bool = False, steering: bool = False
-    ):
+    def __init__(self, simulator: Simulator, observation: str, frames: int, motion: bool, steering: bool):
         self._simulator, self.config = simulator, simulator.config
         self._motion, self._steering = motion, steering
         rays, vehicle = self.config.sensors.rays, self.config.vehicle

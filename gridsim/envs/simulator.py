@@ -179,15 +179,14 @@ class Simulator:
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
         if not len(cars):
             return ranges, starts[:, 3]
-        traffic = self._traffic(starts, maps, keys, worlds) if self.state.worlds.shape[1] else None
+        if self.state.worlds.shape[1]:
+            self.state.worlds[cars] = self._traffic(starts, maps, keys, worlds)
         rows = self._chart(maps)
         cells = max(visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
             more = ((0, 0), (0, cells - self.state.visits.shape[1]))
             self.state = self.state._replace(visits=np.pad(self.state.visits, more, constant_values=-1e6))
         state = self.state
-        if traffic is not None:
-            state.worlds[cars] = traffic
         physics, around = self._kernel_physics(), self._kernel_worlds()
         _place_all(physics, *_by_map(rows), cars, starts, state.cars, state.visits, around, ranges, self.closing)
         state.ends[cars] = End.RUNNING

@@ -30,7 +30,7 @@ from gridsim.config import FILE_SPEEDS, START_SPEED, SimConfig, VehicleConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, without_lanes
 from gridsim.maps.raster import HALF_WALL, OUTSIDE, check_starts, find_starts, road_length, signed_clearance
-from gridsim.maps.roads import CELLS_PER_M, power_of_two
+from gridsim.maps.roads import CELLS_PER_M
 
 PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
@@ -268,7 +268,7 @@ def _sides(free: np.ndarray, file: MapFile) -> tuple[int, int]:
         used = np.flatnonzero(free.any(axis=axis))
         first, last = used[0] * file.resolution, (used[-1] + 1) * file.resolution
         side = max(last + OUTSIDE, last - first + 2 * OUTSIDE + 1, SHORTEST_SIDE)
-        sides.append(power_of_two(side * CELLS_PER_M))
+        sides.append(1 << (math.ceil(side * CELLS_PER_M) - 1).bit_length())
     columns, rows = sides
     width, height = columns / CELLS_PER_M, rows / CELLS_PER_M
     if columns * rows > MAX_NODES:

@@ -37,14 +37,10 @@ def _thickened(free: np.ndarray, depth: np.ndarray, pixel: float) -> np.ndarray 
     `depth` is the distance (m) of a wall's pixels to the road. None if there is no thin wall.
     """
     middle = ~free & (depth < HALF_WALL) & (depth >= ndimage.maximum_filter(depth, size=3))
-    if not middle.any():
-        return None
     thick = depth >= HALF_WALL
-    if thick.any():
+    if middle.any() and thick.any():
         middle &= ndimage.distance_transform_edt(~thick) * pixel > HALF_WALL + _TIP
-        if not middle.any():
-            return None
-    return free & (ndimage.distance_transform_edt(~middle) * pixel > HALF_WALL)
+    return free & (ndimage.distance_transform_edt(~middle) * pixel > HALF_WALL) if middle.any() else None
 
 
 def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
@@ -96,28 +92,20 @@ def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: in
     return nodes
 
 
-def _clearance_at(nodes: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Clearance (m) at points, bilinearly, as in kernels."""
-    grid = [np.asarray(y) * CELLS_PER_M, np.asarray(x) * CELLS_PER_M]
-    return ndimage.map_coordinates(nodes, grid, order=1, mode="grid-wrap")
+def _clearance_around(nodes: np.ndarray, poses: np.ndarray, along: np.ndarray, left: np.ndarray | float) -> np.ndarray:
+    """Clearance (m) at points of a car's frame (m) at each of poses [n, 3]: [n, points], bilinear, as in kernels."""
+    x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
+    c, s = np.cos(heading), np.sin(heading)
+    at = [(y + along * s + left * c) * CELLS_PER_M, (x + along * c - left * s) * CELLS_PER_M]
+    return ndimage.map_coordinates(nodes, at, order=1, mode="grid-wrap")
 
 
 def _fits(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig, margin: float) -> np.ndarray:
     """Whether a car with a margin (m) around it is entirely on the road at poses [n, 3]: bool [n]."""
     half = np.array([vehicle.length, vehicle.width]) / 2 + margin
-    along, across = (np.linspace(-h, h, math.ceil(2 * h / _NODE) + 1) for h in half)
-    u, v = (points.ravel() for points in np.meshgrid(along, across))
-    x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
-    c, s = np.cos(heading), np.sin(heading)
-    return np.all(_clearance_at(nodes, x + u * c - v * s, y + u * s + v * c) >= 0.0, axis=1)
-
-
-def _free_ahead(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
-    """Whether a car can drive _AHEAD m straight on from poses [n, 3]: bool [n]."""
-    steps = np.arange(1, round(_AHEAD / _NODE) + 1) * _NODE
-    x, y, heading = poses[:, :1], poses[:, 1:2], poses[:, 2:]
-    ahead = _clearance_at(nodes, x + steps * np.cos(heading), y + steps * np.sin(heading))
-    return np.all(ahead >= vehicle.width / 2, axis=1)
+    along, left = (np.linspace(-h, h, math.ceil(2 * h / _NODE) + 1) for h in half)
+    u, v = (points.ravel() for points in np.meshgrid(along, left))
+    return np.all(_clearance_around(nodes, poses, u, v) >= 0.0, axis=1)
 
 
 def _directions(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -163,14 +151,6 @@ def road_length(nodes: np.ndarray) -> float:
     return float((area / np.maximum(width, _NODE)).max())
 
 
-def _large(wide: np.ndarray) -> np.ndarray:
-    """Which nodes belong to a connected component of _EXTENT m or more."""
-    labels, _ = ndimage.label(wide)
-    boxes = ndimage.find_objects(labels)
-    extent = [0.0] + [math.hypot(*(part.stop - part.start for part in box)) * _NODE for box in boxes]
-    return (np.array(extent) >= _EXTENT)[labels]
-
-
 def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
     """At most `count` of the items, evenly spread over their order."""
     return items[np.linspace(0, len(items) - 1, count).round().astype(int)] if len(items) > count else items
@@ -182,8 +162,9 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     Raises: ValueError with one line if a car fits nowhere along a road.
     """
     nodes, corner = _window(nodes)
-    wide = nodes >= vehicle.width / 2 + _MARGIN
-    large = _large(wide)
+    labels, _ = ndimage.label(nodes >= vehicle.width / 2 + _MARGIN)
+    extent = [math.hypot(*(side.stop - side.start for side in box)) * _NODE for box in ndimage.find_objects(labels)]
+    large = (np.array([0.0, *extent]) >= _EXTENT)[labels]  # label 0 is none
     if not large.any():
         raise ValueError(
             f"no room for a car: the road is nowhere {vehicle.width + 2 * _MARGIN:g} m wide over {_EXTENT:g} m; "
@@ -195,7 +176,9 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     along = np.column_stack([column * _NODE, row * _NODE, angle[row, column]])[coherence[row, column] >= _COHERENCE]
     along = _spread_sample(along, 4 * _STARTS)
     poses = np.concatenate([along, along + _BACK])
-    poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & _free_ahead(nodes, poses, vehicle)]
+    steps = np.arange(1, round(_AHEAD / _NODE) + 1) * _NODE
+    goes_on = np.all(_clearance_around(nodes, poses, steps, 0.0) >= vehicle.width / 2, axis=1)
+    poses = poses[_fits(nodes, poses, vehicle, _MARGIN) & goes_on]
     if not len(poses):
         raise ValueError(
             f"no room for a car of {vehicle.length:g} m x {vehicle.width:g} m with {_AHEAD:g} m of road ahead; "

@@ -216,11 +216,6 @@ def freeze(array: np.ndarray) -> np.ndarray:
     return view
 
 
-def power_of_two(n: float) -> int:
-    """The smallest power of two that is at least n."""
-    return 1 << max(int(math.ceil(n)) - 1, 0).bit_length()
-
-
 def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
     """Clearance float32 [rows, columns] at the nodes of the field, in m.
 
