@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -121,13 +120,13 @@ def cluster() -> Iterator[Callable[..., tuple[str, subprocess.Popen]]]:
 
     Keywords but `address` are set in its environment.
     """
+    from tracked import free_port
+
     nodes: list[subprocess.Popen] = []
     folders = []  # in a user's own, `ray start` would name another head as the current one; paths of sockets are short
 
     def node(cpus: int, address: str = "", **environment: str) -> tuple[str, subprocess.Popen]:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
+        port = free_port()
         where = [f"--address={address}"]
         if not address:
             folders.append(tempfile.mkdtemp(prefix="gridsim-", dir="/tmp"))

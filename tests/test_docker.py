@@ -250,11 +250,10 @@ def test_the_services_come_up_and_a_run_is_evolved_on_them_and_tracked(
     wait_until(lambda: services.healthy("mlflow"))
     environment = services.environment("head")
     address = services.here("head:6379")  # where containers say auto: another Ray may run on this machine
-    done = finish(
+    finish(
         "gridsim-evolve", "--address", address, "--workers", "1", "--population", "16", "--generations", "1",
         "--name", "composed", cwd=services.folder, timeout=500, **environment,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     summary = json.loads((services.folder / "runs/composed/summary.json").read_text())
     assert summary["workers"] == 1
     assert summary["mlflow_run_id"], "the server has it"

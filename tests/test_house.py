@@ -1,14 +1,13 @@
 """The house rules: who may import whom, what sits behind one file, how large a file and a folder may be."""
 
 import ast
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from commands import finish
 
 # Imports run downwards only: cluster -> evolution -> gridsim.
 RANK = {"gridsim": 0, "evolution": 1, "cluster": 2}
@@ -116,6 +115,4 @@ def test_no_files_import_each_other_in_a_circle(root: Path) -> None:
 )
 def test_a_fresh_process_loads_no_more_than_it_needs(root: Path, module: str, banned: set[str]) -> None:
     code = f"import sys, {module}; print(*sorted({banned!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
+    assert finish("python", "-c", code, cwd=root).stdout.split() == []

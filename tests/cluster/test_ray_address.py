@@ -7,6 +7,7 @@ import time
 
 import pytest
 from test_pool import never_built
+from tracked import free_port
 
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_pool import RayPool
@@ -22,9 +23,7 @@ def test_what_is_no_address(address: str) -> None:
 
 
 def test_an_address_where_nothing_answers() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+    address = f"127.0.0.1:{free_port()}"
     started = time.perf_counter()
     with pytest.raises(PoolError, match=rf"^no Ray cluster answers at {address}: Connection refused; is `ray start"):
         RayPool(2, never_built, address)

@@ -6,11 +6,11 @@ import re
 import shutil
 import sqlite3
 import subprocess
-import sys
 import time
 
 import pytest
-from tracked import PARAMS, TAGS, begin, client, row, runs, steps, tracker, with_path
+from commands import finish, start
+from tracked import PARAMS, PYTHONPATH, TAGS, begin, client, row, runs, steps, tracker
 
 import cluster.tracking.commit
 from cluster.tracking import mlflow_run
@@ -148,13 +148,9 @@ assert (report is None) == (len(sys.argv) > 2), report
 
 
 def test_two_at_once_create_one_database_and_print_nothing(tmp_path):
-    command = [sys.executable, "-W", "default", "-c", QUIET, f"sqlite:///{tmp_path}/mlflow.db", "good"]
-    both = [
-        subprocess.Popen(command, env=with_path(), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        for _ in range(2)
-    ]
-    for process in both:
-        output = process.communicate(timeout=600)[0]
+    command = ["python", "-W", "default", "-c", QUIET, f"sqlite:///{tmp_path}/mlflow.db", "good"]
+    for process in [start(*command, cwd="/", PYTHONPATH=PYTHONPATH) for _ in range(2)]:
+        output = "".join(process.communicate(timeout=600))
         # -W default shows what a user never sees; of that nothing may be ours.
         assert process.returncode == 0, output
         assert "cluster" not in output
@@ -174,9 +170,8 @@ def test_prints_nothing(tmp_path, empty_database):
     with contextlib.closing(sqlite3.connect(broken)) as database:
         database.execute("ALTER TABLE metrics RENAME COLUMN is_nan TO is_gone")  # MLflow logs a traceback
     for arguments in ([f"sqlite:///{good}", "good"], [f"sqlite:///{foreign}"], [f"sqlite:///{broken}"]):
-        command = [sys.executable, "-c", QUIET, *arguments]
-        done = subprocess.run(command, env=with_path(), capture_output=True, text=True, timeout=600)
-        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        done = finish("python", "-c", QUIET, *arguments, cwd="/", timeout=600, PYTHONPATH=PYTHONPATH)
+        assert (done.stdout, done.stderr) == ("", "")
 
 
 def test_git_commit(tmp_path, monkeypatch):
@@ -188,8 +183,7 @@ def test_git_commit(tmp_path, monkeypatch):
 
     def told(folder, **environment):
         script = "from cluster.tracking.commit import git_commit; print(git_commit())"
-        environment = {**os.environ, "PYTHONPATH": str(folder), **environment}
-        done = subprocess.run([sys.executable, "-c", script], cwd="/", env=environment, capture_output=True, text=True)
+        done = finish("python", "-c", script, cwd="/", PYTHONPATH=str(folder), **environment)
         assert done.stderr == ""
         return done.stdout.strip()
 

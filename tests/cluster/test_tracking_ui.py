@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import urllib.request
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from browser import Browser, needs_chromium
+from commands import finish
 from tracked import free_port, row, tracker
 
 from cluster.tracking.mlflow_run import run_tables
@@ -99,17 +101,8 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
 
 
 def test_a_port_in_use_is_one_line(tmp_path):
-    import socket
-
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        done = subprocess.run(
-            [sys.executable, "-m", "cluster.commands.ui", port],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-    assert done.returncode == 1
+        done = finish("python", "-m", "cluster.commands.ui", port, cwd=tmp_path, code=1)
     assert done.stderr == f"make ui: port {port} is in use or not a port; choose another with make ui PORT=...\n"
     assert not list(Path(tmp_path).iterdir())

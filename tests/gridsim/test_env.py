@@ -3,8 +3,6 @@
 import ast
 import math
 import re
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from commands import finish
 from driving import SENSING, drive
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
@@ -37,14 +36,13 @@ Maps = dict[str, list[Map]]
 # --- spaces
 
 
-def test_importing_gridsim_registers_in_milliseconds_and_loads_no_numba() -> None:
+def test_importing_gridsim_registers_in_milliseconds_and_loads_no_numba(root: Path) -> None:
     """Beside Gymnasium, it takes the processor some milliseconds."""
     code = "import sys, time, gymnasium; began = time.process_time(); import gridsim; end = time.process_time()"
     code += "; print('GridSim/City-v0' in gymnasium.registry, 'numba' in sys.modules, end - began)"
     took = []
     for _ in range(5):
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-        *found, seconds = done.stdout.split()
+        *found, seconds = finish("python", "-c", code, cwd=root).stdout.split()
         assert found == ["True", "False"]
         took.append(float(seconds))
     assert np.median(took) < 0.05

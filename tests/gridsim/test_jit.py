@@ -1,20 +1,15 @@
 """Compiled kernels: never stale after an edit anywhere."""
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import pytest
+from commands import finish
 
 from gridsim import jit
-
-F = np.float32
 
 # `collides` is in one file, `clearance`, which it calls, and the constant in there are in another.
 CALLER = """
@@ -45,15 +40,7 @@ def copy(root, tmp_path):
 
 def python(code, folder, cache):
     """Run a script in a process of its own; its last line is JSON."""
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=folder,
-        env={**os.environ, "GRIDSIM_CACHE_DIR": str(cache), "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    done = finish("python", "-c", code, cwd=folder, GRIDSIM_CACHE_DIR=str(cache), PYTHONDONTWRITEBYTECODE="1")
     return json.loads(done.stdout.splitlines()[-1])
 
 

@@ -29,14 +29,22 @@ def start(*arguments, cwd, **env):
     )
 
 
-def finish(*arguments, cwd, timeout=240, **env):
-    """A command, run to its end."""
+@contextlib.contextmanager
+def running(*arguments, cwd, **env):
+    """A command, started; nothing of it is left in the end."""
     process = start(*arguments, cwd=cwd, **env)
     try:
-        out, err = process.communicate(timeout=timeout)
+        yield process
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
+
+
+def finish(*arguments, cwd, timeout=240, code=0, **env):
+    """A command, run to its end, which has to be with that exit code."""
+    with running(*arguments, cwd=cwd, **env) as process:
+        out, err = process.communicate(timeout=timeout)
+    assert process.returncode == code, f"{process.args} ended with {process.returncode}:\n{out}\n{err}"
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
 
 
@@ -92,17 +100,6 @@ def same_run(run, reference):
     return all_in_mlflow(run)
 
 
-def duration_s(run):
-    """Duration that MLflow, in the database beside the run's folder's folder, has of the only run there."""
-    from mlflow.tracking import MlflowClient
-
-    client = MlflowClient(tracking_uri=f"sqlite:///{run.parent.parent}/mlflow.db")
-    experiment = client.get_experiment_by_name("gridsim")
-    assert experiment is not None
-    (found,) = client.search_runs([experiment.experiment_id])
-    return (found.info.end_time - found.info.start_time) / 1000.0
-
-
 def descendants(pid):
     """Processes below a process."""
     with contextlib.suppress(psutil.NoSuchProcess):
@@ -142,10 +139,10 @@ def answers(address: str) -> bool:
 
 def end(node: subprocess.Popen) -> None:
     """Kill a host: all of its processes, at once."""
-    with contextlib.suppress(psutil.NoSuchProcess):
-        for process in [*psutil.Process(node.pid).children(recursive=True), psutil.Process(node.pid)]:
-            with contextlib.suppress(psutil.NoSuchProcess):
-                process.kill()
+    for pid in descendants(node.pid):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    node.kill()
     node.wait()
 
 

@@ -61,9 +61,7 @@ def missing() -> str:
     packages = sorted({package for program, package in PROGRAMS.items() if not shutil.which(program, path=SEARCH)})
     if packages:
         return f"needs apt-get install {' '.join(packages)}"
-    done = subprocess.run(
-        ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc", "true"], capture_output=True
-    )
+    done = subprocess.run([*UNSHARE, "true"], capture_output=True)
     return "" if done.returncode == 0 else "needs leave to make namespaces (in Docker: --privileged)"
 
 

@@ -18,6 +18,8 @@ from gridsim.car.ego import End
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}
 TAGS = {"algorithm": "evolution", "scenario": "seamless"}
+# With it scripts find the packages and this file, whatever the working directory.
+PYTHONPATH = os.pathsep.join([str(Path(mlflow_run.__file__).resolve().parents[2]), str(Path(__file__).parent)])
 
 
 def row(step):
@@ -62,12 +64,6 @@ def begin(uri, count, **options):
     return begun.run_id
 
 
-def with_path(**more):
-    """An environment in which scripts find the packages, whatever the working directory."""
-    folders = [Path(mlflow_run.__file__).resolve().parents[2], Path(__file__).parent]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders)), **more}
-
-
 def free_port():
     with socket.create_server(("127.0.0.1", 0)) as free:
         return free.getsockname()[1]
@@ -94,7 +90,7 @@ def mlflow_server(folder, port):
         server.wait(10)
 
 
-def drive_both(champion, network, traffic=0):
+def drive_both(champion, network, traffic):
     """Drive one episode by a champion and by its torch model, which act alike: steps, how it ended, metres."""
     import torch
 
@@ -112,23 +108,3 @@ def drive_both(champion, network, traffic=0):
     theirs = drive(lambda seen: int(network(torch.from_numpy(seen[None])).argmax()))
     assert mine == theirs, (mine[1], theirs[1])
     return len(mine[0]), End(mine[1]["end"]).name.lower(), mine[1]["distance_m"]
-
-
-FRESH = """
-import sys
-import mlflow.pytorch
-from cluster.runs.champion import load_champion
-from tracked import drive_both
-mlflow.set_tracking_uri(sys.argv[1])
-print(*drive_both(load_champion(sys.argv[3]), mlflow.pytorch.load_model(sys.argv[2]), int(sys.argv[4])))
-"""
-
-
-def drive_registered(uri, model, champion, traffic):
-    """`drive_both` in a fresh process, which takes no pickle: a registered model and a champion.npz."""
-    command = [sys.executable, "-c", FRESH, uri, model, str(champion), str(traffic)]
-    safe = with_path(MLFLOW_ALLOW_PICKLE_DESERIALIZATION="false")
-    done = subprocess.run(command, env=safe, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    count, end, distance = done.stdout.split()
-    return int(count), end, float(distance)
