@@ -106,6 +106,13 @@ def dummy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing that a window could be opened on."""
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(variable, raising=False)
+
+
 @pytest.fixture(scope="module")
 def stand_ins(request: pytest.FixtureRequest) -> Iterator[None]:
     """Ray's workers, which know nothing of pytest's search path, can import what a test's file defines."""

@@ -227,12 +227,11 @@ WRONG = [
 ]
 
 
+@pytest.mark.usefixtures("no_display")
 @pytest.mark.parametrize(("line", "expected"), WRONG)
 def test_wrong_use_is_one_clear_line(going, tmp_path, line, expected, monkeypatch, capsys):
     if expected == "DISPLAY" and not sys.platform.startswith("linux"):
         pytest.skip("elsewhere there is always a display")
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(variable, raising=False)
     monkeypatch.chdir(tmp_path)
     arguments = line.replace("RUN", str(going)).replace("CHAMPION", str(CHAMPION)).split()
     assert expected in " ".join(refused(watch_main, monkeypatch, capsys, *arguments))

@@ -1,18 +1,19 @@
 """A person's drive: keys to actions, the recorded file and its replay, and a real window driven by real key events."""
 
+import contextlib
 import csv
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import call
+from commands import finish, refused, running, wait_until
 
 from cluster.commands.watch import drive_main
 from gridsim.car.ego import End
@@ -20,17 +21,7 @@ from gridsim.car.vehicle import Action
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import (
-    COLUMNS,
-    Recorder,
-    action_for,
-    manual,
-    poses_of,
-    read_drive,
-    replay,
-)
-
-COMMAND = [sys.executable, "-c", "from cluster.commands.entry import drive_main; drive_main()"]
+from gridsim.view.drive import COLUMNS, Recorder, action_for, manual, poses_of, read_drive, replay
 
 
 @pytest.fixture(scope="module")
@@ -98,15 +89,6 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
     assert (len(cars), len(ranges)) == (len(poses), len(poses))
 
 
-def test_recorder_overwrites_nothing(scenario, recorded, tmp_path):
-    before = recorded[0].read_bytes()
-    with pytest.raises(GridSimError, match="exists already"):
-        Recorder(recorded[0], scenario, 0.1)
-    assert recorded[0].read_bytes() == before
-    with pytest.raises(GridSimError, match="cannot be written"):
-        Recorder(tmp_path / "nowhere" / "drive.csv", scenario, 0.1)
-
-
 DAMAGES = {
     "cut off": (lambda text: text[: len(text) // 2 - 3], "or incomplete: "),
     "header only": (lambda text: text.splitlines()[0] + "\n", "no rows"),
@@ -150,8 +132,8 @@ def test_damaged_file_is_one_clear_line(recorded, tmp_path, name):
 
 
 @pytest.fixture
-def display(tmp_path):
-    """An X server without a screen."""
+def display(monkeypatch, no_display):
+    """An X server without a screen, that DISPLAY names."""
     missing = [name for name in ("Xvfb", "xdotool") if not shutil.which(name)]
     if missing:
         pytest.skip(f"needs {' and '.join(missing)} (Debian: apt install xvfb xdotool)")
@@ -167,69 +149,59 @@ def display(tmp_path):
         with os.fdopen(read) as file:
             number = file.readline().strip()
         assert number, "Xvfb did not start"
-        yield f":{number}"
+        monkeypatch.setenv("DISPLAY", f":{number}")
+        yield
     finally:
         server.terminate()
         server.wait(10)
 
 
-def start_driving(display, folder, *arguments):
-    """gridsim-drive in a window on that display, once the window is there: (process, how to press keys)."""
-    environment = {**os.environ, "DISPLAY": display}
-    environment.pop("SDL_VIDEODRIVER", None)
-    process = subprocess.Popen(
-        [*COMMAND, "--scenario", "seamless", "--seed", "11", "--size", "320x240", *arguments],
-        cwd=folder,
-        env={**environment, "PYTHONPATH": str(Path(__file__).parents[2])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-    def keys(*words):
-        return subprocess.run(["xdotool", *words], env=environment, capture_output=True, text=True, check=False)
-
-    end = time.monotonic() + 120
-    while True:
-        for found in keys("search", "--class", "").stdout.split():
-            if keys("getwindowname", found).stdout.startswith("GridSim"):
-                keys("windowfocus", "--sync", found)
-                return process, keys
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.1)
+def keys(*words):
+    return subprocess.run(["xdotool", *words], capture_output=True, text=True, check=False).stdout
 
 
-def wait_for_rows(path, count, process):
-    end = time.monotonic() + 60
-    while not path.exists() or path.read_text().count("\n") <= count:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.02)
+def focus():
+    """Give the keys to the window; whether it is there."""
+    for found in keys("search", "--class", "").split():
+        if keys("getwindowname", found).startswith("GridSim"):
+            keys("windowfocus", "--sync", found)
+            return True
+    return False
+
+
+def wait_for(process, condition):
+    wait_until(lambda: process.poll() is not None or condition())
+    assert process.poll() is None, process.communicate()
+
+
+@contextlib.contextmanager
+def driving(path):
+    """gridsim-drive in a window that has the keys, recorded: (process, how to wait for more than so many rows)."""
+    arguments = ["--scenario", "seamless", "--seed", "11", "--size", "320x240", "--record", path.name]
+    with running("gridsim-drive", *arguments, cwd=path.parent) as process:
+        wait_for(process, focus)
+        yield process, lambda rows: wait_for(process, lambda: path.exists() and path.read_text().count("\n") > rows)
 
 
 @pytest.mark.e2e
 def test_real_keys_drive_a_real_window(display, tmp_path):
     path = tmp_path / "drive.csv"
-    process, keys = start_driving(display, tmp_path, "--record", "drive.csv")
-    try:
-        wait_for_rows(path, 3, process)
+    with driving(path) as (process, wait_for_rows):
+        wait_for_rows(3)
         began, rows = time.monotonic(), path.read_text().count("\n")
         keys("keydown", "Up")
-        wait_for_rows(path, rows + 12, process)
+        wait_for_rows(rows + 12)
         keys("keydown", "Left")
-        wait_for_rows(path, rows + 15, process)
+        wait_for_rows(rows + 15)
         keys("keyup", "Left", "keyup", "Up", "keydown", "space")
-        wait_for_rows(path, rows + 18, process)
+        wait_for_rows(rows + 18)
         keys("keyup", "space")
-        wait_for_rows(path, rows + 30, process)
+        wait_for_rows(rows + 30)
         took = time.monotonic() - began
         keys("key", "r")
-        wait_for_rows(path, rows + 34, process)
+        wait_for_rows(rows + 34)
         keys("key", "Escape")
         out, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert process.returncode == 0, err
     assert err == ""
     assert "gridsim-watch drive.csv" in out
@@ -248,45 +220,33 @@ def test_real_keys_drive_a_real_window(display, tmp_path):
 
 @pytest.mark.e2e
 def test_ctrl_c_keeps_the_drive(display, tmp_path):
-    process, _ = start_driving(display, tmp_path, "--record", "drive.csv")
-    try:
-        wait_for_rows(tmp_path / "drive.csv", 5, process)
+    with driving(tmp_path / "drive.csv") as (process, wait_for_rows):
+        wait_for_rows(5)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=30)
-    finally:
-        process.kill()
     assert process.returncode == 130
     assert "Traceback" not in out + err
     assert len(read_drive(tmp_path / "drive.csv")) >= 5
 
 
-@pytest.fixture
-def refused(tmp_path, monkeypatch, capsys):
-    """Calls gridsim-drive in an empty folder, which refuses it: what it says."""
-    monkeypatch.chdir(tmp_path)
-
-    def said(*arguments):
-        code, out, err = call(drive_main, monkeypatch, capsys, *arguments)
-        assert (code, out) == (2, "")
-        assert err.startswith("gridsim-drive: error: ")
-        assert err.count("\n") <= 3
-        return err
-
-    return said
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a display")
-def test_without_a_display_it_says_so_and_makes_no_file(refused, monkeypatch, tmp_path):
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(variable, raising=False)
-    assert "DISPLAY" in refused("--record", "drive.csv")
+@pytest.mark.usefixtures("no_display")
+@pytest.mark.parametrize("display", ["", ":77"])  # none, and one that does not answer
+def test_without_a_display_it_says_so_and_makes_no_file(display, tmp_path):
+    done = finish("gridsim-drive", "--record", "drive.csv", cwd=tmp_path, code=2, DISPLAY=display)
+    assert re.fullmatch(r"gridsim-drive: error: no window can be opened [^\n]* DISPLAY [^\n]*\n", done.stderr)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures("dummy")
-def test_wrong_flags_and_an_existing_file(refused, tmp_path):
+def test_wrong_flags_and_a_file_that_exists_or_cannot_be_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "drive.csv").write_text("mine")
-    assert "exists already" in refused("--record", "drive.csv")
+    for line, said in (
+        ("--record drive.csv", "exists already"),
+        ("--record nowhere/drive.csv", "cannot be written"),
+        ("--size big", "--size"),
+        ("--scenario moon", "unknown scenario"),
+    ):
+        assert said in refused(drive_main, monkeypatch, capsys, *line.split())[0]
     assert (tmp_path / "drive.csv").read_text() == "mine"
-    assert "--size" in refused("--size", "big")
-    assert "unknown scenario" in refused("--scenario", "moon")

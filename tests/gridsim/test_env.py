@@ -61,14 +61,11 @@ SEES: list[dict[str, Any]] = [{"motion": motion, "steering": steering} for motio
 SEES += [{"observation": observation, "frames": frames} for observation in ("grid", "image") for frames in (1, 4)]
 
 
+@pytest.mark.usefixtures("no_display")
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 @pytest.mark.parametrize("sees", SEES)
 @pytest.mark.parametrize("name", IDS)
-def test_gymnasiums_checker_passes_without_a_display(
-    maps: Maps, monkeypatch: pytest.MonkeyPatch, name: str, sees: dict[str, Any], actions: str
-) -> None:
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(variable, raising=False)
+def test_gymnasiums_checker_passes_without_a_display(maps: Maps, name: str, sees: dict[str, Any], actions: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make(name, maps=maps[ENVIRONMENTS[name]][:1], actions=actions, render_mode="rgb_array", **sees)

@@ -1,9 +1,6 @@
 """Pictures are held against the map and the state they show: which pixel is what, and where things are."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -16,10 +13,6 @@ from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
 from gridsim.view import paint, render
 from gridsim.view.render import Renderer, interpolate
-
-BARE = {**os.environ}
-for _name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR"):
-    BARE.pop(_name, None)
 
 
 @pytest.fixture(scope="module")
@@ -153,27 +146,3 @@ def test_between_goes_over_the_seam_and_keeps_the_heading_a_unit(scenario):
     assert np.hypot(half[SIN], half[COS]) == pytest.approx(1.0, abs=1e-6)
     assert half[SPEED] == pytest.approx(2.0)
     assert interpolate(a, b, 0.0, scenario) == pytest.approx(a)
-
-
-WINDOW = "from gridsim.view.render import NoDisplayError, Window\ntry:\n    Window((320, 240))\n    print('open')\n" + (
-    "except NoDisplayError as error:\n    print(error)\n"
-)
-
-
-def window(**environment):
-    done = subprocess.run(
-        [sys.executable, "-c", WINDOW], env={**BARE, **environment}, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    return done.stdout.strip()
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere there is always a display")
-def test_no_display_is_one_line_and_a_chosen_driver_is_accepted():
-    for nowhere in ({}, {"DISPLAY": ":77"}):
-        said = window(**nowhere)
-        assert said.startswith("no window can be opened")
-        assert "DISPLAY" in said
-        assert "\n" not in said
-    assert window(SDL_VIDEODRIVER="dummy") == "open"
