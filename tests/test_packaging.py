@@ -7,9 +7,6 @@ from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
 
-import pytest
-from commands import finish
-
 PROJECT: dict[str, Any] = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
 SCRIPTS: dict[str, str] = PROJECT["project"]["scripts"]
 
@@ -22,14 +19,6 @@ def test_changelog_has_a_place_for_what_comes_next(root: Path) -> None:
 def test_installed_commands_are_the_declared_ones() -> None:
     installed = distribution("gridsim").entry_points.select(group="console_scripts")
     assert {entry.name: entry.value for entry in installed} == SCRIPTS
-
-
-@pytest.mark.parametrize("name", ["gridsim-evolve", "gridsim-drive"])  # all are read in tests/cluster/test_command.py
-def test_command_explains_itself_in_a_process_of_its_own(tmp_path: Path, name: str) -> None:
-    done = finish(name, "--help", cwd=tmp_path)
-    assert done.stderr == ""
-    assert done.stdout.startswith(f"usage: {name}")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_folder_is_a_package_and_typed(root: Path) -> None:

@@ -3,15 +3,13 @@
 import importlib
 import os
 import re
-import shlex
 import signal
-import subprocess
 import sys
 import time
 from importlib.metadata import entry_points, version
 
 import pytest
-from commands import BIN
+from commands import call, start
 
 from cluster.commands import common as command
 from cluster.commands import entry, watch
@@ -65,13 +63,6 @@ def test_what_is_not_given_follows_from_what_is():
     assert (flags.policy, flags.population, flags.car_steps) == ("mlp:64+motion+steering", 128, 0)
 
 
-def refused(prog, line, capsys):
-    with pytest.raises(SystemExit) as ended:
-        parse(FLAGS[prog], prog, shlex.split(line))
-    assert ended.value.code == 2
-    return capsys.readouterr().err.splitlines()
-
-
 @pytest.mark.parametrize(
     ("prog", "line", "said"),
     [
@@ -96,7 +87,9 @@ def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, te
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
-    assert refused(prog, line, capsys) == [f"{prog}: error: {said}", f"see {prog} --help"]
+    with pytest.raises(SystemExit, match=r"^2$"):
+        parse(FLAGS[prog], prog, line.split())
+    assert capsys.readouterr().err.splitlines() == [f"{prog}: error: {said}", f"see {prog} --help"]
 
 
 @pytest.mark.parametrize(("written", "meant"), [("1e6", 10**6), ("1.5e3", 1500), ("1_000_000", 10**6), ("7", 7)])
@@ -106,12 +99,11 @@ def test_a_whole_number_may_be_written_with_an_exponent_or_underscores(written, 
 
 
 @pytest.mark.parametrize("prog", ["gridsim-evolve", "gridsim-drive"])  # more and less than a pipe's buffer holds
-def test_help_into_head_ends_quietly(prog):
-    with subprocess.Popen([BIN / prog, "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as shown:
-        assert shown.stdout
-        assert shown.stderr
+def test_help_into_head_ends_quietly(prog, tmp_path):
+    with start(prog, "--help", cwd=tmp_path) as shown:
         shown.stdout.close()
         assert (shown.stderr.read(), shown.wait()) == ("", 0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_other_form_of_a_switch_is_known(capsys):
@@ -183,11 +175,9 @@ def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monke
 
     monkeypatch.setattr(ray_pool, "RayPool", no_ray)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["gridsim-evolve", "--workers", "1000", "--scenario", "curved"])
-    with pytest.raises(SystemExit) as ended:
-        evolve_main()
-    assert ended.value.code == 1
-    warning, error = capsys.readouterr().err.splitlines()
+    code, _, err = call(evolve_main, monkeypatch, capsys, "--workers", 1000, "--scenario", "curved")
+    assert code == 1
+    warning, error = err.splitlines()
     assert warning.startswith("gridsim-evolve: warning: 1,000 workers on 2 cores")
     assert error == "gridsim-evolve: error: no Ray in this test"
     warn_of_many_workers("gridsim-compare", 4, "")

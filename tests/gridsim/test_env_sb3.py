@@ -1,4 +1,4 @@
-"""Learners of others: Stable-Baselines3 on the vector environment and in processes of its own, and EvoTorch."""
+"""Stable-Baselines3 on the vector environment and in processes of its own."""
 
 import doctest
 
@@ -105,17 +105,3 @@ def test_sb3s_own_processes_find_the_environment_by_its_modules_name():
     np.testing.assert_array_equal(cars.reset(), own.reset(seed=3)[0])
     np.testing.assert_array_equal(cars.step(np.zeros(2, dtype=int))[0], own.step(np.zeros(2, dtype=int))[0])
     cars.close()
-
-
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script:DeprecationWarning")  # EvoTorch's own
-def test_evotorch_evolves_on_the_environment():
-    from evotorch.algorithms import SNES
-    from evotorch.neuroevolution import GymNE
-
-    options = {"maps": 1, "max_episode_steps": 40}
-    problem = GymNE("gridsim:GridSim/Curved-v0", "Linear(obs_length, act_length)", env_config=options)
-    search = SNES(problem, popsize=8, stdev_init=0.5)
-    search.run(2)
-    assert problem.status["total_episode_count"] == 16
-    assert 16 * 15 <= problem.status["total_interaction_count"] <= 16 * 40
-    assert np.isfinite(search.status["best_eval"])

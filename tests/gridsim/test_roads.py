@@ -82,13 +82,6 @@ def test_sides_that_do_not_fit_are_refused(width, height):
 # --- What kernels read -----------------------------------------------------------------------------------------------
 
 
-def test_what_kernels_read_is_read_only(scenario):
-    parts = [*scenario.road, *scenario.network, *vars(scenario.lanes).values(), *vars(scenario.strips).values()]
-    for array in (part for part in parts if isinstance(part, np.ndarray)):
-        assert array.flags.c_contiguous
-        assert not array.flags.writeable
-
-
 def test_freeze_copies_only_what_it_must_and_the_callers_own_stays_writable():
     whole = np.arange(12.0).reshape(3, 4)
     assert np.shares_memory(freeze(whole), whole)
