@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from commands import rows
+from searching import state_of
 
 from cluster.runs.checkpoint import load, save
 from cluster.runs.run import new_run, open_run
@@ -73,11 +74,6 @@ class StopsAfterTwo(Reporter):
     def row(self, steps, row):
         if steps == 2:
             raise KeyboardInterrupt
-
-
-def state_of(evolution):
-    arrays, meta = evolution.state()
-    return {name: array.tobytes() for name, array in arrays.items()}, meta
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])

@@ -2,7 +2,6 @@
 
 import math
 
-import numba
 import numpy as np
 import pytest
 from searching import new_genomes
@@ -16,19 +15,6 @@ torch = pytest.importorskip("torch")
 
 F = np.float32
 TEXTS = ["cnn:8,8,8@1", "cnn:8,16,32@1", "cnn:16,24,40@2", "cnn:24,32,64@3", "cnn"]
-
-
-@numba.njit
-def outputs_of(genome, layers, grids, speed, room):
-    for k in range(grids.shape[0]):
-        convnet.push(grids[k], False, room)
-    convnet.forward(genome, layers, speed, room)
-    return room.outputs.copy()
-
-
-@numba.njit
-def decide(genome, layers, speed, room):
-    return convnet.decide(genome, layers, speed, room)
 
 
 def cnn(text):
@@ -76,11 +62,13 @@ def test_forward_is_pytorchs(text):
     room = convnet.scratch(spec)
     for genome in new_genomes(spec, 4):
         frames, speed = random_grids(spec.frames, rng), rng.uniform(-3, 30)
-        seen = outputs_of(genome, spec.layers, frames.reshape(spec.frames, -1), F(speed), room)
+        for frame in frames:
+            convnet.push(frame.ravel(), False, room)
+        convnet.forward(genome, spec.layers, F(speed), room)
         expected = in_torch(spec, genome, frames, float(F(speed)))
         assert np.abs(expected).max() > 1e-3
-        assert seen == pytest.approx(expected, abs=2e-5 * max(1.0, np.abs(expected).max()))
-        assert decide(genome, spec.layers, F(speed), room) == int(seen.argmax())
+        assert room.outputs == pytest.approx(expected, abs=2e-5 * max(1.0, np.abs(expected).max()))
+        assert convnet.decide(genome, spec.layers, F(speed), room) == int(room.outputs.argmax())
 
 
 def test_a_gene_that_is_not_a_number_is_no_action():
@@ -91,8 +79,8 @@ def test_a_gene_that_is_not_a_number_is_no_action():
     for gene in [*range(0, spec.size, 37), *range(spec.size - 140, spec.size)]:
         spoilt = genome.copy()
         spoilt[gene] = math.nan
-        assert decide(spoilt, spec.layers, F(5), room) == -1, gene
-    assert decide(genome, spec.layers, F(5), room) >= 0  # and nothing of it stays
+        assert convnet.decide(spoilt, spec.layers, F(5), room) == -1, gene
+    assert convnet.decide(genome, spec.layers, F(5), room) >= 0  # and nothing of it stays
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import torch
 from evolution.dqn.experience import NO_ACTION, Experience
 from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, new_weights, tanh
 from evolution.dqn.replay import Batch, Replay
-from evolution.networks import policy
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 
@@ -18,26 +17,22 @@ F = np.float32
 SPEC = PolicySpec.parse("mlp:5")
 
 
-def learner_of(genome=None, spec=SPEC, **config):
-    learner = DqnLearner(spec, DqnConfig(**config), seed=1)
+def learner_of(genome=None, **config):
+    learner = DqnLearner(SPEC, DqnConfig(**config), seed=1)
     if genome is not None:
         learner.load_weights(genome)
     return learner
 
 
-def random_batch(spec, n, seed=0):
+def random_batch(n, seed=0):
     rng = np.random.default_rng(seed)
     return Batch(
-        rng.uniform(-1, 1, (n, spec.inputs)).astype(F),
+        rng.uniform(-1, 1, (n, SPEC.inputs)).astype(F),
         rng.integers(0, 8, n),
         rng.normal(size=n).astype(F),
-        rng.uniform(-1, 1, (n, spec.inputs)).astype(F),
+        rng.uniform(-1, 1, (n, SPEC.inputs)).astype(F),
         rng.uniform(0, 1, n).astype(F),
     )
-
-
-def random_genome(spec, seed=1):
-    return (np.random.default_rng(seed).normal(size=spec.size) * 0.3 * policy.gene_scales(spec)).astype(F)
 
 
 def replay_of_random_episodes():
@@ -76,17 +71,12 @@ def biased(values):
     return genome
 
 
-def fixed_batch(discounts):
-    """Action 2 with reward 3 in each row."""
-    n, zeros = len(discounts), np.zeros((len(discounts), SPEC.inputs), dtype=F)
-    return Batch(zeros, np.full(n, 2), np.full(n, 3, dtype=F), zeros, np.array(discounts, dtype=F))
-
-
 def test_targets_by_hand():
-    """The network prefers action 3, which the target values at 20; the target's own best is 40."""
+    """Of action 2 with reward 3: the network prefers action 3, which the target values at 20; its own best is 40."""
     learner = learner_of(biased([1, 0, 0.5, 7, 0, 0, 0, 0]), huber_delta=2)
     learner.target.genome.copy_(torch.from_numpy(biased([10, 0, 0, 20, 0, 40, 0, 0])))
-    batch = fixed_batch([0, 0.5, 0.25])
+    zeros = np.zeros((3, SPEC.inputs), dtype=F)
+    batch = Batch(zeros, np.full(3, 2), np.full(3, 3, dtype=F), zeros, np.array([0, 0.5, 0.25], dtype=F))
     assert learner.targets(batch).tolist() == [3, 13, 8]
     loss, q = learner.loss(batch)
     assert q.tolist() == [0.5] * 3
@@ -103,7 +93,7 @@ def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
     adam = torch.optim.Adam([network.genome], lr=0.01, eps=learner.config.adam_epsilon)
     target = learner.weights
     for k in range(5):
-        batch = random_batch(SPEC, 32, seed=k)
+        batch = random_batch(32, seed=k)
         if k % 2:  # errors of a hundredth
             values = learner.q_values(batch.observations)[np.arange(32), batch.actions]
             batch = batch._replace(rewards=values + F(0.01) * batch.rewards, discounts=np.zeros(32, dtype=F))
@@ -183,7 +173,7 @@ def test_seeds_differ_and_repeat():
 
 
 def test_a_network_that_diverged_is_reported_and_left_as_it_was():
-    learner, batch = learner_of(), random_batch(SPEC, 8)
+    learner, batch = learner_of(), random_batch(8)
     batch.rewards[3] = np.inf
     before = learner.weights
     with pytest.raises(FloatingPointError, match="diverged at update 0"):

@@ -19,22 +19,10 @@ from evolution.dqn.experience import (
 )
 from evolution.networks import convnet
 from evolution.networks.policy import SPEED_SCALE, CnnSpec, MlpSpec, PolicySpec
-from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 
 F = np.float32
 AREA = CELLS * CELLS
-SPECS = [MlpSpec((5,)), MlpSpec((5,), motion=True), MlpSpec((5,), steering=True), CnnSpec((8, 8, 8), frames=3)]
-
-
-@njit
-def _keep_grid(grid, speed, row):
-    store_grid(grid, speed, row)
-
-
-@njit
-def _fixed(value):
-    return to_fixed_point(value)
 
 
 def made(spec: PolicySpec, lengths: list[int], seed: int = 0) -> Experience:
@@ -55,14 +43,9 @@ def made(spec: PolicySpec, lengths: list[int], seed: int = 0) -> Experience:
 
 @given(st.floats(-20.0, 20.0, width=32))
 def test_fixed_point_is_the_nearest_and_clipped(value: float) -> None:
-    code = int(_fixed(F(value)))
+    code = int(to_fixed_point(F(value)))
     assert -32768 <= code <= 32767
     assert abs(code / 4096 - min(max(value, -8.0), 32767 / 4096)) <= 0.5 / 4096 + 1e-6
-
-
-@njit
-def _push(grid, begun, room):
-    convnet.push(grid, begun, room)
 
 
 @pytest.mark.parametrize("frames", [1, 4])
@@ -77,8 +60,8 @@ def test_frames_are_stacked_as_the_network_stacks_them(frames: int, turn: int) -
     for steps in lengths:
         for k in range(steps + 1):
             grid = rng.choice(np.array([UNKNOWN, FREE, OCCUPIED]), AREA)
-            _keep_grid(grid, speeds[row], x.observations[row])
-            _push(grid, k == 0, room)
+            store_grid(grid, speeds[row], x.observations[row])
+            convnet.push(grid, k == 0, room)
             wanted.append(room.frames.copy())
             row += 1
     ring = np.roll(x.observations, turn, axis=0)
@@ -92,4 +75,4 @@ def test_frames_are_stacked_as_the_network_stacks_them(frames: int, turn: int) -
 @given(st.lists(st.integers(0, 300), max_size=6))
 def test_ages_count_from_each_episodes_first_row(lengths: list[int]) -> None:
     wanted = [min(k, OLDEST) for steps in lengths for k in range(steps + 1)]
-    assert ages(made(SPECS[0], lengths)).tolist() == wanted
+    assert ages(made(MlpSpec((5,)), lengths)).tolist() == wanted

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from searching import first_gene, leader, told
+from searching import first_gene, leader, state_of, told
 
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import SearchConfig, ranks, tournament_weights
@@ -12,20 +12,13 @@ from evolution.search.recombination import Recombination
 F = np.float32
 SPEC = PolicySpec.parse("mlp:1")
 GENES = SPEC.size  # 49
-SYMMETRIC = PolicySpec.parse("mlp:7+steering")
-CNN = PolicySpec.parse("cnn:8,8,8@1")
 
 
-def begun(config, seed=1, spec=SPEC, genome=None):
-    """A search about a genome, by default a random one."""
-    search = Recombination(spec, config, seed)
-    search.start_from(np.random.default_rng(seed).normal(size=spec.size).astype(F) if genome is None else genome)
+def begun(config, seed=1):
+    """A search about a random genome."""
+    search = Recombination(SPEC, config, seed)
+    search.start_from(np.random.default_rng(seed).normal(size=GENES).astype(F))
     return search
-
-
-def snapshot(search):
-    arrays, numbers = search.state()
-    return {name: array.tobytes() for name, array in arrays.items()}, numbers
 
 
 def test_the_first_centre_is_the_best_of_a_random_generation():
@@ -69,10 +62,10 @@ def test_the_centre_moves_twice_as_far_as_to_the_weighted_mean_of_the_members(ch
 @pytest.mark.parametrize("population", [17, 41])
 def test_equal_scores_move_nothing(population):
     search = begun(SearchConfig(population=population, groups=2))
-    before = snapshot(search)
+    before = state_of(search)
     for score in (0.0, -np.inf, np.nan):
         told(search, lambda genomes: np.full(len(genomes), score))  # noqa: B023
-        after = snapshot(search)
+        after = state_of(search)
         assert all(after[0][name] == before[0][name] for name in ("centre", "path"))
         assert after[1] == before[1]
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from searching import first_gene, told
+from searching import first_gene, state_of, told
 
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import SearchConfig, ranks, split, tournament_weights, tournaments
@@ -123,8 +123,7 @@ def test_a_score_that_is_not_a_number_loses(kind, bad):
             scores = np.random.default_rng(generation).normal(size=16)
             scores[[2, 3, 11]] = spoilt
             search.tell(scores)
-        arrays, numbers = search.state()
-        states.append(({name: array.tobytes() for name, array in arrays.items()}, numbers))
+        states.append(state_of(search))
     assert states[0] == states[1]
 
 

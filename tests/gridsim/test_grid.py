@@ -8,14 +8,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from gridsim.config import SensorConfig, SimConfig
-from gridsim.sensing.grid import (
-    grid_table,
-    grids,
-)
+from gridsim.sensing.grid import grid_table, grids
 
 F = np.float32
 CONFIG = SimConfig()
-TABLE = grid_table(CONFIG)
 
 
 def cell_by_cell(config, ranges):

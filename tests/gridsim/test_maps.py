@@ -10,18 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import finish
-from pictures import (
-    PPM,
-    H,
-    W,
-    crashes,
-    distance,
-    picture,
-    read,
-    save,
-    strip,
-    write_yaml,
-)
+from pictures import PPM, H, W, crashes, distance, picture, read, save, strip, write_yaml
 from PIL import Image
 
 from cluster.commands.cli import EvolveFlags, _prepare

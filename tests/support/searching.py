@@ -20,6 +20,12 @@ def leader(search):
     return found
 
 
+def state_of(search):
+    """All that a search, or a run with one, saves, to be compared."""
+    arrays, numbers = search.state()
+    return {name: array.tobytes() for name, array in arrays.items()}, numbers
+
+
 def first_gene(genomes):
     """A score: the first gene of each genome."""
     return genomes[:, 0].astype(float)
