@@ -1,7 +1,7 @@
 """Collecting: the fused loop against `Simulator`, step by step; nothing lost, nothing mixed up."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,34 +46,27 @@ class Asked(NamedTuple):
     def only(self, which: list[int]) -> "Asked":
         """The same for some episodes."""
         rows = np.array(which, dtype=int)
-        return self._replace(
-            episodes=self.episodes[rows],
-            epsilons=self.epsilons[rows],
-            keys=self.keys[rows],
-            worlds=self.worlds[rows],
-        )
+        return self._replace(**{name: getattr(self, name)[rows] for name in ("episodes", "epsilons", "keys", "worlds")})
+
+
+Asking = Callable[[str, int, float, int], Asked]
 
 
 @pytest.fixture(scope="module")
-def scenarios() -> list[Map]:
-    return [build("seamless", 3), build("highway", 4)]
+def ask(root: Path) -> Asking:
+    """Makes arguments for `n` episodes; of a `mlp:6,7` the weights are a trained driver's."""
+    driver = load_champion(root / "benchmarks" / "champion_traffic.npz").genome
+    scenarios = [build("seamless", 3), build("highway", 4)]
 
+    def make(policy: str, n: int, epsilon: float, cars: int) -> Asked:
+        rng = np.random.default_rng(5)
+        spec = PolicySpec.parse(policy)
+        weights = driver if policy == "mlp:6,7" else (rng.normal(size=spec.size) * 0.3).astype(F)
+        episodes, worlds = lane_starts(scenarios, np.arange(n) % len(scenarios), rng, cars)
+        keys = rng.integers(1 << 63, size=n, dtype=np.uint64)
+        return Asked(spec, weights, scenarios, episodes, np.full(n, epsilon, F), keys, LIMITS, CONFIG, worlds)
 
-@pytest.fixture(scope="module")
-def driver(root: Path) -> np.ndarray:
-    """The weights of a trained `mlp:6,7`."""
-    return load_champion(root / "benchmarks" / "champion_traffic.npz").genome
-
-
-def asked(
-    policy: str, scenarios: list[Map], driver: np.ndarray, n: int, epsilon: float, cars: int, seed: int = 5
-) -> Asked:
-    rng = np.random.default_rng(seed)
-    spec = PolicySpec.parse(policy)
-    weights = driver if policy == "mlp:6,7" else (rng.normal(size=spec.size) * 0.3).astype(F)
-    episodes, worlds = lane_starts(scenarios, np.arange(n) % len(scenarios), rng, cars)
-    keys = rng.integers(1 << 63, size=n, dtype=np.uint64)
-    return Asked(spec, weights, scenarios, episodes, np.full(n, epsilon, F), keys, LIMITS, CONFIG, worlds)
+    return make
 
 
 def cut_up(experience: Experience) -> Iterator[Experience]:
@@ -87,15 +80,13 @@ def cut_up(experience: Experience) -> Iterator[Experience]:
 
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "cnn:8,8,16@3"])
-def test_every_row_is_what_the_simulator_shows_for_these_actions(
-    scenarios: list[Map], driver: np.ndarray, policy: str, cars: int
-) -> None:
-    of = asked(policy, scenarios, driver, 8, 0.3, cars)
+def test_every_row_is_what_the_simulator_shows_for_these_actions(ask: Asking, policy: str, cars: int) -> None:
+    of = ask(policy, 8, 0.3, cars)
     experience, results = collect(*of)
     inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
     row, table, k, seen = 0, grid_table(CONFIG), constants(CONFIG), np.zeros(64, dtype=F)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
-        road = scenarios[episode["map"]]
+        road = of.scenarios[episode["map"]]
         simulator = Simulator([road], 1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
         ranges, speeds = simulator.reset(episode["start"][None], worlds=world[None] if cars else None)
         for step in range(int(result["steps"]) + 1):
@@ -116,10 +107,10 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(
 
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", POLICIES)
-def test_without_exploring_it_is_evaluate(scenarios: list[Map], driver: np.ndarray, policy: str, cars: int) -> None:
-    of = asked(policy, scenarios, driver, 12, 0.0, cars)
+def test_without_exploring_it_is_evaluate(ask: Asking, policy: str, cars: int) -> None:
+    of = ask(policy, 12, 0.0, cars)
     _, results = collect(*of)
-    wanted, _, _ = evaluate(of.spec, of.weights[None], scenarios, of.episodes, LIMITS, CONFIG, worlds=of.worlds)
+    wanted, _, _ = evaluate(of.spec, of.weights[None], of.scenarios, of.episodes, LIMITS, CONFIG, worlds=of.worlds)
     assert results.tobytes() == wanted[0].tobytes()
     assert results["steps"].sum() > 100
 
@@ -127,10 +118,8 @@ def test_without_exploring_it_is_evaluate(scenarios: list[Map], driver: np.ndarr
 # --- Rows ------------------------------------------------------------------------------------------------------------
 
 
-def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(
-    scenarios: list[Map], driver: np.ndarray
-) -> None:
-    of = asked("mlp:6,7", scenarios, driver, 60, 0.1, 0)
+def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask: Asking) -> None:
+    of = ask("mlp:6,7", 60, 0.1, 0)
     of.epsilons[1::2] = 0.8
     of.episodes["steps"][::3] = 40
     of.episodes["target"][::5] = 25.0
@@ -147,8 +136,8 @@ def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(
 
 
 @pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
-def test_a_network_without_numbers_leaves_whole_rows(scenarios: list[Map], driver: np.ndarray, policy: str) -> None:
-    of = asked(policy, scenarios, driver, 6, 0.5, 0)
+def test_a_network_without_numbers_leaves_whole_rows(ask: Asking, policy: str) -> None:
+    of = ask(policy, 6, 0.5, 0)
     experience, results = collect(*of._replace(weights=np.full_like(of.weights, math.nan)))
     assert experience.actions.tolist() == [NO_ACTION] * 6
     assert not experience.ends.any()
@@ -160,8 +149,8 @@ def test_a_network_without_numbers_leaves_whole_rows(scenarios: list[Map], drive
 # --- Exploring -------------------------------------------------------------------------------------------------------
 
 
-def test_random_actions_are_uniform_and_as_many_as_asked_for(scenarios: list[Map], driver: np.ndarray) -> None:
-    of = asked("mlp:6,7", scenarios, driver, 600, 1.0, 0)
+def test_random_actions_are_uniform_and_as_many_as_asked_for(ask: Asking) -> None:
+    of = ask("mlp:6,7", 600, 1.0, 0)
     counts = np.bincount(collect(*of)[0].actions, minlength=256)
     n, counts = counts[:8].sum(), counts[:8]
     assert n > 8000
@@ -173,9 +162,9 @@ def test_random_actions_are_uniform_and_as_many_as_asked_for(scenarios: list[Map
     assert np.mean(driven != 4) == pytest.approx(0.25 * 7 / 8, abs=5 * math.sqrt(0.22 * 0.78 / len(driven)))
 
 
-def test_an_episode_depends_on_itself_alone(scenarios: list[Map], driver: np.ndarray) -> None:
+def test_an_episode_depends_on_itself_alone(ask: Asking) -> None:
     """In any order, alone or in company, and with epsilons of its own; another key, another episode."""
-    of = asked("mlp:6,7", scenarios, driver, 12, 0.0, CARS)
+    of = ask("mlp:6,7", 12, 0.0, CARS)
     of.epsilons[:] = np.linspace(0.0, 1.0, 12)
     whole, results = collect(*of)
     singles = [collect(*of.only([k])) for k in range(12)]
@@ -194,10 +183,10 @@ def test_an_episode_depends_on_itself_alone(scenarios: list[Map], driver: np.nda
 # --- What is refused -------------------------------------------------------------------------------------------------
 
 
-def test_what_does_not_fit_is_refused(scenarios: list[Map], driver: np.ndarray) -> None:
-    of = asked("mlp:6,7", scenarios, driver, 4, 0.5, 0)
+def test_what_does_not_fit_is_refused(ask: Asking) -> None:
+    of = ask("mlp:6,7", 4, 0.5, 0)
     for change, text in (
-        ({"weights": driver[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
+        ({"weights": of.weights[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
         ({"worlds": no_traffic(3)}, "traffic of 4 episodes is"),
         ({"limits": Limits(100.0, 0)}, "1 to 65535 steps, not 0"),
     ):

@@ -261,41 +261,34 @@ def test_pedal_and_wheel_are_clipped_and_do_what_they_say(maps: Maps) -> None:
 
 
 def test_success_and_time_truncate_and_everything_else_terminates(maps: Maps) -> None:
-    timed = GridSimEnv(maps=maps["seamless"], max_episode_steps=3)
-    timed.reset(seed=0)
-    outcomes = [timed.step(Action.NONE) for _ in range(3)]
-    assert [(o[2], o[3], o[4]["end"]) for o in outcomes] == [(False, False, End.RUNNING)] * 2 + [
-        (False, True, End.TIME)
-    ]
-    assert not any(o[4]["is_success"] for o in outcomes)
+    def drive_to_the_end(action: Action, **options: Any) -> list[Any]:
+        """What each step returned, the same action in all."""
+        env = GridSimEnv(maps=maps["seamless"], **options)
+        env.reset(seed=0)
+        steps: list[Any] = []
+        while not steps or not (steps[-1][2] or steps[-1][3]):
+            steps.append(env.step(action))
+        return steps
 
-    crashing = GridSimEnv(maps=maps["seamless"])
-    crashing.reset(seed=0)
-    while True:
-        _, reward, term, trunc, info = crashing.step(Action.ACCELERATE_LEFT)
-        if term or trunc:
-            break
-        assert 0.0 < reward <= 1.0
-    assert (term, trunc, info["end"], reward) == (True, False, End.COLLISION, -1.0)
+    timed = drive_to_the_end(Action.NONE, max_episode_steps=3)
+    ends = [(terminated, truncated, info["end"]) for *_, terminated, truncated, info in timed]
+    assert ends == [(False, False, End.RUNNING)] * 2 + [(False, True, End.TIME)]
+    assert not any(info["is_success"] for *_, info in timed)
 
-    parked = GridSimEnv(maps=maps["seamless"])
-    parked.reset(seed=0)
-    for _ in range(100):
-        _, reward, term, trunc, info = parked.step(Action.BRAKE)
-        if term or trunc:
-            break
-    assert (term, trunc, info["end"], info["speed_mps"]) == (True, False, End.IDLE, 0.0)
-    assert reward == pytest.approx(0.7 * parked.cars.ranges.min() / 50.0)  # of a step at a stand: no penalty
+    *before, (_, reward, terminated, truncated, info) = drive_to_the_end(Action.ACCELERATE_LEFT)
+    assert (terminated, truncated, info["end"], reward) == (True, False, End.COLLISION, -1.0)
+    assert all(0.0 < reward <= 1.0 for _, reward, *_ in before)
 
-    short = GridSimEnv(maps=maps["seamless"], config=SimConfig(episode=EpisodeConfig(target=1.0)))
-    short.reset(seed=0)
-    for _ in range(10):
-        _, reward, term, trunc, info = short.step(Action.ACCELERATE)
-        if term or trunc:
-            break
-    assert (term, trunc, info["end"], info["is_success"]) == (False, True, End.SUCCESS, True)
+    *_, (seen, reward, terminated, truncated, info) = drive_to_the_end(Action.BRAKE)
+    assert (terminated, truncated, info["end"], info["speed_mps"]) == (True, False, End.IDLE, 0.0)
+    assert reward == pytest.approx(0.7 * seen[:31].min())  # of a step at a stand: no penalty
+
+    short = drive_to_the_end(Action.ACCELERATE, config=SimConfig(episode=EpisodeConfig(target=1.0)))
+    _, reward, terminated, truncated, info = short[-1]
+    assert (terminated, truncated, info["end"], info["is_success"]) == (False, True, End.SUCCESS, True)
     assert reward > 0.0
     assert info["distance_m"] >= 1.0
+    assert len(short) <= 10
 
 
 def test_what_was_returned_is_the_callers_own(maps: Maps) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +20,7 @@ from gridsim.config import CROSSING_GAP
 from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.generators import roundabout
+from gridsim.maps.generators.tiles import TILE, TILES, tile_graph
 from gridsim.maps.lanes import Path, beside, lay_lanes
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
@@ -337,6 +339,29 @@ def test_parked_cars_stand_beside_the_lanes():
             others = np.delete(np.arange(len(blocks)), k)
             d = wrapped(blocks[others, :2] - blocks[k, :2], m.sides)
             assert np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])).min() > 4.1
+
+
+@pytest.fixture(scope="module")
+def graphs():
+    return [tile_graph(np.random.default_rng(seed)) for seed in range(300)]
+
+
+def test_all_kinds_of_tiles_of_the_seamless_road_appear_turned_all_ways(graphs):
+    seen = Counter(tuple(map(bool, row)) for edges in graphs for row in edges)
+    assert min(edges.any(axis=1).sum() for edges in graphs) >= TILES * TILES // 2
+    assert len(seen) == 12  # none; 2 straights, 4 curves, 4 Ts, 1 crossing
+    assert min(seen.values()) > 0.005 * seen.total()
+
+
+def test_roundabouts_of_the_seamless_road_appear_and_only_at_junctions(graphs):
+    rings, junctions = 0, 0
+    for seed, edges in enumerate(graphs[:60]):
+        arcs = lay("seamless", seed).strips.arcs
+        junctions += (edges.sum(axis=1) > 2).sum()
+        for x, y, *_ in arcs[np.abs(arcs[:, 4]) > 6.0]:
+            rings += 1
+            assert edges[int(y // TILE) * TILES + int(x // TILE)].sum() > 2
+    assert 0.02 < rings / junctions < 0.09
 
 
 # --- Paths -----------------------------------------------------------------------------------------------------------

@@ -17,8 +17,6 @@ K = constants(SimConfig())
 SIDE = 256.0
 REACH = 50.0
 RAYS = np.radians(np.linspace(-60.0, 60.0, 31))
-POSES_A_MAP = 2500
-MAPS = (0, 1, 2, 3)
 
 
 def look(road, points, headings, k=K, count=31):
@@ -41,8 +39,8 @@ def random_points(exact, n, rng, margin=0.0, side=SIDE):
 class Views:
     """Poses on the road of one map, what the kernel sees there, and what is there."""
 
-    def __init__(self, seed, name="seamless", count=POSES_A_MAP):
-        self.scenario = build(name, seed)
+    def __init__(self, seed, count=2500):
+        self.scenario = build("seamless", seed)
         self.exact = oracle.ExactRoad(self.scenario.strips, SIDE, SIDE)
         rng = np.random.default_rng(1000 + seed)
         self.points = random_points(self.exact, count, rng)
@@ -51,18 +49,10 @@ class Views:
         self.seen = look(self.scenario.road, self.points, self.headings).astype(float)
         self.true = self.exact.cast(self.points, self.angles, REACH)
 
-    def with_edges_moved(self, margin, of=slice(None)):
-        return self.exact.widened(margin).cast(self.points[of], self.angles[of], REACH)
-
-    def unexplained(self, margin, of):
-        """Share of rays that end 0.2 m or more beyond the exact ranges of roads `margin` m narrower and wider."""
-        low, high = self.with_edges_moved(-margin, of), self.with_edges_moved(margin, of)
-        return ((self.seen[of] < low - 0.2) | (self.seen[of] > high + 0.2)).mean()
-
 
 @pytest.fixture(scope="module")
 def views():
-    return [Views(seed) for seed in MAPS]
+    return [Views(seed) for seed in range(4)]
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +68,10 @@ def test_rays_are_those_of_the_exact_geometry(views):
     assert np.quantile(error, 0.99) <= 0.2
     assert seen.min() >= 0.0
     assert seen.max() == REACH
-    inner = np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.15)[:1000]
-    assert views[0].unexplained(0.1, inner) < 0.003  # a ray far off is one that grazes an edge
+    # A ray far off is one that grazes an edge: the road 10 cm narrower or wider explains it.
+    exact, inner = views[0].exact, np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.15)[:1000]
+    low, high = (exact.widened(by).cast(views[0].points[inner], views[0].angles[inner], REACH) for by in (-0.1, 0.1))
+    assert ((views[0].seen[inner] < low - 0.2) | (views[0].seen[inner] > high + 0.2)).mean() < 0.003
 
 
 def test_the_first_ray_is_the_rightmost():

@@ -71,12 +71,6 @@ def crossing_paths():
     return east + north
 
 
-def right_turn():
-    """Lane 6 from the eastern way southwards, and lane 7, round the torus into itself."""
-    south = Path(128.0, 120.0, -math.pi / 2, ((256.0, 0.0),))
-    return [Path(120.0, 128.0, 0.0, ((math.pi / 2 * 8.0, -1.0 / 8.0),)), south]
-
-
 @pytest.fixture(scope="module")
 def crossing():
     return network_of(crossing_paths(), 256.0, 256.0)
@@ -347,7 +341,9 @@ def test_a_junction_is_left_free_while_there_is_no_room_behind(crossing):
 def test_the_second_of_a_queue_has_no_permit_before_the_first():
     """Else two queues could wait for each other for ever, each first car for the second of the other. Here the ego car
     is in the first car's way, while the second wants to turn right, where the road is free."""
-    network = network_of([*crossing_paths(), *right_turn()], 256.0, 256.0)
+    turn = Path(120.0, 128.0, 0.0, ((math.pi / 2 * 8.0, -1.0 / 8.0),))  # lane 6, from the eastern way
+    south = Path(128.0, 120.0, -math.pi / 2, ((256.0, 0.0),))  # lane 7, round the torus into itself
+    network = network_of([*crossing_paths(), turn, south], 256.0, 256.0)
     world = cars_on(network, (0, 116.0, 0.0, 1.0), (0, 110.0, 0.0, 1.0))
     world[1, [NEXT, SECOND_NEXT]] = 6, 7
     assert {6} < set(network.successors[0])
