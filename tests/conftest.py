@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from commands import BIN, answers, end, importable, wait_until
+from commands import BIN, answers, end, finish, importable, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -68,6 +68,16 @@ def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def database(empty_database: Path, tmp_path: Path) -> None:
     """The database that a run started in `tmp_path` logs to, created already."""
     shutil.copy(empty_database, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, empty_database: Path) -> Path:
+    """The folder of a run that nobody disturbed, in one process: of the command and flags in a test's `REFERENCE`."""
+    command, *flags = request.module.REFERENCE
+    cwd = tmp_path_factory.mktemp("reference")
+    shutil.copy(empty_database, cwd)
+    finish(command, "--workers", "0", "--name", "ref", *flags, cwd=cwd)
+    return cwd / "runs/ref"
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from gridsim.config import SimConfig
 # Of all maps these are built fastest.
 ROAD = ["--scenario", "curved", "--traffic", "2"]
 SMALL = [*ROAD, "--population", "48", "--generations", "6", "--seed", "5"]
+REFERENCE = ("gridsim-evolve", *SMALL)
 
 
 def evolve(*arguments, cwd):
@@ -41,22 +41,13 @@ def in_mlflow(cwd):
     return run.info, (run.info.end_time - run.info.start_time) / 1000.0
 
 
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory, empty_database):
-    """The undisturbed run, in one process."""
-    cwd = tmp_path_factory.mktemp("reference")
-    shutil.copy(empty_database, cwd)
-    evolve("--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
-    return cwd
-
-
 @pytest.mark.e2e
 @pytest.mark.usefixtures("database")
 @pytest.mark.parametrize("workers", [1, 4])  # with 2 it is interrupted, below
 def test_champion_is_the_same_for_any_number_of_workers(reference, tmp_path, workers):
     done = evolve("--workers", str(workers), "--name", "w", *SMALL, cwd=tmp_path)
     assert done.stderr == ""  # no warning of Ray's or MLflow's reaches the user
-    assert same_run(tmp_path / "runs/w", reference / "runs/ref")
+    assert same_run(tmp_path / "runs/w", reference)
 
 
 @pytest.mark.e2e
@@ -76,7 +67,7 @@ def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
     assert duration_s == pytest.approx(float(rows(run)[-1]["wall_s"]), abs=0.01)
     evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
     assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
-    assert summary(run)["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
 
 
 def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path, monkeypatch):
@@ -124,25 +115,25 @@ def test_a_users_own_ray_outlives_tests_that_start_and_end_others(cluster, root,
 
 @pytest.mark.e2e
 def test_run_folder_and_mlflow_keep_their_contracts(reference):
-    folder = reference / "runs/ref"
-    stored = {path.name: path.read_bytes() for path in (reference / "mlartifacts").rglob("*") if path.is_file()}
+    home = reference.parent.parent
+    stored = {path.name: path.read_bytes() for path in (home / "mlartifacts").rglob("*") if path.is_file()}
     for name in ("config.json", "champion.npz", "elites.npz", "curves.png", "trajectory.png", "drive.html"):
-        assert stored[name] == (folder / name).read_bytes() > b""
-    assert (folder / "checkpoint.npz").is_file()
-    assert not (folder / "steps.part").exists()
+        assert stored[name] == (reference / name).read_bytes() > b""
+    assert (reference / "checkpoint.npz").is_file()
+    assert not (reference / "steps.part").exists()
     assert "steps.part" not in stored
-    assert "elites" not in load(folder / "checkpoint.npz")[0]
-    with np.load(folder / "champion.npz", allow_pickle=False) as arrays:
+    assert "elites" not in load(reference / "checkpoint.npz")[0]
+    with np.load(reference / "champion.npz", allow_pickle=False) as arrays:
         assert arrays["genome"].dtype == np.float32
-    figures = summary(folder)
-    assert len(rows(folder)) == figures["generations"] == 6
-    assert all_in_mlflow(folder)
-    run = tracked.client(f"sqlite:///{reference}/mlflow.db").get_run(figures["mlflow_run_id"])
+    figures = summary(reference)
+    assert len(rows(reference)) == figures["generations"] == 6
+    assert all_in_mlflow(reference)
+    run = tracked.client(f"sqlite:///{home}/mlflow.db").get_run(figures["mlflow_run_id"])
     assert run.data.tags["algorithm"] == "evolution"
     assert run.data.params["population"] == "48"
-    assert run.data.metrics["distance_m/best"] == pytest.approx(float(rows(folder)[-1]["distance_m/best"]))
+    assert run.data.metrics["distance_m/best"] == pytest.approx(float(rows(reference)[-1]["distance_m/best"]))
     assert run.data.metrics["held_out/success_rate"] == figures["held_out"]["success_rate"]
-    done = finish("gridsim-evaluate", "runs/ref", "--json", cwd=reference)
+    done = finish("gridsim-evaluate", "runs/ref", "--json", cwd=home)
     assert done.stderr == ""
     assert json.loads(done.stdout) == pytest.approx(figures["held_out"])
 
@@ -151,18 +142,18 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
 @pytest.mark.usefixtures("database")
 def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_path):
     """The same run again, a part of it first: flags beside `--config` change it."""
-    config, run = str(reference / "runs/ref/config.json"), tmp_path / "runs/s"
+    config, run = str(reference / "config.json"), tmp_path / "runs/s"
     evolve("--workers", "0", "--config", config, "--generations", "3", "--name", "s", cwd=tmp_path)
     assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "finished" in evolve("--workers", "0", "--resume", "runs/s", cwd=tmp_path).stdout
     done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
     assert len(rows(run)) == 6
-    assert (run / "elites.npz").read_bytes() == (reference / "runs/ref/elites.npz").read_bytes()
+    assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
     assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "compare: make ui, or" in done.stdout
     assert "chosen: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout
     assert "http://127.0.0.1:5000/#/experiments/2/runs?workflowType=machine_learning&" in done.stdout
-    assert summary(run)["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
 
 
 @pytest.mark.e2e
@@ -170,9 +161,9 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
 def test_init_begins_with_a_champion(reference, tmp_path):
     arguments = ["--workers", "0", *ROAD, "--population", "24", "--generations", "1"]
     arguments += ["--recombination", "two", "--mutation-rate", "0"]
-    evolve(*arguments, "--init", str(reference / "runs/ref"), "--name", "warm", cwd=tmp_path)
+    evolve(*arguments, "--init", str(reference), "--name", "warm", cwd=tmp_path)
     # Without mutation every member is the one it started from.
-    assert summary(tmp_path / "runs/warm")["champion_sha256"] == summary(reference / "runs/ref")["champion_sha256"]
+    assert summary(tmp_path / "runs/warm")["champion_sha256"] == summary(reference)["champion_sha256"]
 
 
 @pytest.mark.e2e

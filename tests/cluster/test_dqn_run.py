@@ -9,7 +9,8 @@ import time
 
 import numpy as np
 import pytest
-from commands import BIN, finish, ray_workers, rows, running, summary, wait_until
+from commands import BIN, all_in_mlflow, finish, ray_workers, rows, running, summary, wait_until
+from tracked import client
 
 from cluster.runs.checkpoint import load
 
@@ -17,18 +18,10 @@ SMALL = [
     *("--scenario", "curved", "--traffic", "2", "--policy", "mlp:12", "--seed", "5"),
     *("--car-steps", "330000", "--evaluate-every", "40000", "--replay", "50000"),
 ]
+REFERENCE = ("gridsim-dqn", *SMALL)
 NOT_OF_THE_CLOCK = ("distance_m/best", "distance_m/mean", "loss", "q/mean", "q/change", "updates", "car_steps")
 
 pytestmark = pytest.mark.e2e
-
-
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory, empty_database):
-    """The undisturbed run, in one process."""
-    cwd = tmp_path_factory.mktemp("reference")
-    shutil.copy(empty_database, cwd)
-    finish("gridsim-dqn", "--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
-    return cwd / "runs/ref"
 
 
 def same(run, reference):
@@ -77,17 +70,12 @@ def test_run_keeps_the_contracts(reference):
     assert found["updates"] == int(float(rows(reference)[-1]["updates"])) > 300
     assert found["car_steps"] >= 330_000
     assert set(found["held_out"]) == {"episodes", "success_rate", "distance_m", "speed_mps", "collision_rate"}
-    from mlflow.tracking import MlflowClient
-
-    client = MlflowClient(tracking_uri=f"sqlite:///{reference.parent.parent}/mlflow.db")
-    logged = client.get_run(found["mlflow_run_id"])
-    assert logged.info.status == "FINISHED"
-    assert logged.data.tags["algorithm"] == "dqn"
-    assert not [name for name in logged.data.metrics if name.startswith("fitness")]
-    for name in ("distance_m/best", "speed_mps/mean", "car_steps", "wall_s", "car_steps_per_s", "loss"):
-        history = client.get_metric_history(found["mlflow_run_id"], name)
-        assert [m.step for m in history] == list(range(found["evaluations"]))
-    assert logged.data.params["discount"]
+    names = ("distance_m/best", "speed_mps/mean", "car_steps", "wall_s", "car_steps_per_s", "loss")
+    assert all_in_mlflow(reference, names, "evaluations")
+    logged = client(f"sqlite:///{reference.parent.parent}/mlflow.db").get_run(found["mlflow_run_id"]).data
+    assert logged.tags["algorithm"] == "dqn"
+    assert not [name for name in logged.metrics if name.startswith("fitness")]
+    assert logged.params["discount"]
     done = finish("gridsim-evaluate", str(reference), "--json", cwd=reference.parent)
     assert json.loads(done.stdout) == found["held_out"]
 

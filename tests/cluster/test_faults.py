@@ -9,7 +9,6 @@ import functools
 import os
 import random
 import re
-import shutil
 import signal
 import subprocess
 import time
@@ -32,17 +31,8 @@ pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 LONG_S = 300.0  # what takes seconds where nothing else runs
 PATIENCE_S = 45  # a host and its worker take 10 to 30 to come up
 KILLS = int(os.environ.get("GRIDSIM_KILLS", "2"))
-ROAD = ["--scenario", "curved", "--traffic", "2"]
-SMALL = [*ROAD, "--population", "48", "--generations", "10", "--seed", "5"]
-
-
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory, empty_database: Path) -> Path:
-    """The undisturbed run, in one process."""
-    cwd = tmp_path_factory.mktemp("reference")
-    shutil.copy(empty_database, cwd)
-    finish("gridsim-evolve", "--workers", "0", "--name", "ref", *SMALL, cwd=cwd)
-    return cwd / "runs/ref"
+SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "10", "--seed", "5"]
+REFERENCE = ("gridsim-evolve", *SMALL)
 
 
 def generations(run: Path) -> int:

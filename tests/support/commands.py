@@ -75,15 +75,15 @@ def rows(folder):
         return list(csv.DictReader(file))
 
 
-def all_in_mlflow(run):
+def all_in_mlflow(run, names=("fitness/best", "distance_m/mean", "car_steps", "wall_s"), unit="generations"):
     """Whether MLflow, in the database beside the run's folder's folder, has all of it once, and that it is finished."""
     from mlflow.tracking import MlflowClient
 
     ended = summary(run)
     client = MlflowClient(tracking_uri=f"sqlite:///{run.parent.parent}/mlflow.db")
-    for name in ("fitness/best", "distance_m/mean", "car_steps", "wall_s"):
+    for name in names:
         steps = [metric.step for metric in client.get_metric_history(ended["mlflow_run_id"], name)]
-        assert sorted(steps) == list(range(ended["generations"])), f"{name}: lost or doubled"
+        assert sorted(steps) == list(range(ended[unit])), f"{name}: lost or doubled"
     return client.get_run(ended["mlflow_run_id"]).info.status == "FINISHED"
 
 
