@@ -128,12 +128,6 @@ def expected(n: int) -> bytes:
     return SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(n)).results.tobytes()
 
 
-def gone(processes: list[psutil.Process], within_s: float = 10.0) -> list[psutil.Process]:
-    """Those that are still there after that time."""
-    _, alive = psutil.wait_procs(processes, timeout=within_s)
-    return alive
-
-
 def test_results_progress_and_what_is_sent(pool: RayPool) -> None:
     progress: list[tuple[int, int]] = []
     outcome = pool.evaluate(make_task(), make_recipes(512), lambda *done: progress.append(done))
@@ -317,7 +311,7 @@ def test_any_number_of_workers_gives_the_serial_pools_bits(workers: int) -> None
             assert collected.results.tobytes() == alone.results.tobytes()
         killer.join()
         processes = psutil.Process().children(recursive=True)
-    assert gone(processes) == []
+    assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
 
 
 @pytest.mark.usefixtures("no_pool")

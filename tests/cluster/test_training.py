@@ -68,6 +68,12 @@ def halfway(maps, tmp_path_factory):
     return run.path
 
 
+@pytest.fixture
+def stopped(halfway, tmp_path):
+    """The folder of such a run, to be changed."""
+    return shutil.copytree(halfway, tmp_path / "run")
+
+
 class StopsAfterTwo(Reporter):
     """Ctrl-C comes after two generations."""
 
@@ -246,65 +252,46 @@ def test_training_is_among_more_cars_than_validation(maps):
 @pytest.mark.parametrize(
     "name", ["steps_sha256", "search_path", "crashes", "tried", "search", "generation", "champion"]
 )
-def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, halfway, tmp_path, name):
-    path = run_folder(halfway, tmp_path)
-    arrays, meta = load(path / "checkpoint.npz")
+def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, stopped, name):
+    arrays, meta = load(stopped / "checkpoint.npz")
     arrays.pop(name, None)
     meta.pop(name, None)
-    save(path / "checkpoint.npz", arrays, meta)
+    save(stopped / "checkpoint.npz", arrays, meta)
     with pytest.raises(GridSimError, match=r"another version|not those of a run|it lacks steps") as error:
-        go_on_in(path, maps)
+        in_folder(open_run(stopped), maps)
     assert "\n" not in str(error.value)
 
 
-def run_folder(halfway, path):
-    """A run that was stopped after two of three generations."""
-    return shutil.copytree(halfway, path / "run")
-
-
-class InterruptedOnce(Session):
-    """Ctrl-C comes while its first save is on its way."""
-
-    interrupted = False
-
-    def save(self) -> None:
-        if not self.interrupted:
-            self.interrupted = True
-            raise KeyboardInterrupt
-        super().save()
-
-
-def go_on_in(path, maps, session=Session):
-    """A stopped run, to be continued from its folder."""
-    return in_folder(open_run(path), maps, session)
-
-
-def in_folder(run, maps, session=Session):
+def in_folder(run, maps):
     """A run in its folder, with a short validation."""
-    made = session(run, SerialPool(maps.build), maps, f"sqlite:///{run.path.parent}/m.db", "test")
+    made = Session(run, SerialPool(maps.build), maps, f"sqlite:///{run.path.parent}/m.db", "test")
     curriculum = made.learning.curriculum
     curriculum.config = dataclasses.replace(curriculum.config, validation=8)
     return made
 
 
-def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, halfway, tmp_path):
-    path = run_folder(halfway, tmp_path)
-    resumed = go_on_in(path, maps, InterruptedOnce)
+def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, stopped, monkeypatch):
+    resumed, save = in_folder(open_run(stopped), maps), Session.save
+
+    def interrupted(session):
+        monkeypatch.setattr(Session, "save", save)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Session, "save", interrupted)
     with pytest.raises(KeyboardInterrupt):
         resumed.learn()
-    assert resumed.interrupted
-    assert load(path / "checkpoint.npz")[1]["generation"] == 3
-    assert len(rows(path)) == 3
+    assert Session.save is save
+    assert load(stopped / "checkpoint.npz")[1]["generation"] == 3
+    assert len(rows(stopped)) == 3
 
 
-def test_a_history_without_its_last_row_is_mended(maps, halfway, tmp_path):
+def test_a_history_without_its_last_row_is_mended(maps, stopped):
     """As a kill between the last checkpoint and its history leaves it, when nothing is left to evolve."""
-    path = run_folder(halfway, tmp_path)
-    go_on_in(path, maps).learn()
-    whole = (path / "history.csv").read_bytes()
-    (path / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
-    go_on_in(path, maps).learn()
-    assert (path / "history.csv").read_bytes() == whole
+    in_folder(open_run(stopped), maps).learn()
+    whole = (stopped / "history.csv").read_bytes()
+    (stopped / "history.csv").write_bytes(b"".join(whole.splitlines(keepends=True)[:-1]))
+    in_folder(open_run(stopped), maps).learn()
+    assert (stopped / "history.csv").read_bytes() == whole
 
 
 class Losing(SerialPool):

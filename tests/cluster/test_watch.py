@@ -55,9 +55,8 @@ def drive(driver):
     return record(driver, scenario, start, 12.0)
 
 
-def test_recording_ends_with_its_episode():
+def test_recording_ends_with_its_episode(driver):
     scenario = build("seamless", 4)
-    driver = load_champion(CHAMPION)
     blind = type(driver)(np.zeros_like(driver.genome), driver.policy, driver.scenario, driver.sim)  # accelerates
     drive = record(blind, scenario, sample_starts(scenario, 1, np.random.default_rng(0))[0], 60.0)
     assert drive.end == End.COLLISION

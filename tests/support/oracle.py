@@ -20,7 +20,6 @@ SQUARE = 4.0  # m, side of the squares in which new ground is counted
 SAME_VISIT = 12.0  # m of driving: back in a square so soon is the same visit
 CHECK_EVERY = 1.0  # m that a car moves between two looks at its outline, at most
 GROUP = 32.0  # m, side of the squares whose points are looked at together
-STAGES = (16.0,)  # m, to which rays are cast before they are cast to their whole reach
 
 
 # --- The road --------------------------------------------------------------------------------------------------------
@@ -114,24 +113,14 @@ class ExactRoad:
         """How far each ray gets before it leaves the union: [n, r] m for origins [n, 2] and directions rad [n, r]."""
         origins, angles = np.asarray(origins, dtype=np.float64), np.asarray(angles, dtype=np.float64)
         result = np.zeros(angles.shape)
-        # Most rays end soon, where few strips need to be looked at; the others are cast again with more of them.
-        todo = np.ones(angles.shape, dtype=bool)
-        for limit in (*(stage for stage in STAGES if stage < reach), reach):
-            ray, of = np.nonzero(todo)
-            result[ray, of] = self._cast(origins[ray], angles[ray, of], limit)
-            todo = result >= limit
-        return result
-
-    def _cast(self, origins: np.ndarray, angles: np.ndarray, reach: float) -> np.ndarray:
-        result = np.zeros(len(angles))
         for chosen, x, y in self._groups(origins):
             lines, arcs, blocks = self._near(x, y, reach + GROUP * math.sqrt(0.5))
-            p, d = origins[chosen, None, :], np.stack([np.cos(angles[chosen]), np.sin(angles[chosen])], axis=-1)
-            d = d[:, None, :]
+            p = origins[chosen].repeat(angles.shape[1], axis=0)[:, None, :]  # each ray by itself
+            d = np.stack([np.cos(angles[chosen]), np.sin(angles[chosen])], axis=-1).reshape(-1, 1, 2)
             inside = [_in_capsule(p, d, lines), *_in_annular_sector(p, d, arcs)]
             low, high = (np.concatenate(ends, axis=1) for ends in zip(*inside, strict=True))
             # Within the union as long as some strip that was entered before is not left yet.
-            before, t = np.full(len(chosen), -1.0), np.zeros(len(chosen))
+            before, t = np.full(len(p), -1.0), np.zeros(len(p))
             while (t > before + 1e-9).any():
                 before = t
                 t = np.maximum(t, np.where(low <= t[:, None] + 1e-9, high, 0.0).max(axis=1, initial=0.0))
@@ -139,7 +128,7 @@ class ExactRoad:
             half = blocks[:, 3:5]
             enter, leave = _meet(*(_between(q[..., k], e[..., k], -half[:, k], half[:, k]) for k in (0, 1)))
             hit = np.where(leave > 0.0, np.maximum(enter, 0.0), np.inf)
-            result[chosen] = np.minimum(t, hit.min(axis=1, initial=reach))
+            result[chosen] = np.minimum(t, hit.min(axis=1, initial=reach)).reshape(len(chosen), -1)
         return result
 
     def outline_on_road(self, poses: np.ndarray, half_length: float, half_width: float) -> np.ndarray:
