@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from commands import BIN, answers, end, finish, importable, wait_until
+from commands import BIN, answers, end, finish, wait_until
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -127,7 +127,8 @@ def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
 def stand_ins(request: pytest.FixtureRequest) -> Iterator[None]:
     """Ray's workers, which know nothing of pytest's search path, can import what a test's file defines."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", importable(request.path))
+        for folder in (Path(__file__).parent / "support", request.path.parent):
+            patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
         yield
 
 

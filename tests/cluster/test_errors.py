@@ -20,8 +20,7 @@ from gridsim.reference.profile import BRAKING, LATERAL, top_speed
 INTERVAL = REGISTRY["seamless"].speed_interval
 TOP = top_speed(INTERVAL)
 CAR = VehicleConfig()
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-CHAMPION = BENCHMARKS / "champion.npz"
+CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 
 
 @pytest.fixture(scope="module")

@@ -58,10 +58,9 @@ def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
     assert not [name for name in files if "pickle" in name or name.endswith((".pth", ".pkl"))]
     assert "cloudpickle" not in (folder / "requirements.txt").read_text()
 
-    write_model(folder, champion_model(2, policy=policy))  # in place of the first
-    assert (Model.load(str(folder)).metadata or {})["champion_sha256"] == champion_model(
-        2, policy=policy
-    ).champion_sha256
+    second = champion_model(2, policy=policy)
+    write_model(folder, second)  # in place of the first
+    assert (Model.load(str(folder)).metadata or {})["champion_sha256"] == second.champion_sha256
     assert os.listdir(tmp_path) == ["model"]
 
 

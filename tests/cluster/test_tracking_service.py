@@ -14,7 +14,7 @@ import sqlite3
 from types import SimpleNamespace
 
 import pytest
-from commands import finish, rows, start, summary, wait_until
+from commands import finish, rows, running, summary, wait_until
 from tracked import PYTHONPATH, client, free_port, mlflow_server
 
 from cluster.runs.run import open_run
@@ -23,8 +23,8 @@ from cluster.runs.train import send_missing
 pytestmark = pytest.mark.e2e
 
 GENERATIONS = 12
-ROAD = ["--scenario", "curved", "--traffic", "2"]
-SMALL = [*ROAD, "--population", "48", "--generations", str(GENERATIONS), "--seed", "5", "--until", "2"]
+SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", str(GENERATIONS),
+         "--seed", "5", "--until", "2"]  # fmt: skip
 COMMAND = "gridsim-evolve"
 
 
@@ -49,12 +49,11 @@ def served(tmp_path_factory, empty_database):
         history = cwd / "runs" / name / "history.csv"
         return len(rows(history.parent)) if history.exists() else 0
 
-    try:
+    with contextlib.ExitStack() as stack:
         with mlflow_server(cwd, port):
             for name in ("during", "after"):
-                runs[name] = start(
-                    COMMAND, *SMALL, "--workers", "0", "--name", name, "--tracking-uri", uri, cwd=cwd
-                )  # fmt: skip
+                asked = (*SMALL, "--workers", "0", "--name", name, "--tracking-uri", uri)
+                runs[name] = stack.enter_context(running(COMMAND, *asked, cwd=cwd))
             wait_until(lambda: begun("during") and begun("after"), 300)
         seen = lines("during")  # and the server is dead
         wait_until(lambda: lines("during") >= min(seen + 3, GENERATIONS), 300)
@@ -67,10 +66,6 @@ def served(tmp_path_factory, empty_database):
                 cwd=cwd, uri=uri, database=cwd / "served.db", said=said,
                 codes={name: run.returncode for name, run in runs.items()},
             )  # fmt: skip
-    finally:
-        for run in runs.values():
-            if run.poll() is None:
-                os.killpg(run.pid, signal.SIGKILL)
 
 
 def check_complete(served, name):

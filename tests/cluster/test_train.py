@@ -10,7 +10,6 @@ from cluster.commands.cli import evolve_main
 from cluster.runs import train
 from cluster.runs.run import new_run, open_run, read_config
 from cluster.runs.settings import EvolveSettings
-from cluster.tracking.address import check_uri
 
 SETTINGS = EvolveSettings("curved", policy="mlp:4", population=8, generations=2)
 
@@ -31,7 +30,7 @@ class Notes(train.Reporter):
         self.seen.append("stopping")
 
     def unsent(self, text, finished):
-        self.seen.append("finished" if finished else text)
+        self.seen.append(text)
 
 
 def interrupted_ray():
@@ -72,16 +71,6 @@ def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raise
     assert found.info.status == status
     assert steps(uri, found.info.run_id, ["leader/success_rate"]) == [0, 1]
     assert open_run(run.path).tracking_key == found.data.tags["gridsim.key"]
-
-
-def test_what_could_not_be_sent_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(train.Session, "finish", end(None))
-    (tmp_path / "text.db").touch()
-    notes = Notes()
-    uri = check_uri(f"sqlite:///{tmp_path}/text.db")
-    (tmp_path / "text.db").write_text("some text, which is no database at all\n" * 100)
-    train.train(new_run(tmp_path, "r", SETTINGS), train.Workers(0, None, 0.0), uri, "driving", notes)
-    assert notes.seen == [1, 2, "finished"]
 
 
 @pytest.mark.usefixtures("impatient")

@@ -138,25 +138,17 @@ def test_a_box_only_ever_shortens_a_range_and_who_is_not_there_does_not():
 # --- Overlap ---------------------------------------------------------------------------------------------------------
 
 
-def cross_product(a, b):
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 def outlines_meet(one, other):
     """Whether rectangles [n, 4, 2] share ground with others [n, 4, 2]: bool [n].
 
-    An edge of one then crosses an edge of the other, or one lies within the other and so does its middle.
+    They do unless, seen along an edge of one of them, all corners of one lie before all those of the other.
     """
-    p, q = one[:, :, None], other[:, None]
-    r, s = np.roll(p, -1, axis=1) - p, np.roll(q, -1, axis=2) - q
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t, u = cross_product(q - p, s) / cross_product(r, s), cross_product(q - p, r) / cross_product(r, s)
-    crossing = (t >= 0.0) & (t <= 1.0) & (u >= 0.0) & (u <= 1.0)
-    within = [
-        (cross_product(np.roll(a, -1, axis=1) - a, b.mean(axis=1, keepdims=True) - a) >= 0.0).all(axis=1)
-        for a, b in ((one, other), (other, one))
-    ]
-    return crossing.any(axis=(1, 2)) | within[0] | within[1]
+    apart = np.zeros(len(one), dtype=bool)
+    for of in (one, other):
+        for edge in (of[:, 1] - of[:, 0], of[:, 2] - of[:, 1]):
+            a, b = (np.vecdot(corners, edge[:, None]) for corners in (one, other))
+            apart |= (a.max(axis=1) < b.min(axis=1)) | (b.max(axis=1) < a.min(axis=1))
+    return ~apart
 
 
 @pytest.mark.parametrize("vehicle", [VehicleConfig(), VehicleConfig(length=6.0, width=2.2)])

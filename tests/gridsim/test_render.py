@@ -43,10 +43,7 @@ def world(renderer, car, column, row):
     """Where pixels' middles are, by the textbook's turning: metres ahead and to the right of the car."""
     ahead = (renderer.size[1] * render.CAR_AT - (row + 0.5)) / renderer.pixels_per_m
     right = (column + 0.5 - renderer.size[0] / 2) / renderer.pixels_per_m
-    return (
-        car[X] + ahead * car[COS] + right * car[SIN],
-        car[Y] + ahead * car[SIN] - right * car[COS],
-    )
+    return car[X] + ahead * car[COS] + right * car[SIN], car[Y] + ahead * car[SIN] - right * car[COS]
 
 
 def test_every_pixel_is_road_where_the_map_has_road(scenario):

@@ -45,22 +45,13 @@ class Driver:
         self.heading.append(math.atan2(sine, cosine))
         self.speeds.append(speed)
 
-    def do(self, action: Action, times: int = 1) -> "Driver":
-        for _ in range(times):
-            acceleration, self.steering = act(self.k, int(action), self.state[4], self.steering)
-            self.steering = F(self.steering)
-            self.step(acceleration)
-        return self
+    def do(self, action: Action) -> None:
+        acceleration, self.steering = act(self.k, int(action), self.state[4], self.steering)
+        self.steering = F(self.steering)
+        self.step(acceleration)
 
 
 # --- Straight ahead --------------------------------------------------------------------------------------------------
-
-
-def test_20_mps_for_2_s_is_40_m():
-    car = Driver(speed=20.0).do(Action.NONE, 20)
-    assert car.x[-1] == pytest.approx(40.0, abs=1e-4)
-    assert car.y[-1] == 0.0
-    assert car.speed == 20.0
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.8, 5.0, 12.0, 20.0, 30.0])

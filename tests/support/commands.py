@@ -32,12 +32,12 @@ def start(*arguments, cwd, **env):
 @contextlib.contextmanager
 def running(*arguments, cwd, **env):
     """A command, started; nothing of it is left in the end."""
-    process = start(*arguments, cwd=cwd, **env)
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
+    with start(*arguments, cwd=cwd, **env) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def finish(*arguments, cwd, timeout=240, code=0, **env):
@@ -144,9 +144,3 @@ def end(node: subprocess.Popen) -> None:
             os.kill(pid, signal.SIGKILL)
     node.kill()
     node.wait()
-
-
-def importable(test):
-    """A PYTHONPATH with which workers can import what is defined in a test's file (`__file__`)."""
-    folders = [Path(test).parent, Path(__file__).parent, *filter(None, [os.environ.get("PYTHONPATH")])]
-    return os.pathsep.join(map(str, folders))

@@ -4,6 +4,7 @@ A host is a process in namespaces of its own (`unshare`). Its first process read
 end, however that is, it ends too, and the kernel removes the host's processes, mounts and network with it.
 """
 
+import contextlib
 import importlib.util
 import os
 import pwd
@@ -14,6 +15,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+import psutil  # type: ignore[import-untyped]
 from commands import descendants, wait_until
 
 HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
@@ -191,10 +193,8 @@ class Host:
         """Command lines of what runs there."""
         found = []
         for pid in descendants(self.pid):
-            try:
-                found.append(Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
-            except OSError:
-                continue
+            with contextlib.suppress(psutil.NoSuchProcess):
+                found.append(" ".join(psutil.Process(pid).cmdline()))
         return found
 
     def listening(self) -> dict[int, set[str]]:
