@@ -69,12 +69,8 @@ def ignored(path: str) -> bool:
 
 
 def test_what_is_copied_is_there_and_is_what_pip_needs() -> None:
-    sources = [
-        source
-        for name, rest in instructions()
-        if name == "COPY" and "--from" not in rest
-        for source in rest.split()[:-1]
-    ]
+    copied = [rest.split()[:-1] for name, rest in instructions() if name == "COPY" and "--from" not in rest]
+    sources = [source for each in copied for source in each]
     assert [source for source in sources if not (ROOT / source).exists()] == []
     files = [path for source in sources for path in [ROOT / source, *(ROOT / source).rglob("*.py")] if path.is_file()]
     assert [path for path in files if ignored(str(path.relative_to(ROOT)))] == []
@@ -90,9 +86,8 @@ def test_what_is_copied_is_there_and_is_what_pip_needs() -> None:
 
 
 def test_python_and_every_package_are_pinned_to_a_version_that_the_project_takes() -> None:
-    version = re.search(r"^ARG PYTHON=(3\.\d+\.\d+)$", DOCKERFILE, re.MULTILINE)
-    assert version is not None
-    assert version[1] in SpecifierSet(PROJECT["project"]["requires-python"])
+    (version,) = re.findall(r"^ARG PYTHON=(3\.\d+\.\d+)$", DOCKERFILE, re.MULTILINE)
+    assert version in SpecifierSet(PROJECT["project"]["requires-python"])
     assert all(rest.startswith("python:${PYTHON}-slim-") for name, rest in instructions() if name == "FROM")
     pinned = pins()
     for line in [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]:
@@ -105,12 +100,10 @@ def test_it_runs_as_a_user_whose_caches_and_volumes_are_its_own() -> None:
     user = [rest for name, rest in steps if name == "USER"][-1]
     text = "\n".join(rest for _, rest in steps)
     assert re.search(rf"useradd --uid [1-9]\d+ .*{user}", text)
-    owned = re.search(rf"install --directory --owner={user} --group={user} (.*)", text)
-    assert owned is not None
-    folders = set(owned[1].split())
-    cache = re.search(r"GRIDSIM_CACHE_DIR=(\S+)", text)
-    assert cache is not None
-    assert cache[1] in folders
+    (owned,) = re.findall(rf"install --directory --owner={user} --group={user} (.*)", text)
+    folders = set(owned.split())
+    (cache,) = re.findall(r"GRIDSIM_CACHE_DIR=(\S+)", text)
+    assert cache in folders
     home = [rest for name, rest in steps if name == "WORKDIR"][-1]
     assert f"{home}/{cli.EvolveFlags().output}" in folders, "where runs go by default"
     mounted = {
@@ -155,10 +148,9 @@ def test_every_node_of_ray_has_the_token_and_room_for_its_store() -> None:
         service = compose()["services"][name]
         assert service["environment"]["RAY_AUTH_MODE"] == "token"
         assert service["environment"]["RAY_AUTH_TOKEN"] == TOKEN
-        store = re.search(r"--object-store-memory=(\d+)", service["command"])
-        assert store is not None
+        (store,) = re.findall(r"--object-store-memory=(\d+)", service["command"])
         assert service["shm_size"] == "1gb"
-        assert int(store[1]) < 2**30
+        assert int(store) < 2**30
     assert "RAY_AUTH_TOKEN" not in str(compose()["services"]["mlflow"])
 
 

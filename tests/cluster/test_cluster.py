@@ -1,7 +1,6 @@
 """The cluster files: held against Ray's schema and the project, and local.yaml used for real, on two hosts over SSH."""
 
 import contextlib
-import importlib.util
 import json
 import re
 import shlex
@@ -10,7 +9,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterator
-from importlib.metadata import distributions, requires
+from importlib.metadata import distribution, distributions, requires
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +54,7 @@ def pinned(config: dict[str, Any]) -> dict[str, str]:
 
 @pytest.mark.parametrize("name", LAUNCHED)
 def test_file_fits_rays_schema(root: Path, name: str) -> None:
-    ray = importlib.util.find_spec("ray")
-    assert ray is not None
-    assert ray.submodule_search_locations is not None
-    schema = json.loads(Path(ray.submodule_search_locations[0], "autoscaler/ray-schema.json").read_text())
+    schema = json.loads(Path(str(distribution("ray").locate_file("ray/autoscaler/ray-schema.json"))).read_text())
     config = read(root, name)
     jsonschema.validate(config, schema)
     with pytest.raises(jsonschema.ValidationError):

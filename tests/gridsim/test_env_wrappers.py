@@ -42,12 +42,10 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
         for _ in range(3):
             env.step(Action.ACCELERATE)
     assert human.render() is None
-    picture = array.render()
-    assert picture is not None
+    picture: Any = array.render()
     assert picture.dtype == np.uint8
     assert picture.shape == (RENDER_SIZE[1], RENDER_SIZE[0], 3)
-    surface = pygame.display.get_surface()
-    assert surface is not None
+    surface: Any = pygame.display.get_surface()
     shown = pygame.surfarray.array3d(surface).swapaxes(0, 1)
     np.testing.assert_array_equal(shown, picture)
 
@@ -60,30 +58,26 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
 
 
 def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
-    env = GridSimVectorEnv(3, scenario="highway", maps=maps["highway"], render_mode="rgb_array", observation="grid")
+    options: Any = {"scenario": "highway", "maps": maps["highway"], "observation": "grid"}
+    env: Any = GridSimVectorEnv(3, render_mode="rgb_array", **options)
     env.reset(seed=0)
     pictures = env.render()
-    assert pictures is not None
     assert len(pictures) == 3
     assert len({p.tobytes() for p in pictures}) == 3
-    again = env.render()
-    assert again is not None
-    np.testing.assert_array_equal(pictures, again)
+    np.testing.assert_array_equal(pictures, env.render())
 
 
 @pytest.mark.parametrize("vector", [False, True])
 def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path, vector: bool) -> None:
     """Films are of lengths that MoviePy 2 does not cut: it does so with 8, 10 and 11 pictures at 10 a second."""
     options: Any = {"maps": 1, "render_mode": "rgb_array", "max_episode_steps": 6}
+    filmed: Any = {"video_folder": str(tmp_path / "films"), "episode_trigger": lambda _: True}
     env: Any
     if vector:
-        env = gymnasium.make_vec("GridSim/Highway-v0", num_envs=2, **options)
-        env = wrappers.RecordVideo(
-            env, str(tmp_path / "films"), video_aspect_ratio=(2, 1), episode_trigger=lambda _: True
-        )
+        plain = gymnasium.make_vec("GridSim/Highway-v0", num_envs=2, **options)
+        env = wrappers.RecordVideo(plain, video_aspect_ratio=(2, 1), **filmed)
     else:
-        env = gymnasium.make("GridSim/Highway-v0", **options)
-        env = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
+        env = RecordVideo(gymnasium.make("GridSim/Highway-v0", **options), **filmed)
     env.reset(seed=0)
     for step in range(6 + 1 + 4):  # an episode, the step or reset that begins the next one, and some of that one
         if step == 6 and not vector:
@@ -195,9 +189,8 @@ def test_a_copied_environment_goes_on_alike_with_the_same_kernels(
 def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Map]]) -> None:
     """Gymnasium copies what it is given; a kernel takes arrays that can be written to for another type."""
     city = maps["city"][0]
-    spec = gymnasium.make("GridSim/City-v0", maps=[city]).spec
-    assert spec is not None
-    copied = spec.make().unwrapped.cars.simulator.scenarios[0]  # type: ignore[attr-defined]
+    spec: Any = gymnasium.make("GridSim/City-v0", maps=[city]).spec
+    copied = spec.make().unwrapped.cars.simulator.scenarios[0]
     assert copied.seed == city.seed
     for again in (city, copied, copy.deepcopy(city), pickle.loads(pickle.dumps(city))):
         np.testing.assert_equal(again.arrays(), city.arrays())

@@ -82,10 +82,9 @@ def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
         load_map(save(tmp_path / "ring.png", pixels))
     assert len(said) == short
     if short:
-        told = r"ring has about (\d+) m of road\. Ground driven again within 200 m does not count"
-        about = re.match(told, str(said[0].message))
-        assert about is not None
-        assert float(about[1]) == pytest.approx(2 * math.pi * radius, rel=0.1)
+        told = r"^ring has about (\d+) m of road\. Ground driven again within 200 m does not count"
+        (about,) = re.findall(told, str(said[0].message))
+        assert float(about) == pytest.approx(2 * math.pi * radius, rel=0.1)
 
 
 def test_an_inverted_picture_is_told_by_environments_and_commands(tmp_path):
