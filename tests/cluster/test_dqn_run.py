@@ -24,17 +24,6 @@ NOT_OF_THE_CLOCK = ("distance_m/best", "distance_m/mean", "loss", "q/mean", "q/c
 pytestmark = pytest.mark.e2e
 
 
-def same(run, reference):
-    """Whether two runs did and found the same: the champion, and every network on the way to it."""
-    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
-    assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
-    mine, theirs = load(run / "checkpoint.npz")[0], load(reference / "checkpoint.npz")[0]
-    assert {name for name in theirs if not np.array_equal(mine[name], theirs[name])} <= {"history"}  # it has the clock
-    for row, other in zip(rows(run), rows(reference), strict=True):
-        assert {name: row[name] for name in NOT_OF_THE_CLOCK} == {name: other[name] for name in NOT_OF_THE_CLOCK}
-    return True
-
-
 @pytest.mark.usefixtures("database")
 def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, tmp_path):
     run = tmp_path / "runs/k"
@@ -55,7 +44,12 @@ def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, t
         process.communicate()
     assert not (run / "summary.json").exists()
     finish("gridsim-dqn", "--resume", str(run), "--workers", "0", cwd=tmp_path)
-    assert same(run, reference)
+    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
+    assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
+    mine, theirs = load(run / "checkpoint.npz")[0], load(reference / "checkpoint.npz")[0]
+    assert {name for name in theirs if not np.array_equal(mine[name], theirs[name])} <= {"history"}  # it has the clock
+    for row, other in zip(rows(run), rows(reference), strict=True):
+        assert {name: row[name] for name in NOT_OF_THE_CLOCK} == {name: other[name] for name in NOT_OF_THE_CLOCK}
     again = finish("gridsim-dqn", "--resume", str(run), cwd=tmp_path)
     assert again.stderr == ""
     assert "is finished" in again.stdout

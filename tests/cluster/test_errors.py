@@ -45,14 +45,9 @@ def along(points, speed, steering=0.0):
     return rows
 
 
-def straight(length, step=0.5):
-    s = np.arange(0.0, length + step / 2, step)
+def straight(length):
+    s = np.arange(0.0, length + 0.25, 0.5)
     return np.stack([10.0 + s, np.full_like(s, 20.0)], axis=1)
-
-
-def circle(radius, length, step=0.25):
-    turn = np.arange(0.0, length / radius, step / radius)
-    return 100.0 + radius * np.stack([np.sin(turn), -np.cos(turn)], axis=1)
 
 
 def of(poses, road):
@@ -73,8 +68,8 @@ def test_constant_offsets_on_a_straight_are_the_errors(road):
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_circle_wants_the_bicycles_steering(road, side):
-    radius = 20.0
-    points = circle(radius, 100.0) * [1.0, side]
+    radius, turn = 20.0, np.arange(0.0, 5.0, 0.0125)
+    points = (100.0 + radius * np.stack([np.sin(turn), -np.cos(turn)], axis=1)) * [1.0, side]
     speed = math.sqrt(LATERAL * radius)
     wheels = side * math.atan(2.0 * math.tan(math.asin(1.25 / radius)))
     right = errors_of([of(along(points, speed, wheels), road)], CAR)

@@ -1,10 +1,12 @@
-"""RayPool with real Ray processes: the same bits from any number of workers, and what happens when workers die."""
+"""RayPool with real Ray processes: the same bits from any number of workers, workers that die, and addresses."""
 
 import contextlib
 import functools
+import http.server
 import os
 import re
 import signal
+import socket
 import sys
 import threading
 import time
@@ -33,6 +35,7 @@ from test_pool import (
 from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool
+from cluster.workers.ray_session import check_address
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
@@ -327,3 +330,37 @@ def test_workers_that_cannot_start_are_given_up() -> None:
 def test_a_pool_needs_workers(workers: int) -> None:
     with pytest.raises(ValueError, match="1 worker or more"):
         RayPool(workers, never_built)
+
+
+# --- Addresses of clusters --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("address", ["nowhere", "host:0", "host:99999", ":6379", "ray://127.0.0.1:10001", "a/b:1"])
+def test_what_is_no_address(address: str) -> None:
+    with pytest.raises(PoolError, match="is not a Ray address; give host:port"):
+        RayPool(2, never_built, address)
+
+
+def test_an_address_where_nothing_answers() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    started = time.perf_counter()
+    with pytest.raises(PoolError, match=rf"^no Ray cluster answers at {address}: Connection refused; is `ray start"):
+        RayPool(2, never_built, address)
+    assert time.perf_counter() - started < 2
+
+
+def test_an_address_where_something_else_answers() -> None:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), http.server.BaseHTTPRequestHandler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with pytest.raises(PoolError, match="is not a Ray cluster; is that its head's port"):
+            check_address(f"127.0.0.1:{server.server_port}")
+        server.shutdown()
+
+
+def test_an_address_that_accepts_and_says_nothing() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        started = time.perf_counter()
+        with pytest.raises(PoolError, match="is not a Ray cluster"):
+            check_address(f"127.0.0.1:{server.getsockname()[1]}")
+        assert time.perf_counter() - started < 5

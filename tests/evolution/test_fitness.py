@@ -19,12 +19,7 @@ def results(distance, paced):
 
 
 metres = st.floats(0.0, 1000.0, width=32)
-episodes = st.lists(st.tuples(metres, st.floats(0.0, 1.0)), min_size=1, max_size=6)
-
-
-def one(drives):
-    """One member's results [1, e] of (distance, share of it that was paced)."""
-    return results([[d for d, _ in drives]], [[d * share for d, share in drives]])
+episodes = st.lists(st.tuples(metres, st.floats(0.0, 1.0)), min_size=1, max_size=6)  # distance, share that was paced
 
 
 def test_nothing_is_0_and_the_target_is_1():
@@ -35,7 +30,7 @@ def test_nothing_is_0_and_the_target_is_1():
 
 @given(drives=episodes, which=st.integers(0, 5), more=st.floats(0.5, 100.0))
 def test_further_and_better_paced_is_never_worse(drives, which, more):
-    row = one(drives)
+    row = results([[d for d, _ in drives]], [[d * share for d, share in drives]])
     further, paced = row.copy(), row.copy()
     k = which % len(drives)
     further["distance"][0, k] += more

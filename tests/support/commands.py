@@ -107,14 +107,16 @@ def descendants(pid):
     return []
 
 
+def command_line(pid):
+    """Of a process; empty where it is gone."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return " ".join(psutil.Process(pid).cmdline())
+    return ""
+
+
 def ray_workers(pid):
     """Actor processes that belong to a command."""
-    found = []
-    for child in descendants(pid):
-        with contextlib.suppress(OSError):
-            if Path(f"/proc/{child}/cmdline").read_bytes().startswith(b"ray::Actor"):
-                found.append(child)
-    return found
+    return [child for child in descendants(pid) if command_line(child).startswith("ray::Actor")]
 
 
 def wait_until(condition, timeout=120.0, pause=0.02):

@@ -4,7 +4,6 @@ A host is a process in namespaces of its own (`unshare`). Its first process read
 end, however that is, it ends too, and the kernel removes the host's processes, mounts and network with it.
 """
 
-import contextlib
 import importlib.util
 import os
 import pwd
@@ -15,8 +14,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import psutil  # type: ignore[import-untyped]
-from commands import descendants, wait_until
+from commands import command_line, descendants, wait_until
 
 HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
 PROGRAMS = {
@@ -191,11 +189,7 @@ class Host:
 
     def processes(self) -> list[str]:
         """Command lines of what runs there."""
-        found = []
-        for pid in descendants(self.pid):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                found.append(" ".join(psutil.Process(pid).cmdline()))
-        return found
+        return [command_line(pid) for pid in descendants(self.pid)]
 
     def listening(self) -> dict[int, set[str]]:
         """Ports that TCP connections are waited for at, and the addresses that they can be made to."""
