@@ -150,31 +150,23 @@ UP_S = 300.0  # for what takes half a minute on a quiet machine
 class Machines:
     """A laptop, with the switch, and machines that serve SSH: a head, a worker without GridSim, and a spare one."""
 
-    def __init__(self, folder: Path, root: Path):
-        self.all: list[Host] = []
+    def __init__(self, folder: Path, root: Path, stack: contextlib.ExitStack):
         keep = [root, Path(sys.prefix), Path(sys.base_prefix), CACHE_FOLDER]
-        try:
-            self.laptop = hosts.switch(folder / "laptop", keep)
-            self.all.append(self.laptop)
-            self.head = Host(folder / "head", keep)
-            self.all.append(self.head)
-            self.worker = Host(folder / "worker", keep, hosts.package_folders())
-            self.all.append(self.worker)
-            self.laptop.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/gridsim")
-            authorized = (self.laptop.home / ".ssh/gridsim.pub").read_text()
-            self.spare = Host(folder / "spare", keep)
-            self.all.append(self.spare)
-            for address, host in (("10.77.0.2", self.head), ("10.77.0.3", self.worker), ("10.77.0.4", self.spare)):
-                host.connect(self.laptop, address)
-                host.serve_ssh(authorized)
-                (host.home / ".bashrc").write_text(f"export GRIDSIM_CACHE_DIR={CACHE_FOLDER.parents[1]}\n")
-            with (self.head.home / ".bashrc").open("a") as profile:
-                profile.write(f"export PYTHONPATH={root}\n")  # these sources, whatever is installed
-            self.config = HOME / "cluster.yaml"
-            (self.laptop.home / "cluster.yaml").write_text(yaml.safe_dump(self._adapted(root)))
-        except BaseException:
-            self.close()
-            raise
+        self.laptop = stack.enter_context(contextlib.closing(hosts.switch(folder / "laptop", keep)))
+        self.head = stack.enter_context(contextlib.closing(Host(folder / "head", keep)))
+        without = hosts.package_folders()
+        self.worker = stack.enter_context(contextlib.closing(Host(folder / "worker", keep, without)))
+        self.spare = stack.enter_context(contextlib.closing(Host(folder / "spare", keep)))
+        self.laptop.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/gridsim")
+        authorized = (self.laptop.home / ".ssh/gridsim.pub").read_text()
+        for address, host in (("10.77.0.2", self.head), ("10.77.0.3", self.worker), ("10.77.0.4", self.spare)):
+            host.connect(self.laptop, address)
+            host.serve_ssh(authorized)
+            (host.home / ".bashrc").write_text(f"export GRIDSIM_CACHE_DIR={CACHE_FOLDER.parents[1]}\n")
+        with (self.head.home / ".bashrc").open("a") as profile:
+            profile.write(f"export PYTHONPATH={root}\n")  # these sources, whatever is installed
+        self.config = HOME / "cluster.yaml"
+        (self.laptop.home / "cluster.yaml").write_text(yaml.safe_dump(self._adapted(root)))
 
     def _adapted(self, root: Path) -> dict[str, Any]:
         """local.yaml with these addresses, without downloads, and with one core of each machine."""
@@ -187,19 +179,15 @@ class Machines:
             config[f"{which}_start_ray_commands"][-1] += " --num-cpus=1 --object-store-memory=100000000"
         return config
 
-    def close(self) -> None:
-        for host in reversed(self.all):
-            host.close()
-
 
 @pytest.fixture(scope="module")
 def machines(tmp_path_factory: pytest.TempPathFactory, root: Path, empty_database: Path) -> Iterator[Machines]:
     if reason := hosts.missing():
         pytest.skip(reason)
-    machines = Machines(tmp_path_factory.mktemp("hosts"), root)
-    shutil.copy(empty_database, machines.head.home / "mlflow.db")
-    yield machines
-    machines.close()
+    with contextlib.ExitStack() as stack:
+        machines = Machines(tmp_path_factory.mktemp("hosts"), root, stack)
+        shutil.copy(empty_database, machines.head.home / "mlflow.db")
+        yield machines
 
 
 @pytest.fixture(scope="module")

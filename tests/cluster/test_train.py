@@ -33,16 +33,14 @@ class Notes(train.Reporter):
         self.seen.append(text)
 
 
-def interrupted_ray():
-    raise SystemError from KeyboardInterrupt()
+INTERRUPTED_RAY = SystemError()
+INTERRUPTED_RAY.__cause__ = KeyboardInterrupt()
 
 
 def end(error):
     def finish(session, workers):
-        if isinstance(error, type):
-            raise error
         if error:
-            error()
+            raise error
 
     return finish
 
@@ -52,7 +50,7 @@ def end(error):
     [
         (None, None, "FINISHED", []),
         (KeyboardInterrupt, KeyboardInterrupt, "KILLED", ["stopping"]),
-        (interrupted_ray, KeyboardInterrupt, "KILLED", ["stopping"]),
+        (INTERRUPTED_RAY, KeyboardInterrupt, "KILLED", ["stopping"]),
         (MemoryError, MemoryError, "FAILED", []),
     ],
 )

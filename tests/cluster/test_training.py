@@ -44,9 +44,11 @@ def maps():
 
 def begin(maps, settings=SETTINGS):
     """A run with a short validation."""
-    evolution = Evolution(settings, SerialPool(maps.build), maps)
-    curriculum = evolution.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, validation=8)
+    return with_a_short_validation(Evolution(settings, SerialPool(maps.build), maps))
+
+
+def with_a_short_validation(evolution):
+    evolution.curriculum.config = dataclasses.replace(evolution.curriculum.config, validation=8)
     return evolution
 
 
@@ -265,8 +267,7 @@ def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, stopped, name)
 def in_folder(run, maps):
     """A run in its folder, with a short validation."""
     made = Session(run, SerialPool(maps.build), maps, f"sqlite:///{run.path.parent}/m.db", "test")
-    curriculum = made.learning.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, validation=8)
+    with_a_short_validation(made.learning)
     return made
 
 

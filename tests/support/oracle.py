@@ -40,20 +40,16 @@ class ExactRoad:
         self.blocks = np.array(strips.blocks, dtype=np.float64).reshape(-1, 5)
 
     @cached_property
-    def _boxes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bounding boxes of lines, arcs and blocks, [4, n]: x from, x to, y from, y to."""
-        lines, arcs = self.lines, self.arcs
-        a, b, w = lines[:, 0:2], lines[:, 2:4], lines[:, 4:5]
-        low, high = np.minimum(a, b) - w, np.maximum(a, b) + w
+    def _circles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A circle that holds each of lines, arcs and blocks, [3, n]: x, y, radius."""
+        lines, arcs, blocks = self.lines.T, self.arcs.T, self.blocks.T
+        length = np.hypot(lines[2] - lines[0], lines[3] - lines[1])
         # A piece of a quarter turn at most lies in the circle about its middle that reaches its ends.
-        middle = arcs[:, 3] + arcs[:, 4] / 2
-        mx, my = arcs[:, 0] + arcs[:, 2] * np.cos(middle), arcs[:, 1] + arcs[:, 2] * np.sin(middle)
-        size = 2 * arcs[:, 2] * np.sin(arcs[:, 4] / 4) + arcs[:, 5]
-        bx, by, diagonal = self.blocks[:, 0], self.blocks[:, 1], np.hypot(self.blocks[:, 3], self.blocks[:, 4])
+        middle, size = arcs[3] + arcs[4] / 2, 2 * arcs[2] * np.sin(arcs[4] / 4) + arcs[5]
         return (
-            np.stack([low[:, 0], high[:, 0], low[:, 1], high[:, 1]]),
-            np.stack([mx - size, mx + size, my - size, my + size]),
-            np.stack([bx - diagonal, bx + diagonal, by - diagonal, by + diagonal]),
+            np.stack([(lines[0] + lines[2]) / 2, (lines[1] + lines[3]) / 2, length / 2 + lines[4]]),
+            np.stack([arcs[0] + arcs[2] * np.cos(middle), arcs[1] + arcs[2] * np.sin(middle), size]),
+            np.stack([blocks[0], blocks[1], np.hypot(blocks[3], blocks[4])]),
         )
 
     def _near(self, x: float, y: float, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -63,10 +59,9 @@ class ExactRoad:
             for dy in self._shifts(y, radius, self.height):
                 moved = ([dx, dy, dx, dy, 0.0], [dx, dy, 0.0, 0.0, 0.0, 0.0], [dx, dy, 0.0, 0.0, 0.0])
                 kinds = (self.lines, self.arcs, self.blocks)
-                for items, box, shift, near in zip(kinds, self._boxes, moved, found, strict=True):
-                    away_x = np.maximum(np.maximum(box[0] + dx - x, x - box[1] - dx), 0.0)
-                    away_y = np.maximum(np.maximum(box[2] + dy - y, y - box[3] - dy), 0.0)
-                    near.append(items[away_x**2 + away_y**2 <= radius**2] + shift)
+                for items, circle, shift, near in zip(kinds, self._circles, moved, found, strict=True):
+                    away = np.hypot(circle[0] + dx - x, circle[1] + dy - y) - circle[2]
+                    near.append(items[away <= radius] + shift)
         lines, arcs, blocks = map(np.concatenate, found)
         return lines, arcs, blocks
 
