@@ -249,9 +249,8 @@ def test_the_services_come_up_and_a_run_is_evolved_on_them_and_tracked(
     summary = json.loads((services.folder / "runs/composed/summary.json").read_text())
     assert summary["workers"] == 1
     assert summary["mlflow_run_id"], "the server has it"
-    with pytest.raises(
-        PoolError, match=rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
-    ):
+    wants = rf"^the Ray cluster at {address} wants its token: set RAY_AUTH_MODE=token, and"
+    with pytest.raises(PoolError, match=wants):
         check_address(address)
     monkeypatch.setenv("RAY_AUTH_MODE", "token")
     monkeypatch.setenv("RAY_AUTH_TOKEN", TOKEN)

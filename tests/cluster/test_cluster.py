@@ -106,10 +106,9 @@ def test_kuberay_has_a_run_and_a_cluster_that_stays(root: Path) -> None:
     (workers,) = spec["workerGroupSpecs"]
     version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     pods = []
+    labels = documents["NetworkPolicy"]["spec"]["podSelector"]["matchLabels"]
     for group in (spec["headGroupSpec"], workers):
-        assert (
-            group["template"]["metadata"]["labels"] == documents["NetworkPolicy"]["spec"]["podSelector"]["matchLabels"]
-        )
+        assert group["template"]["metadata"]["labels"] == labels
         pod = group["template"]["spec"]
         pods.append((pod, *pod["containers"]))
         assert pod["securityContext"]["runAsNonRoot"]

@@ -35,10 +35,6 @@ SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--gene
 REFERENCE = ("gridsim-evolve", *SMALL)
 
 
-def generations(run: Path) -> int:
-    return len(rows(run)) if (run / "history.csv").is_file() else 0
-
-
 class Stopping(Answering):
     """Stops its own process where it is told to, in a parcel or while it is prepared: nobody hears of it again."""
 
@@ -75,10 +71,8 @@ def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> No
 
 def test_an_only_worker_that_stops_while_it_is_prepared_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "stop").touch()
-    pool = RayPool(
-        1, never_built, worker_factory=functools.partial(Stopping, tmp_path, prepared=False), patience_s=15.0
-    )
-    with contextlib.closing(pool):
+    worker = functools.partial(Stopping, tmp_path, prepared=False)
+    with contextlib.closing(RayPool(1, never_built, worker_factory=worker, patience_s=15.0)) as pool:
         outcome = pool.evaluate(make_task(), make_recipes(8))
         wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(8))
         assert outcome.results.tobytes() == wanted.results.tobytes()
@@ -92,7 +86,7 @@ def test_workers_killed_at_random_moments_change_nothing(reference: Path, tmp_pa
     arguments = ("--workers", "2", "--patience", "300", "--name", "k", *SMALL)
     run, rng, killed = tmp_path / "runs/k", random.Random(0), 0
     with running("gridsim-evolve", *arguments, cwd=tmp_path) as process:
-        wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
+        wait_until(lambda: rows(run) or process.poll() is not None, LONG_S)
         while killed < 5 and process.poll() is None:
             time.sleep(rng.uniform(0.0, 0.6))
             for pid in rng.sample(victims := ray_workers(process.pid), min(len(victims), 1)):
@@ -120,14 +114,14 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     arguments = ("--workers", "2", "--address", "auto", "--patience", str(PATIENCE_S), "--name", "h", *SMALL)
     with running("gridsim-evolve", *arguments, cwd=tmp_path, RAY_ADDRESS=address) as process:
         _, first = cluster(1, address)
-        wait_until(lambda: generations(run) or process.poll() is not None, LONG_S)
+        wait_until(lambda: rows(run) or process.poll() is not None, LONG_S)
         process.send_signal(signal.SIGSTOP)  # or it may be done before the second host is up
         _, second = cluster(1, address)
         wait_until(lambda: below(second, "ray::Actor"), LONG_S)
-        done = generations(run)
+        done = len(rows(run))
         end(first)
         process.send_signal(signal.SIGCONT)
-        wait_until(lambda: generations(run) > done + 1 or process.poll() is not None, LONG_S)
+        wait_until(lambda: len(rows(run)) > done + 1 or process.poll() is not None, LONG_S)
         end(second)
         killed = time.monotonic()
         _, err = process.communicate(timeout=LONG_S)

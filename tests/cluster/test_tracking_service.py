@@ -45,27 +45,20 @@ def served(tmp_path_factory, empty_database):
         rows_of = "SELECT count(*) FROM metrics JOIN runs USING (run_uuid) WHERE name LIKE ?"
         return query(cwd / "served.db", rows_of, f"{name}%")[0][0]
 
-    def lines(name):
-        history = cwd / "runs" / name / "history.csv"
-        return len(rows(history.parent)) if history.exists() else 0
-
     with contextlib.ExitStack() as stack:
         with mlflow_server(cwd, port):
             for name in ("during", "after"):
                 asked = (*SMALL, "--workers", "0", "--name", name, "--tracking-uri", uri)
                 runs[name] = stack.enter_context(running(COMMAND, *asked, cwd=cwd))
             wait_until(lambda: begun("during") and begun("after"), 300)
-        seen = lines("during")  # and the server is dead
-        wait_until(lambda: lines("during") >= min(seen + 3, GENERATIONS), 300)
+        seen = len(rows(cwd / "runs/during"))  # and the server is dead
+        wait_until(lambda: len(rows(cwd / "runs/during")) >= min(seen + 3, GENERATIONS), 300)
         os.kill(runs["during"].pid, signal.SIGSTOP)
         said["after"] = runs["after"].communicate(timeout=600)
         with mlflow_server(cwd, port):
             os.kill(runs["during"].pid, signal.SIGCONT)
             said["during"] = runs["during"].communicate(timeout=600)
-            yield SimpleNamespace(
-                cwd=cwd, uri=uri, database=cwd / "served.db", said=said,
-                codes={name: run.returncode for name, run in runs.items()},
-            )  # fmt: skip
+            yield SimpleNamespace(cwd=cwd, uri=uri, database=cwd / "served.db", said=said, runs=runs)
 
 
 def check_complete(served, name):
@@ -110,7 +103,7 @@ def away(served):
 
 def test_a_run_outlives_an_outage_and_loses_nothing(served):
     _out, err = served.said["during"]
-    assert served.codes["during"] == 0
+    assert served.runs["during"].returncode == 0
     assert re.fullmatch(rf"({away(served)}[^\n]* is back, and has all rows\n)?", err)
     run = check_complete(served, "during")
     assert len({summary(served.cwd / "runs" / name)["champion_sha256"] for name in ("during", "after")}) == 1
@@ -120,7 +113,7 @@ def test_a_run_outlives_an_outage_and_loses_nothing(served):
 
 def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     _out, err = served.said["after"]
-    assert served.codes["after"] == 0
+    assert served.runs["after"].returncode == 0
     assert re.fullmatch(
         rf"({away(served)})?"
         rf"{COMMAND}: warning: not logged to MLflow at {served.uri}: \d+ rows? \(step [\d to]*{GENERATIONS}\), "
@@ -138,11 +131,10 @@ def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
     assert run.info.end_time <= 1000.0 * ended + 2.0  # not when it was sent
     assert run.info.end_time - run.info.start_time == pytest.approx(1000.0 * summary(folder)["wall_s"], abs=2.0)
 
-    dump = [query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")]
+    tables = ("runs", "metrics", "tags", "model_versions")
+    before = [query(served.database, f"SELECT * FROM {table}") for table in tables]
     assert send_missing(open_run(folder), "", "gridsim") == ("", None)
-    assert dump == [
-        query(served.database, f"SELECT * FROM {table}") for table in ("runs", "metrics", "tags", "model_versions")
-    ]
+    assert before == [query(served.database, f"SELECT * FROM {table}") for table in tables]
 
 
 FRESH = """

@@ -4,7 +4,6 @@ import re
 import subprocess
 import sys
 import time
-from contextlib import closing
 from hashlib import sha256
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from commands import call, refused
+from pictures import record_drive
 
 from cluster.commands import watch
 from cluster.commands.watch import checkpoint_time, elite, watch_main
@@ -26,7 +26,6 @@ from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import Recorder, manual, poses_of
 from gridsim.view.render import Renderer
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
@@ -128,14 +127,8 @@ def test_watch_writes_films(tmp_path, monkeypatch, capsys):
 def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     scenario = build("seamless", 3)
-    simulator = manual(scenario)
     start = sample_starts(scenario, 1, np.random.default_rng(1))[0]
-    with closing(Recorder(tmp_path / "drive.csv", scenario, 0.1)) as recorder:
-        for episode, steps in enumerate((16, 11)):
-            simulator.reset(start[None])
-            for k in range(steps):
-                recorder.write(k, start if k == 0 else poses_of(simulator.state.cars[0]), 0, episode)
-                simulator.step(np.array([0]))
+    record_drive(tmp_path / "drive.csv", scenario, start, [[0] * 16, [0] * 11])
     for arguments, pictures in (([], 25), (["--seconds", 2], 20)):
         film = ["drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]
         code, out, _ = call(watch_main, monkeypatch, capsys, *film)

@@ -96,10 +96,13 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again():
     curriculum = new()
     led(curriculum, 0, np.full(8, End.COLLISION))
     easy = curriculum.crashes["start"][4:, 0]
+
+    def crash_starts(generation):
+        """Of each group: [3, 2]."""
+        return curriculum.episodes(generation).rows["start"].reshape(3, 4, 5)[:, 2:, 0]
+
     for generation in range(1, 40):
-        starts = (
-            curriculum.episodes(generation).rows["start"].reshape(3, 4, 5)[:, 2:, 0]
-        )  # of each group's crash starts
+        starts = crash_starts(generation)
         results = np.zeros((3, 6, 4), dtype=RESULT)  # of groups, members, episodes
         results["end"] = End.COLLISION
         results["end"][:, ::2, 2:] = End.SUCCESS  # half of the members avoid the hard ones
@@ -107,9 +110,7 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again():
         curriculum.learn_from_members(generation, list(results))
     assert curriculum.failures[:4] == pytest.approx(0.5)
     assert (curriculum.failures[4:] < 0.05).all()
-    drawn = np.concatenate(
-        [curriculum.episodes(k).rows["start"].reshape(3, 4, 5)[:, 2:, 0].ravel() for k in range(40, 90)]
-    )
+    drawn = np.concatenate([crash_starts(generation) for generation in range(40, 90)])
     # Of 6 starts without repetition, 4 are hard ones nearly always.
     assert 0.58 < 1.0 - np.isin(drawn, easy).mean() < 0.67
     led(curriculum, 1, np.full(8, End.COLLISION))

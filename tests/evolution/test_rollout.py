@@ -97,13 +97,9 @@ def test_what_is_rewound_goes_on_as_it_did(among):
     for k, (row, states, traffic) in enumerate(paths):
         first, last = max(int(row["steps"]) - 64, 0), int(row["steps"])
         assert then[0, k].tobytes() == traffic[first].tobytes()
-        assert starts[0, k] == pytest.approx(
-            [
-                *states[first][[X, Y]],
-                math.atan2(states[first][SIN], states[first][COS]),
-                *states[first][[SPEED, STEERING]],
-            ]
-        )
+        car = states[first]
+        pose = [*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]]
+        assert starts[0, k] == pytest.approx(pose)
         if End(int(row["end"])) != End.COLLISION:
             continue
         compared += 1

@@ -218,10 +218,8 @@ def meet(scenario, start, world, action=Action.NONE, steps=40):
 def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
     """30 against 30 m/s, 6 m a control period, at every phase of it; and past each other with 10 cm to spare."""
     for phase in np.arange(0.0, 6.0, 0.4):
-        along = SIDE - 150.0 - phase
-        simulator, end = meet(
-            cross, [100.0, 128.0 + aside, 0.0, 30.0, 0.0], on_lane(0, along, 30.0, (SIDE - along, 128.0, math.pi))
-        )
+        along, start = SIDE - 150.0 - phase, [100.0, 128.0 + aside, 0.0, 30.0, 0.0]
+        simulator, end = meet(cross, start, on_lane(0, along, 30.0, (SIDE - along, 128.0, math.pi)))
         assert end == (End.COLLISION if abs(aside) < 2.0 else End.RUNNING)
         car, other = simulator.state.cars[0], simulator.state.worlds[0, 0]
         assert other[SPEED] == pytest.approx(30.0, abs=1e-3)
@@ -251,11 +249,8 @@ def test_nothing_tunnels_through_crosswise(cross, offset):
     """Both at 30 m/s, at right angles, so that the middle of one is `offset` m short when that of the other crosses."""
     for phase in np.arange(0.0, 3.0, 0.4):
         south = 128.0 - 30.0 - phase
-        _, end = meet(
-            cross,
-            [128.0 - 30.0 - phase - offset, 128.0, 0.0, 30.0, 0.0],
-            on_lane(1, south, 30.0, (128.0, south, math.pi / 2)),
-        )
+        start = [128.0 - 30.0 - phase - offset, 128.0, 0.0, 30.0, 0.0]
+        _, end = meet(cross, start, on_lane(1, south, 30.0, (128.0, south, math.pi / 2)))
         assert end == End.COLLISION
 
 

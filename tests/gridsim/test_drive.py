@@ -9,19 +9,18 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import closing
 
 import numpy as np
 import pytest
 from commands import finish, refused, running, wait_until
+from pictures import record_drive
 
 from cluster.commands.watch import drive_main
-from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import COLUMNS, Recorder, action_for, manual, poses_of, read_drive, replay
+from gridsim.view.drive import COLUMNS, action_for, read_drive, replay
 
 
 @pytest.fixture(scope="module")
@@ -35,20 +34,7 @@ def recorded(scenario, tmp_path_factory):
     path = tmp_path_factory.mktemp("drive") / "drive.csv"
     rng = np.random.default_rng(0)
     start = sample_starts(scenario, 1, rng)[0]
-    simulator = manual(scenario)
-    poses = []
-    with closing(Recorder(path, scenario, 0.1)) as recorder:
-        for episode in range(2):
-            simulator.reset(start[None])
-            for step in range(60):
-                here = start if step == 0 else poses_of(simulator.state.cars[0])
-                action = int(rng.choice([0, 0, 1, 2, 3, 4, 5, 6, 7]))
-                recorder.write(step, here, action, episode)
-                poses.append(here)
-                _, _, _, ends = simulator.step(np.array([action]))
-                if ends[0] != End.RUNNING:
-                    break
-    return path, np.array(poses)
+    return path, record_drive(path, scenario, start, rng.choice([0, 0, 1, 2, 3, 4, 5, 6, 7], (2, 60)).tolist())
 
 
 @pytest.mark.parametrize(

@@ -140,9 +140,7 @@ def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: Maps) -> 
     assert not np.array_equal(first, second)
     assert not np.array_equal(first, other)
     np.testing.assert_array_equal(env.reset(seed=8)[0], first)
-    assert not np.array_equal(
-        GridSimEnv(maps=maps["seamless"]).reset()[0], GridSimEnv(maps=maps["seamless"]).reset()[0]
-    )
+    assert not np.array_equal(*(GridSimEnv(maps=maps["seamless"]).reset()[0] for _ in range(2)))
 
 
 @pytest.mark.parametrize("seed", [np.int64(3), np.uint8(254), [np.int64(3), 4, 5]])

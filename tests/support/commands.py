@@ -71,6 +71,9 @@ def summary(folder):
 
 
 def rows(folder):
+    """Of a run's history.csv; none before it is there."""
+    if not (folder / "history.csv").exists():
+        return []
     with (folder / "history.csv").open() as file:
         return list(csv.DictReader(file))
 
@@ -94,6 +97,7 @@ def same_run(run, reference):
     assert mine["car_steps"] == theirs["car_steps"]
     assert mine["lost_chunks"] == 0
     assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
+    assert len(rows(run)) == theirs["generations"]
     for row, other in zip(rows(run), rows(reference), strict=True):
         for name in ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate"):
             assert row[name] == other[name]

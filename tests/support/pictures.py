@@ -1,16 +1,18 @@
-"""Small roads, pictures of roads, and what is where on the maps made of them."""
+"""Small roads, pictures of roads, what is where on the maps made of them, and recorded drives."""
 
 import math
+from contextlib import closing
 
 import numpy as np
 import oracle
 import yaml
 from PIL import Image
 
-from gridsim.car.ego import collides
+from gridsim.car.ego import End, collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze, make_road
+from gridsim.view.drive import Recorder, manual, poses_of
 
 PPM = 16
 W, H = 100.0, 72.0  # m
@@ -74,6 +76,21 @@ def small_road(lines=(), arcs=(), side=64.0):
     """A road on a torus of so many metres, for 5 to 12 m/s and rays of 50 m; and the same for the oracle."""
     strips = Strips.of(lines, arcs)
     return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 1.0), oracle.ExactRoad(strips, side, side)
+
+
+def record_drive(path, scenario, start, episodes):
+    """Record a person's drive: episodes from one start, of these actions, until they end; the states in the file."""
+    simulator, states = manual(scenario), []
+    with closing(Recorder(path, scenario, 0.1)) as recorder:
+        for episode, actions in enumerate(episodes):
+            simulator.reset(start[None])
+            for step, action in enumerate(actions):
+                states.append(start if step == 0 else poses_of(simulator.state.cars[0]))
+                recorder.write(step, states[-1], action, episode)
+                _, _, _, ends = simulator.step(np.array([action]))
+                if ends[0] != End.RUNNING:
+                    break
+    return np.array(states)
 
 
 def strip(cx, cy, angle, half_width, half_length=45.0):
