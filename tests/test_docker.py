@@ -51,13 +51,6 @@ def compose() -> dict[str, Any]:
     return yaml.safe_load(re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", text))
 
 
-def pins() -> dict[str, str]:
-    lines = (ROOT / "docker/requirements.txt").read_text(encoding="utf-8").splitlines()
-    found = [re.fullmatch(r"([A-Za-z0-9._-]+)==([A-Za-z0-9.+]+)", line) for line in lines if line[0] not in "#-"]
-    assert all(found), "every package with one version"
-    return {canonicalize_name(match[1]): match[2] for match in found if match}
-
-
 def ignored(path: str) -> bool:
     """Whether .dockerignore keeps a path from the builder: the last pattern that fits decides."""
     kept = True
@@ -89,7 +82,10 @@ def test_python_and_every_package_are_pinned_to_a_version_that_the_project_takes
     (version,) = re.findall(r"^ARG PYTHON=(3\.\d+\.\d+)$", DOCKERFILE, re.MULTILINE)
     assert version in SpecifierSet(PROJECT["project"]["requires-python"])
     assert all(rest.startswith("python:${PYTHON}-slim-") for name, rest in instructions() if name == "FROM")
-    pinned = pins()
+    lines = (ROOT / "docker/requirements.txt").read_text(encoding="utf-8").splitlines()
+    found = [re.fullmatch(r"([A-Za-z0-9._-]+)==([A-Za-z0-9.+]+)", line) for line in lines if line[0] not in "#-"]
+    assert all(found), "every package with one version"
+    pinned = {canonicalize_name(match[1]): match[2] for match in found if match}
     for line in [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]:
         requirement = Requirement(line)
         assert pinned[canonicalize_name(requirement.name)] in requirement.specifier, line
@@ -193,8 +189,7 @@ class Services:
         return {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT), **image, **given}
 
     def start(self, name: str) -> None:
-        log = (self.folder / f"{name}.log").open("wb")
-        with log:
+        with (self.folder / f"{name}.log").open("wb") as log:
             self.started[name] = subprocess.Popen(
                 shlex.split(self.here(self.services[name]["command"])),
                 cwd=self.folder,

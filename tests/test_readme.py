@@ -60,12 +60,6 @@ def code(page: Path, language: str) -> str:
     return "\n".join(re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL))
 
 
-def commands(readme: Path) -> set[str]:
-    """The lines of its shell blocks, without comments."""
-    lines = code(readme, "sh").splitlines()
-    return {line.partition("#")[0].strip() for line in lines} - {""}
-
-
 def examples(root: Path) -> dict[str, str]:
     """Of each page with Python its blocks, as one program: later ones use earlier names."""
     pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
@@ -73,7 +67,8 @@ def examples(root: Path) -> dict[str, str]:
 
 
 def test_every_command_of_the_readme_is_run_by_a_test(root: Path) -> None:
-    assert commands(root / "README.md") == {*HERE, *ELSEWHERE}
+    lines = code(root / "README.md", "sh").splitlines()
+    assert {line.partition("#")[0].strip() for line in lines} - {""} == {*HERE, *ELSEWHERE}
     for test in ELSEWHERE.values():
         file, name = test.split("::")
         assert re.search(rf"def {name}", (root / file).read_text(encoding="utf-8")), test

@@ -142,7 +142,6 @@ def test_a_run_ships_its_packages_beside_what_its_job_brought(monkeypatch: pytes
 
 RAY = BIN / "ray"
 SMALL = ("--scenario", "curved", "--traffic", "2", "--population", "48", "--seed", "5")
-CUT_S = 10.0
 UP_S = 300.0  # for what takes half a minute on a quiet machine
 
 
@@ -276,7 +275,7 @@ def test_a_cable_out_for_10_s_and_a_machine_without_power(up: Machines, root: Pa
     wait_until(lambda: history.exists() or run.process.poll() is not None, UP_S)
     assert run.process.poll() is None, run.finish(0)
     up.worker.plug(False)
-    time.sleep(CUT_S)
+    time.sleep(10.0)
     up.worker.plug(True)
     assert run.process.poll() is None, run.finish(0)
     up.spare.plug(False)

@@ -52,8 +52,8 @@ class Stopping(Answering):
 def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> None:
     """As a host that is cut off: Ray says nothing. When patience is at its end the worker is replaced."""
     wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(512)).results.tobytes()
-    pool = RayPool(2, never_built, worker_factory=functools.partial(Stopping, tmp_path))
-    with contextlib.closing(pool):
+    worker = functools.partial(Stopping, tmp_path)
+    with contextlib.closing(RayPool(2, never_built, worker_factory=worker)) as pool:
         wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and len(pool.pids()) == 2, 60)
         pool._patience_s = 5.0
         (tmp_path / "stop").touch()

@@ -126,9 +126,8 @@ def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
     assert "cannot be written" in refused(f"sqlite:///{tmp_path}/mlflow.db")
 
 
-@pytest.fixture
-def web_server():
-    """Serves `pages`, path to (status, body), and 404 for everything else."""
+def test_what_else_may_answer(silent, impatient):
+    """A server of `pages`, path to (status, body), and of 404 for everything else."""
     pages: dict[str, tuple[int, bytes]] = {}
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -143,13 +142,7 @@ def web_server():
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_address[1]}", pages
-    server.shutdown()
-    server.server_close()
-
-
-def test_what_else_may_answer(web_server, silent, impatient):
-    uri, pages = web_server
+    uri = f"http://127.0.0.1:{server.server_port}"
     page = "/api/2.0/mlflow/experiments/search"
     for answer, reason in (
         ((404, b"<html>not here</html>"), "something else answers"),
@@ -166,3 +159,5 @@ def test_what_else_may_answer(web_server, silent, impatient):
     pages.clear()
     pages[f"/prefix{page}"] = (200, b"{}")
     assert check_uri(f"{uri}/prefix/") == f"{uri}/prefix"
+    server.shutdown()
+    server.server_close()

@@ -11,13 +11,8 @@ from gridsim.maps.scenarios import build
 CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
 
 
-def new(config=CONFIG, traffic=2):
-    return Curriculum(config, 7, lambda seed: build("seamless", seed), 2000.0, 400.0, 0.1, traffic)
-
-
-@pytest.fixture(scope="module")
-def curriculum():
-    return new()
+def new():
+    return Curriculum(CONFIG, 7, lambda seed: build("seamless", seed), 2000.0, 400.0, 0.1, traffic=2)
 
 
 def led(curriculum, generation, ends, distance=0.0, steps=50):
@@ -30,7 +25,8 @@ def led(curriculum, generation, ends, distance=0.0, steps=50):
     return episodes, rewound
 
 
-def test_a_leader_s_episodes_are_longer_and_rewound(curriculum):
+def test_a_leader_s_episodes_are_longer_and_rewound():
+    curriculum = new()
     episodes = curriculum.leader_episodes(0)
     assert len(episodes.rows) == 8
     assert (episodes.rows["rewind"] == CONFIG.rewind).all()
@@ -118,7 +114,8 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again():
     assert curriculum.failures[-8:] == pytest.approx(0.5)
 
 
-def test_maps_come_in_one_by_one(curriculum):
+def test_maps_come_in_one_by_one():
+    curriculum = new()
     assert [curriculum.maps_in_use(generation) for generation in (0, 1, 2, 8)] == [2, 3, 3, 3]
     assert set(curriculum.episodes(0).maps) <= set(curriculum.map_seeds[:2])
     assert len(set(curriculum.map_seeds)) == 3

@@ -64,18 +64,6 @@ def cast(poses, worlds, reach=50.0):
     return ranges
 
 
-def check_rays(pose, boxes, ranges):
-    """Ranges of one sensor against the oracle; where a ray grazes a corner, either answer is right."""
-    sides = (SIDE, SIDE)
-    larger, smaller = (
-        np.minimum(oracle.rays_to_boxes(CONFIG, sides, pose[:2], pose[2] + ANGLES, boxes, margin), 50.0)
-        for margin in (2e-4, -2e-4)
-    )
-    assert (ranges >= larger - 1e-3).all()
-    assert (ranges <= smaller + 1e-3).all()
-    return np.abs(smaller - larger) < 0.01  # rays that do not graze
-
-
 # --- Rays ------------------------------------------------------------------------------------------------------------
 
 
@@ -122,8 +110,16 @@ def test_rays_are_the_oracles():
     boxes[300:600, :, 2] = sensors[300:600, 2, None]  # rays that are parallel to two sides
     boxes, sensors = boxes.astype(F).astype(float), sensors.astype(F).astype(float)
     ranges = cast(sensors, np.stack([parked(*row) for row in boxes]))
-    exact = sum(int(check_rays(*scene).sum()) for scene in zip(sensors, boxes, ranges, strict=True))
-    assert exact > 0.98 * ranges.size
+    grazing = 0  # rays that graze a corner: either answer is right
+    for pose, near, seen in zip(sensors, boxes, ranges, strict=True):
+        larger, smaller = (
+            np.minimum(oracle.rays_to_boxes(CONFIG, (SIDE, SIDE), pose[:2], pose[2] + ANGLES, near, margin), 50.0)
+            for margin in (2e-4, -2e-4)
+        )
+        assert (seen >= larger - 1e-3).all()
+        assert (seen <= smaller + 1e-3).all()
+        grazing += (np.abs(smaller - larger) >= 0.01).sum()
+    assert grazing < 0.02 * ranges.size
     assert 0.03 < (ranges == 0.0).all(axis=1).mean() < 0.3  # from within a box
     assert 0.2 < (ranges < 50.0).mean() < 0.8
 
@@ -203,12 +199,12 @@ def on_lane(lane, along, speed, pose):
     return world
 
 
-def meet(scenario, start, world, action=Action.NONE, steps=40):
+def meet(scenario, start, world):
     """Drive one car of a `BLIND` world until the episode ends; (simulator, End)."""
     simulator = Simulator([scenario], 1, BLIND, traffic=1)
     simulator.reset(np.array([start], dtype=F), worlds=world[None])
-    for _ in range(steps):
-        *_, ends = simulator.step(np.array([action]))
+    for _ in range(40):
+        *_, ends = simulator.step(np.array([Action.NONE]))
         if ends[0]:
             break
     return simulator, End(int(ends[0]))

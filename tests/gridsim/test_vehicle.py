@@ -24,12 +24,11 @@ actions = st.sampled_from(list(Action))
 
 
 class Driver:
-    """A car on an endless plane: poses as lists, one entry a control period and one for the start."""
+    """A car on an endless plane, that begins at its origin: x, y, cosine, sine, speed."""
 
     def __init__(self, speed: float = 0.0, steering: float = 0.0, k: Constants = K):
         self.k, self.steering = k, F(steering)
         self.state: tuple[np.float32, ...] = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
-        self.x, self.y, self.heading, self.speeds = [0.0], [0.0], [0.0], [float(speed)]
 
     @property
     def speed(self) -> float:
@@ -39,11 +38,6 @@ class Driver:
         kappa = path_curvature(self.k, self.state[4], self.steering)
         *state, _ = advance(self.k, *self.state, F(acceleration), kappa, self.k.dt)
         self.state = tuple(map(F, state))
-        x, y, cosine, sine, speed = map(float, self.state)
-        self.x.append(x)
-        self.y.append(y)
-        self.heading.append(math.atan2(sine, cosine))
-        self.speeds.append(speed)
 
     def do(self, action: Action) -> None:
         acceleration, self.steering = act(self.k, int(action), self.state[4], self.steering)
@@ -65,7 +59,7 @@ def test_stopping_distance(speed):
     # v^2 / 2a; the last period brakes no harder than it must, so it takes its whole 0.1 s.
     rest = speed % 0.8
     late = rest * DT / 2 - rest**2 / (2 * 8.0)
-    assert car.x[-1] == pytest.approx(speed**2 / (2 * 8.0) + late, abs=1e-3)
+    assert car.state[0] == pytest.approx(speed**2 / (2 * 8.0) + late, abs=1e-3)
     assert late < 0.011
 
 
@@ -78,7 +72,7 @@ def test_the_pedal_brakes_to_a_stand_and_not_further(pedal, speed):
         assert abs(acceleration) <= -8.0 * pedal * (1 + 1e-6)
         car.step(acceleration)
     assert abs(car.speed) <= STILL
-    assert car.x[-1] * speed > 0.0
+    assert car.state[0] * speed > 0.0
 
 
 def test_braking_in_a_bend_stays_within_the_friction_circle():
@@ -113,7 +107,7 @@ def test_ten_seconds_of_stepwise_steering_are_kongs():
         car.do(action)
         drive = (float(car.steering), 0.0)
         state = list(solve_ivp(kong, (0.0, DT), state, args=drive, rtol=1e-9, atol=1e-9).y[:, -1])
-    assert math.hypot(car.x[-1] - state[0], car.y[-1] - state[1]) < 1e-3
+    assert math.hypot(car.state[0] - state[0], car.state[1] - state[1]) < 1e-3
 
 
 @given(speed=speeds, steering=steerings, heading=st.floats(-math.pi, math.pi), action=actions)
