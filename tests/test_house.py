@@ -25,43 +25,39 @@ TORCH_AT_IMPORT = {"evolution/dqn/learner.py"}
 MOST_MODULES, MOST_LINES = 14, 500  # of a folder, and of a file
 
 
-def is_typing_only(node: ast.AST) -> bool:
-    """Whether it is a block for type checkers alone."""
-    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-
-
-def imported(tree: ast.Module) -> Iterator[tuple[str, int, bool]]:
-    """Yield each imported top-level module, its line, and whether it is imported when the file is."""
-    lazy: set[int] = set()
-    for node in ast.walk(tree):
-        if is_typing_only(node) or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            lazy.update(id(inner) for inner in ast.walk(node))
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.stmt | ast.expr):
-            continue
-        names: list[str] = []
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            names = [node.module]
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-            names = [str(a.value) for a in node.args[:1] if isinstance(a, ast.Constant)]
-        for name in names:
-            yield name.partition(".")[0], node.lineno, id(node) not in lazy
+def imports(node: ast.AST, when: str = "at import") -> Iterator[tuple[str, int, str]]:
+    """Yield each module, and each of its names, that is imported, the line, and when: also later, or only for types."""
+    if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+        when = "for types"
+    elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and when == "at import":
+        when = "later"
+    elif isinstance(node, ast.Import):
+        for alias in node.names:
+            yield alias.name, node.lineno, when
+    elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+        for name in (node.module, *(f"{node.module}.{alias.name}" for alias in node.names)):
+            yield name, node.lineno, when
+    elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
+        for argument in node.args[:1]:
+            if isinstance(argument, ast.Constant):
+                yield str(argument.value), node.lineno, when
+    for inner in ast.iter_child_nodes(node):
+        yield from imports(inner, when)
 
 
 def breaches(file: str, source: str) -> list[str]:
     """What in a file (its path from the root) breaks a rule, a line each."""
     package = file.partition("/")[0]
     found = []
-    for module, line, at_import in imported(ast.parse(source, filename=file)):
+    tree = ast.parse(source, filename=file)
+    for module, line, when in sorted({(name.partition(".")[0], *where) for name, *where in imports(tree)}):
         if RANK.get(module, 0) > RANK[package]:
             found.append(f"{file}:{line}: {package} imports {module}, upwards")
         elif module in NOT_IN.get(package, ()):
             found.append(f"{file}:{line}: {package} knows no {module}")
         elif module in BEHIND and file not in BEHIND[module]:
             found.append(f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}")
-        elif module == "torch" and at_import and file not in TORCH_AT_IMPORT:
+        elif module == "torch" and when == "at import" and file not in TORCH_AT_IMPORT:
             found.append(f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}")
     return found
 
@@ -87,16 +83,8 @@ def own_imports(root: Path) -> dict[str, set[str]]:
     names = {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
     found: dict[str, set[str]] = {}
     for name, file in names.items():
-        asked: set[str] = set()
         tree = ast.parse(file.read_text(encoding="utf-8"))
-        typing_only = {id(inner) for node in ast.walk(tree) if is_typing_only(node) for inner in ast.walk(node)}
-        for node in ast.walk(tree):
-            if id(node) in typing_only:
-                continue
-            if isinstance(node, ast.Import):
-                asked |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                asked |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        asked = {other for other, _, when in imports(tree) if when != "for types"}
         found[name] = (asked & names.keys()) - {name}
     return found
 

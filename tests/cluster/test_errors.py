@@ -17,8 +17,7 @@ from gridsim.reference.errors import Series, error_series
 from gridsim.reference.errors import errors as errors_of
 from gridsim.reference.profile import BRAKING, LATERAL, top_speed
 
-INTERVAL = REGISTRY["seamless"].speed_interval
-TOP = top_speed(INTERVAL)
+TOP = top_speed(REGISTRY["seamless"].speed_interval)
 CAR = VehicleConfig()
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 

@@ -20,7 +20,7 @@ from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import spawn
 
-ROOT = Path(__file__).resolve().parents[2]
+CHAMPION = Path(__file__).parents[2] / "benchmarks/champion_traffic.npz"
 
 
 def channels(drive):
@@ -63,7 +63,7 @@ def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
 
 def shown_drives():
     """Ways to show a drive of a minute among 3 cars: as an elite's, and as the champion's."""
-    champion = load_champion(ROOT / "benchmarks/champion_traffic.npz")
+    champion = load_champion(CHAMPION)
     road_map = build("seamless", 2_000_000)
     start = sample_starts(road_map, 1, np.random.default_rng(1))
     world = spawn(road_map.network, start, 3, np.array([1]), champion.sim)[0]

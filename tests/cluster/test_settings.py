@@ -16,9 +16,8 @@ POLICIES = {
 }
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-def test_the_policy_suits_observation_and_traffic(policy):
-    settings = POLICIES[policy]
+@pytest.mark.parametrize(("policy", "settings"), POLICIES.items())
+def test_the_policy_suits_observation_and_traffic(policy, settings):
     settings.check()
     assert settings.policy == policy
     assert from_dict(type(settings), asdict(settings)) == settings

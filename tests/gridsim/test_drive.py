@@ -104,9 +104,8 @@ def test_a_missing_file_is_one_clear_line(tmp_path):
             read_drive(path)
 
 
-@pytest.mark.parametrize("name", DAMAGES)
-def test_damaged_file_is_one_clear_line(recorded, tmp_path, name):
-    change, expected = DAMAGES[name]
+@pytest.mark.parametrize(("change", "expected"), DAMAGES.values(), ids=DAMAGES)
+def test_damaged_file_is_one_clear_line(recorded, tmp_path, change, expected):
     damaged = change(recorded[0].read_text())
     path = tmp_path / "drive.csv"
     path.write_bytes(damaged if isinstance(damaged, bytes) else damaged.encode())
