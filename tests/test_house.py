@@ -50,7 +50,7 @@ def breaches(file: str, source: str) -> list[str]:
     package = file.partition("/")[0]
     found = []
     tree = ast.parse(source, filename=file)
-    for module, line, when in sorted({(name.partition(".")[0], *where) for name, *where in imports(tree)}):
+    for module, line, when in sorted({(name.partition(".")[0], line, when) for name, line, when in imports(tree)}):
         if RANK.get(module, 0) > RANK[package]:
             found.append(f"{file}:{line}: {package} imports {module}, upwards")
         elif module in NOT_IN.get(package, ()):

@@ -44,7 +44,8 @@ def in_mlflow(cwd):
 @pytest.mark.e2e
 @pytest.mark.usefixtures("database")  # a run waits for MLflow no more than 15 s then
 def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
-    process, run = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path), tmp_path / "runs/c"
+    run = tmp_path / "runs/c"
+    process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
     wait_until(lambda: len(rows(run)) >= 2)
     children = descendants(process.pid)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process
