@@ -91,7 +91,7 @@ def make_task(parents: np.ndarray, key: int = 1, count: int = EPISODES) -> Task:
     """A generation's task without maps; each episode is marked by its number."""
     episodes = np.zeros(count, EPISODE)
     episodes["start"][:, 4] = np.arange(count)
-    return Task(POLICY, parents, key, Mutation(), episodes, no_traffic(count), (), Limits(150.0, 245), SimConfig())
+    return Task(POLICY, episodes, no_traffic(count), (), Limits(150.0, 245), SimConfig(), parents, key, Mutation())
 
 
 def rows(count: int) -> np.ndarray:

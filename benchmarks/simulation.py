@@ -90,8 +90,8 @@ class Call:
         episodes = np.zeros(e, dtype=EPISODE)
         episodes["target"] = self.targets
         task = Task(
-            "mlp:6,7", np.zeros((1, 1), np.float32), 0, Mutation(), episodes, no_traffic(e), (), Limits(1.0, 1),
-            SimConfig(),
+            "mlp:6,7", episodes, no_traffic(e), (), Limits(1.0, 1), SimConfig(), np.zeros((1, 1), np.float32), 0,
+            Mutation(),
         )  # fmt: skip
         asked = self.asked or [Chunk(slice(0, n), slice(0, e))]
         whole = sum(metres(task, part) for part in asked)

@@ -9,18 +9,18 @@ episodes, as evolution's candidates do.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
 from cluster.runs.settings import DqnSettings
-from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named, unmodified
+from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
 from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import Limits
-from gridsim.maps.scenarios import seed_of_map
 
 COLUMNS = (
     "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean", "network/success_rate",
@@ -114,24 +114,14 @@ class Dqn(Learning):
         episodes = self.curriculum.starts(k, n)
         self.maps.ahead(self.curriculum.map_seeds[: k + 8])
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
-        task = CollectTask(
-            policy=s.policy,
-            weights=_finite(self.learner.weights, self.learner.updates),
-            episodes=episodes.rows,
-            worlds=episodes.worlds,
-            maps=tuple((s.scenario, seed_of_map(s.scenario, seed)) for seed in episodes.maps),
-            epsilons=self._epsilons(n),
-            keys=keys,
-            limits=Limits(self.curriculum.goal, EPISODE_STEPS),
-            config=self.sim,
-        )
-        progress = self.on_progress
-        tell = (lambda done, total: progress("collect", done, total)) if progress else None
-        brought = self.pool.collect(task, tell, self._train)
+        weights = _finite(self.learner.weights, self.learner.updates)
+        limits = Limits(self.curriculum.goal, EPISODE_STEPS)
+        task = self._task(CollectTask, episodes, limits, weights=weights, epsilons=self._epsilons(n), keys=keys)
+        brought = self.pool.collect(task, partial(self.on_progress, "collect"), self._train)
         self._report("collect", brought)
         check_any_left(brought.lost, "collect")
         self.replay.add(brought.experience)
-        results = brought.results[~brought.lost]
+        results = brought.results[~brought.lost, 0]
         steps = int(results["steps"].sum())
         self._owed += steps * s.updates / 1000.0
         self._mean_steps = steps / len(results)
@@ -149,8 +139,7 @@ class Dqn(Learning):
 
     def _train(self) -> bool:
         """Make some of the updates that the batches so far require. Returns whether any are left."""
-        if self.meanwhile:
-            self.meanwhile()
+        self.meanwhile()
         if len(self.replay) < min(WARM_UP, self.replay.capacity):
             self._owed = 0.0
         n = min(int(self._owed), SLICE)
@@ -166,10 +155,9 @@ class Dqn(Learning):
         """Validate the averaged network. Returns its figures."""
         network = _finite(self.learner.average, self.learner.updates)
         self.elites[self.steps] = network
-        driven = self._evaluate(
-            "validate", unmodified(network[None]), self.curriculum.validation(), self.curriculum.goal_limits(),
-            meanwhile=self._train,
-        )  # fmt: skip
+        driven = self.drive(
+            "validate", network[None], self.curriculum.validation(), self.curriculum.goal_limits(), self._train
+        )
         check_any_left(driven.lost, "validate")
         self._judge(network, driven.results, self.steps)
         results = driven.results[0]

@@ -14,13 +14,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
 from cluster.runs.settings import RunSettings
-from cluster.workers.pool import Chunk, Collected, Meanwhile, Outcome, PoolError, WorkerPool
-from cluster.workers.worker import Task
+from cluster.workers.pool import Call, Chunk, Meanwhile, Outcome, PoolError, WorkerPool
+from cluster.workers.worker import CollectTask, Task
 from evolution.episodes.curriculum import (
     FINAL_SEEDS,
     HELD_OUT_EPISODES,
@@ -39,6 +40,7 @@ from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build, seed_of_map
 
+T = TypeVar("T", Task, CollectTask)
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 
 
@@ -131,8 +133,8 @@ class Learning(ABC):
     lost_chunks: int = 0
     wall_before_s: float = 0.0
     warn: Callable[[str], None] = warnings.warn
-    on_progress: Callable[[str, int, int], None] | None = None
-    meanwhile: Callable[[], None] | None = None  # called in each step while the workers are busy
+    on_progress: Callable[[str, int, int], None] = lambda *_: None
+    meanwhile: Callable[[], None] = lambda: None  # called in each step while the workers are busy
     out_of_time: Callable[[], bool] = lambda: False  # whether the wall-time budget is spent, so that a long step ends
 
     def __post_init__(self) -> None:
@@ -218,33 +220,31 @@ class Learning(ABC):
         self, stage: str, members: Generation, episodes: Episodes, limits: Limits,
         asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
     ) -> Outcome:  # fmt: skip
-        task = Task(
-            policy=self.settings.policy,
-            parents=members.parents,
-            key=members.key,
-            mutation=members.mutation,
-            episodes=episodes.rows,
-            worlds=episodes.worlds,
-            maps=tuple((self.settings.scenario, seed_of_map(self.settings.scenario, seed)) for seed in episodes.maps),
-            limits=limits,
-            config=self.sim,
-        )
-        progress = self.on_progress
-        tell = (lambda k, n: progress(stage, k, n)) if progress else None
-        outcome = self.pool.evaluate(task, members.recipes, tell, asked, meanwhile)
+        own = {"parents": members.parents, "key": members.key, "mutation": members.mutation}
+        task = self._task(Task, episodes, limits, **own)
+        outcome = self.pool.evaluate(task, members.recipes, partial(self.on_progress, stage), asked, meanwhile)
         self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
         self._report(stage, outcome)
         return outcome
 
-    def _report(self, stage: str, brought: Outcome | Collected) -> None:
-        self.lost_chunks += int(brought.lost.sum())
-        for text in brought.warnings:
+    def _task(self, kind: Callable[..., T], episodes: Episodes, limits: Limits, **own: Any) -> T:
+        """A task of a kind, with what only this kind has."""
+        scenario = self.settings.scenario
+        maps = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
+        return kind(self.settings.policy, episodes.rows, episodes.worlds, maps, limits, self.sim, **own)
+
+    def _report(self, stage: str, call: Call) -> None:
+        self.lost_chunks += int(call.lost.sum())
+        for text in call.warnings:
             self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
 
-    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits) -> Outcome:
+    def drive(
+        self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, meanwhile: Meanwhile | None = None
+    ) -> Outcome:
         """Results [n, e] of given genomes [n, genes], which are sent as plain copies."""
-        return self._evaluate(stage, unmodified(genomes), episodes, limits)
+        copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
+        return self._evaluate(stage, copies, episodes, limits, meanwhile=meanwhile)
 
     def add_wall_clock(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
         """Add the wall clock's columns to a row."""
@@ -315,11 +315,6 @@ def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
 def genes_of(genome: np.ndarray | None) -> np.ndarray:
     """A genome as a checkpoint has it: float32 [genes], or [0] for none."""
     return np.zeros(0, dtype=np.float32) if genome is None else genome
-
-
-def unmodified(genomes: np.ndarray) -> Generation:
-    """Plain copies of genomes float32 [n, genes]."""
-    return Generation(genomes[:0], recipes(0)).and_copies(genomes)
 
 
 def check_any_left(lost: np.ndarray, stage: str) -> None:

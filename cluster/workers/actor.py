@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cluster.workers.pool import BuildMap
-from cluster.workers.worker import CollectTask, Task, Worker
+from cluster.workers.worker import AnyTask, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
 
@@ -38,7 +38,7 @@ class Actor:
 
     def __init__(self, factory: Callable[[], Worker]):
         self._worker = factory()
-        self._task: Task | CollectTask
+        self._task: AnyTask
         self._maps: dict[Name, Map] = {}
 
     def hello(self) -> int:
@@ -84,7 +84,7 @@ class Shared:
         self._put, self._build_map = put, build_map
         self._maps: dict[Name, Any] = {}  # references
 
-    def put(self, task: Task | CollectTask) -> tuple[Any, int]:
+    def put(self, task: AnyTask) -> tuple[Any, int]:
         """Put a task, unless it is small, and those of its maps that are not there yet.
 
         Returns: the pickled task or its reference, and the bytes of all arrays.
@@ -100,7 +100,7 @@ class Shared:
         data = pickle.dumps(task, protocol=5)
         return data if len(data) <= INLINE else self._put(data), sent
 
-    def update(self, known: set[Name], task: Task | CollectTask, shared: Any) -> list[Any]:
+    def update(self, known: set[Name], task: AnyTask, shared: Any) -> list[Any]:
         """What an actor with the maps `known` needs to take up a task; `known` is updated to what it then has.
 
         Returns: the names of the maps that it lacks, those to forget, the task as `put` returned it, and references to

@@ -1,9 +1,9 @@
 """Which parcel of chunks goes to which worker, and what happens when a worker dies. Bookkeeping only: no Ray, no clock.
 
 * The parcels of a worker that died are sent again, one at a time, so that a second death shows which one caused it.
-* A parcel that killed twice is split into its members (of a batch of experience: its episodes). A member that kills
-  three workers by itself is lost, with everything that it was asked for. So the same members are lost however many
-  workers there are and however the work was cut.
+* A parcel that killed twice is split into its members (of a batch of experience: its episodes, of which all that is
+  said of members is true). A member that kills three workers by itself is lost, with everything that it was asked for.
+  So the same members are lost however many workers there are and however the work was cut.
 """
 
 from __future__ import annotations
@@ -22,17 +22,15 @@ class Dispatch:
 
     Args:
         parcels: the parcels; where one is split, its pieces are added at the end.
-        by_episode: whether single episodes are lost, instead of whole members.
 
     Attributes:
         retries: parcels that were sent again because their worker died; one that is split then counts once.
         deaths: workers that died in a row, without an answer in between.
     """
 
-    def __init__(self, parcels: Sequence[Parcel], by_episode: bool):
+    def __init__(self, parcels: Sequence[Parcel]):
         self.parcels = list(parcels)
         self.retries = self.deaths = 0
-        self._by_episode = by_episode
         self._open = set(range(len(self.parcels)))  # neither answered nor lost
         self._todo = deque(range(len(self.parcels)))  # of these, the ones that no worker holds
         self._held: dict[int, deque[int]] = {}  # by worker, the one that it works on first
@@ -104,13 +102,7 @@ class Dispatch:
         return worker, parcel
 
     def _units(self, parcel: int) -> list[Parcel]:
-        """The members of a parcel, or its episodes if `by_episode`, each as a parcel of its own."""
-        if self._by_episode:
-            return [
-                (Chunk(rows, slice(k, k + 1)),)
-                for rows, columns in self.parcels[parcel]
-                for k in range(columns.start, columns.stop)
-            ]
+        """The members of a parcel, each as a parcel of its own."""
         return [
             (Chunk(slice(k, k + 1), columns),)
             for rows, columns in self.parcels[parcel]
@@ -118,7 +110,7 @@ class Dispatch:
         ]
 
     def _split(self, parcel: int) -> None:
-        """Replace a parcel by one for each of its members, or for each of its episodes."""
+        """Replace a parcel by one for each of its members."""
         self._open.remove(parcel)
         for unit in self._units(parcel):
             piece = len(self.parcels)
@@ -128,11 +120,9 @@ class Dispatch:
             self._suspects.add(piece)
 
     def _lose(self, parcel: int) -> list[int]:
-        """Give up a parcel of one member, with everything else asked of that member; or a parcel of one episode."""
-        also: list[int] = []
-        if not self._by_episode:
-            rows = self.parcels[parcel][0].rows
-            also = [k for k, (one, *more) in enumerate(self.parcels) if one.rows == rows and not more and k != parcel]
+        """Give up a parcel of one member, with everything else asked of that member."""
+        rows = self.parcels[parcel][0].rows
+        also = [k for k, (one, *more) in enumerate(self.parcels) if one.rows == rows and not more and k != parcel]
         lost = [k for k in (parcel, *also) if k in self._open]
         self._open.difference_update(lost)
         self._todo = deque(k for k in self._todo if k in self._open)

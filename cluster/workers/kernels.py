@@ -99,11 +99,11 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
     config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
     made = recipes(2)
     made["kind"] = Kind.NEW
-    task = Task(policy, genome[None], 1, Mutation(), episodes, worlds, (), limits, config)
+    task = Task(policy, episodes, worlds, (), limits, config, genome[None], 1, Mutation())
     Worker().answer(task, [road], made, 0, 1)
     if command == DqnSettings.command:
         epsilons, keys = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.uint64)
-        collecting = CollectTask(policy, genome, episodes, worlds, (), epsilons, keys, limits, config)
+        collecting = CollectTask(policy, episodes, worlds, (), limits, config, genome, epsilons, keys)
         Worker().answer(collecting, [road], made, 0, 1)
 
 

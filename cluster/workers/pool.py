@@ -6,16 +6,14 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from cluster.workers.worker import CollectTask, Task, Worker
+from cluster.workers.worker import AnyTask, CollectTask, Task, Worker
 from evolution.dqn.experience import Experience, join
 from evolution.episodes.rollout import RESULT, targets
-from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -39,7 +37,7 @@ class PoolError(GridSimError):
 
 
 class Chunk(NamedTuple):
-    """Some members (rows), on some of the task's episodes (columns)."""
+    """Some members (rows), on some of the task's episodes (columns). Of a batch of experience, rows are episodes."""
 
     rows: slice
     columns: slice
@@ -54,56 +52,75 @@ def size(chunk: Chunk) -> int:
     return (chunk.rows.stop - chunk.rows.start) * (chunk.columns.stop - chunk.columns.start)
 
 
-@dataclass(kw_only=True)
-class Call:
-    """What one call of a pool returned, and what it took.
+class Call(ABC):
+    """One call of a pool: what is asked for, what it returned, and what it took.
 
     Attributes:
-        results: RESULT, one row per member or, if experience is collected, per episode; zero where nothing was asked
-            for and where it was lost.
+        task, recipes, asked: what is asked for, as in `WorkerPool.evaluate`.
+        results: RESULT [rows, columns]; zero where nothing was asked for and where it was lost.
         lost: bool [rows], those that killed every worker that tried them.
-        asked: how many episodes the members were to drive, in all.
         wall_s: seconds from call to return.
         busy_s: seconds that each worker (by its number) was at work. A replacement keeps the number.
-        episode_s: seconds of these that each episode took, for all members together, float64 [episodes].
+        episode_s: seconds of these that each column took, for all rows together, float64 [columns].
         retries: chunks that were sent again because their worker died.
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
         broadcast_bytes: put into the object store: the task and the maps that were new to it.
         warnings: a line for each row that was lost, and for each worker that was replaced because it was silent.
+        total, done: how many episodes are to be driven, in all, and how many of these are, or are lost.
     """
 
-    results: np.ndarray
-    lost: np.ndarray
-    asked: int
-    episode_s: np.ndarray
-    wall_s: float = 0.0
-    busy_s: dict[int, float] = field(default_factory=dict)
-    retries: int = 0
-    bytes_down: int = 0
-    bytes_up: int = 0
-    broadcast_bytes: int = 0
-    warnings: list[str] = field(default_factory=list)
-    done: int = 0  # of `asked`
+    noun: ClassVar[str]  # what its rows are
 
-    def progress(self) -> tuple[int, int]:
-        """Arguments of `Progress`; a member that is done in part counts in part."""
-        rows = len(self.results)
-        return (rows * self.done // self.asked if self.asked else 0), rows
+    def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk], rows: int, columns: int):
+        self.task, self.recipes, self.asked = task, recipes, asked
+        self.results = np.zeros((rows, columns), RESULT)
+        self.lost = np.zeros(rows, bool)
+        self.wall_s = 0.0
+        self.busy_s: dict[int, float] = {}
+        self.episode_s = np.zeros(columns)
+        self.retries = self.bytes_down = self.bytes_up = self.broadcast_bytes = 0
+        self.warnings: list[str] = []
+        self.total, self.done = sum(map(size, asked)), 0
 
-    def whole(self) -> bool:
-        """Whether every result is there."""
-        return self.done >= self.asked
+    def work(self, chunk: Chunk) -> tuple[np.ndarray, int, int]:
+        """Arguments of `Worker.answer` for a chunk: its recipes, its first episode and the one after its last."""
+        episodes = chunk.rows if isinstance(self.task, CollectTask) else chunk.columns
+        return self.recipes[chunk.rows], episodes.start, episodes.stop
 
-    def _count(self, worker: int, chunk: Chunk, seconds: float) -> None:
+    @abstractmethod
+    def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
+        """Take in what `Worker.answer` returned for a chunk."""
+
+    def _count(self, worker: int, chunk: Chunk, results: np.ndarray, seconds: float) -> None:
+        self.results[chunk.rows, chunk.columns] = results
         self.done += size(chunk)
         self.episode_s[chunk.columns] += seconds / (chunk.columns.stop - chunk.columns.start)
         self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
 
+    def lose(self, chunk: Chunk) -> None:
+        """Do without a chunk's rows: results that they already have do not count either."""
+        self.lost[chunk.rows] = True
+        self.results[chunk.rows] = np.zeros((), self.results.dtype)
+        self.done += size(chunk)
 
-@dataclass(kw_only=True)
+    def progress(self) -> tuple[int, int]:
+        """Arguments of `Progress`; a member that is done in part counts in part."""
+        rows = len(self.results)
+        return (rows * self.done // self.total if self.total else 0), rows
+
+    def describe(self, index: int, parcel: Parcel) -> str:
+        """A parcel in words."""
+        spans = ", ".join(f"{chunk.rows.start} to {chunk.rows.stop - 1}" for chunk in parcel)
+        return f"parcel {index} ({self.noun} {spans})"
+
+    @abstractmethod
+    def identify(self, row: int) -> str:
+        """A member with its recipe, or an episode of experience, so that it can be tried again."""
+
+
 class Outcome(Call):
-    """What `evaluate` returned: results RESULT [members, episodes], members in the order of the recipes.
+    """What `evaluate` returned: rows are members, in the order of the recipes, columns episodes.
 
     Attributes:
         rewound: float32 [episodes, 5], for episodes with a `rewind` the state so many steps before the end. Only one
@@ -111,76 +128,53 @@ class Outcome(Call):
         worlds: float32 [episodes, cars, world.FIELDS], the traffic at that time.
     """
 
-    rewound: np.ndarray
-    worlds: np.ndarray
+    noun = "members"
+    task: Task
 
-    def add(
-        self, worker: int, chunk: Chunk, results: np.ndarray, rewound: np.ndarray, worlds: np.ndarray, seconds: float
-    ) -> None:
-        """Take in what `Worker.evaluate` returned for a chunk."""
-        self.results[chunk.rows, chunk.columns] = results
+    def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk]):
+        super().__init__(task, recipes, asked, len(recipes), len(task.episodes))
+        self.rewound = np.zeros((len(task.episodes), 5), np.float32)
+        self.worlds = np.zeros_like(task.worlds)
+
+    def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
+        results, rewound, worlds, seconds = answer
         if rewound.size:
             self.rewound[chunk.columns], self.worlds[chunk.columns] = rewound[0], worlds[0]
-        self._count(worker, chunk, seconds)
+        self._count(worker, chunk, results, seconds)
 
-    def lose(self, chunk: Chunk) -> None:
-        """Do without a chunk's members: results that they already have do not count either."""
-        self.lost[chunk.rows] = True
-        self.results[chunk.rows] = np.zeros((), self.results.dtype)
-        self.done += size(chunk)
+    def identify(self, row: int) -> str:
+        recipe = self.recipes[row]
+        kind = Kind(int(recipe["kind"])).name.lower()
+        parents = f"rows {recipe['a']} and {recipe['b']}"
+        return f"member {row} ({kind} of {parents}, seed {recipe['seed']}, key {self.task.key:#x})"
 
 
-@dataclass(kw_only=True)
 class Collected(Call):
-    """What `collect` returned: results RESULT [episodes].
+    """What `collect` returned: rows are episodes, in one column.
 
     Attributes:
-        policy: of the network that drove.
         experience: of all episodes that are not lost, in their order.
     """
 
-    policy: PolicySpec
-    _parts: dict[int, Experience] = field(default_factory=dict)  # by their first episodes
+    noun = "episodes"
+    task: CollectTask
+
+    def __init__(self, task: CollectTask):
+        n = len(task.episodes)
+        super().__init__(task, np.zeros(0, RECIPE), rectangle(n, 1), n, 1)
+        self._parts: dict[int, Experience] = {}  # by their first episodes
 
     @cached_property
     def experience(self) -> Experience:
-        return join(self.policy, [self._parts.pop(first) for first in sorted(self._parts)])
+        return join([self._parts.pop(first) for first in sorted(self._parts)])
 
-    def add(self, worker: int, chunk: Chunk, experience: Experience, results: np.ndarray, seconds: float) -> None:
-        """Take in what `Worker.collect` returned for a chunk."""
-        self._parts[chunk.columns.start] = experience
-        self.results[chunk.columns] = results
-        self._count(worker, chunk, seconds)
+    def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
+        experience, results, seconds = answer
+        self._parts[chunk.rows.start] = experience
+        self._count(worker, chunk, results[:, None], seconds)
 
-    def lose(self, chunk: Chunk) -> None:
-        """Do without a chunk's episodes."""
-        self.lost[chunk.columns] = True
-        self.done += size(chunk)
-
-
-def new_outcome(task: Task, recipes: np.ndarray, asked: Sequence[Chunk]) -> Outcome:
-    """An outcome to be filled, its results all zero."""
-    n, e = len(recipes), len(task.episodes)
-    return Outcome(
-        results=np.zeros((n, e), RESULT),
-        lost=np.zeros(n, bool),
-        asked=sum(map(size, asked)),
-        episode_s=np.zeros(e),
-        rewound=np.zeros((e, 5), np.float32),
-        worlds=np.zeros_like(task.worlds),
-    )
-
-
-def new_collected(task: CollectTask) -> Collected:
-    """A collection to be filled."""
-    n = len(task.episodes)
-    return Collected(
-        results=np.zeros(n, RESULT),
-        lost=np.zeros(n, bool),
-        asked=n,
-        episode_s=np.zeros(n),
-        policy=PolicySpec.parse(task.policy),
-    )
+    def identify(self, row: int) -> str:
+        return f"episode {row} (key {self.task.keys[row]:#x}, exploration {self.task.epsilons[row]:.3g})"
 
 
 def rectangle(rows: int, columns: int) -> list[Chunk]:
@@ -210,9 +204,8 @@ class WorkerPool(ABC):
 
         Raises: PoolError if that cannot be done.
         """
-        asked = rectangle(len(recipes), len(task.episodes)) if asked is None else asked
-        outcome = new_outcome(task, recipes, asked)
-        self._work(task, recipes, asked, outcome, on_progress, meanwhile)
+        outcome = Outcome(task, recipes, rectangle(len(recipes), len(task.episodes)) if asked is None else asked)
+        self._work(outcome, on_progress, meanwhile)
         return outcome
 
     def collect(
@@ -222,16 +215,12 @@ class WorkerPool(ABC):
 
         Raises: PoolError if that cannot be done.
         """
-        collected = new_collected(task)
-        asked = rectangle(1, len(task.episodes))
-        self._work(task, np.zeros(0, RECIPE), asked, collected, on_progress, meanwhile)
+        collected = Collected(task)
+        self._work(collected, on_progress, meanwhile)
         return collected
 
     @abstractmethod
-    def _work(
-        self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,
-        on_progress: Progress | None, meanwhile: Meanwhile | None,
-    ) -> None:  # fmt: skip
+    def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         """Have all that is asked for done, and fill `call`."""
 
     @abstractmethod
@@ -246,20 +235,16 @@ class SerialPool(WorkerPool):
         self._build_map = build_map
         self._worker = worker_factory()
 
-    def _work(
-        self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,
-        on_progress: Progress | None, meanwhile: Meanwhile | None,
-    ) -> None:  # fmt: skip
+    def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         started = time.perf_counter()
-        maps = [self._build_map(*name) for name in task.maps]
+        maps = [self._build_map(*name) for name in call.task.maps]
         finish(meanwhile)
-        for index, parcel in enumerate(cut(task, asked, SERIAL_PARTS)):
+        for index, parcel in enumerate(cut(call.task, call.asked, SERIAL_PARTS)):
             try:
                 for chunk in parcel:
-                    first, stop = chunk.columns.start, chunk.columns.stop
-                    call.add(0, chunk, *self._worker.answer(task, maps, recipes[chunk.rows], first, stop))
+                    call.add(0, chunk, *self._worker.answer(call.task, maps, *call.work(chunk)))
             except Exception as error:
-                raise PoolError(f"a worker failed on {describe(task, index, parcel)}: {last_line(error)}") from error
+                raise PoolError(f"a worker failed on {call.describe(index, parcel)}: {last_line(error)}") from error
             if on_progress:
                 on_progress(*call.progress())
         call.wall_s = time.perf_counter() - started
@@ -274,14 +259,18 @@ def finish(meanwhile: Meanwhile | None) -> None:
         pass
 
 
-def metres(task: Task | CollectTask, chunk: Chunk) -> float:
+def _goals(task: AnyTask) -> np.ndarray:
+    """Target (m) of each column: float64 [columns]. All episodes of a batch of experience have the same."""
+    goals = targets(task.episodes, task.limits)
+    return goals[:1] if isinstance(task, CollectTask) else goals
+
+
+def metres(task: AnyTask, chunk: Chunk) -> float:
     """How far the members of a chunk drive if all of them reach their targets."""
-    return float(targets(task.episodes[chunk.columns], task.limits).sum()) * (chunk.rows.stop - chunk.rows.start)
+    return float(_goals(task)[chunk.columns].sum()) * (chunk.rows.stop - chunk.rows.start)
 
 
-def cut(
-    task: Task | CollectTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None
-) -> list[Parcel]:
+def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None) -> list[Parcel]:
     """Cut what is asked for into parcels, by the seconds that it may take: large ones first, small ones last.
 
     Each takes most of a worker's share of the rest, so that no worker waits long for the slowest, and little is sent
@@ -298,7 +287,7 @@ def cut(
     worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one worker computes, all others get their parcels
     least = min(worth_s, left / (2 * workers))  # every worker gets some, however little it costs
     largest = max(LARGEST_S, LARGER * worth_s)
-    goals = targets(task.episodes, task.limits)
+    goals = _goals(task)
     parcel: Parcel = ()  # not yet full
     room = 0.0  # seconds left in it
     for rate, (rows, columns) in zip(rates, asked, strict=True):
@@ -325,26 +314,6 @@ def cut(
                 left -= seconds[stop] - seconds[column]
                 row, column = (row + 1, 0) if stop == len(seconds) - 1 else (row, stop)
     return [*parcels, parcel] if parcel else parcels
-
-
-def describe(task: Task | CollectTask, index: int, parcel: Parcel) -> str:
-    """A parcel in words."""
-    if isinstance(task, CollectTask):
-        spans = [chunk.columns for chunk in parcel]
-        return f"parcel {index} (episodes {spans[0].start} to {spans[-1].stop - 1})"
-    spans = [chunk.rows for chunk in parcel]
-    return f"parcel {index} (members {', '.join(f'{span.start} to {span.stop - 1}' for span in spans)})"
-
-
-def identify(task: Task | CollectTask, chunk: Chunk, recipes: np.ndarray) -> str:
-    """The one member, or episode, of a chunk: with its recipe (of `recipes`), so that it can be tried again."""
-    if isinstance(task, CollectTask):
-        k = chunk.columns.start
-        return f"episode {k} (key {task.keys[k]:#x}, exploration {task.epsilons[k]:.3g})"
-    recipe = recipes[chunk.rows][0]
-    kind = Kind(int(recipe["kind"])).name.lower()
-    rows = f"rows {recipe['a']} and {recipe['b']}"
-    return f"member {chunk.rows.start} ({kind} of {rows}, seed {recipe['seed']}, key {task.key:#x})"
 
 
 def last_line(error: BaseException) -> str:

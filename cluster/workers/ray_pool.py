@@ -20,33 +20,28 @@ import shutil
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from cluster.workers import ray_session
-from cluster.workers.actor import Actor, Name, Shared
+from cluster.workers.actor import Actor, Name, Shared, Work
 from cluster.workers.dispatch import MAX_KILLS, Dispatch
 from cluster.workers.pool import (
     UNMEASURED_METRE_S,
     BuildMap,
+    Call,
     Chunk,
-    Collected,
     Meanwhile,
-    Outcome,
     PoolError,
     Progress,
     WorkerPool,
     cut,
-    describe,
     finish,
-    identify,
     last_line,
     metres,
 )
-from cluster.workers.worker import CollectTask, Task, Worker
+from cluster.workers.worker import AnyTask, CollectTask, Worker
 from evolution.episodes.rollout import Limits
 
 CONNECT_S = 60.0
@@ -78,17 +73,15 @@ class _Slot:
 class _Job:
     """One call while it is being done."""
 
-    task: Task | CollectTask
-    shared: Any  # the task as workers get it
-    recipes: np.ndarray
+    call: Call
     dispatch: Dispatch
-    call: Outcome | Collected
+    shared: Any  # the task as workers get it
 
 
 _Kind = tuple[type, Limits, bool]
 
 
-def _kind(task: Task | CollectTask, part: Chunk) -> _Kind:
+def _kind(task: AnyTask, part: Chunk) -> _Kind:
     """The same for parts that need about as long for a metre: one member drives on where many others crash early."""
     return type(task), task.limits, part.rows.stop - part.rows.start == 1
 
@@ -134,33 +127,27 @@ class RayPool(WorkerPool):
         """Process ids of the workers that are up, on whichever machine they are."""
         return [slot.pid for slot in self._slots if slot.pid]
 
-    def _work(
-        self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,
-        on_progress: Progress | None, meanwhile: Meanwhile | None,
-    ) -> None:  # fmt: skip
+    def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         started = time.perf_counter()
         self._wait_for_ray()
         import ray
 
         try:
-            self._share_out(task, recipes, asked, call, on_progress, meanwhile)
+            self._share_out(call, on_progress, meanwhile)
         except ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
-        self._measure(task, asked, call)
+        self._measure(call)
         call.wall_s = time.perf_counter() - started
 
-    def _share_out(
-        self, task: Task | CollectTask, recipes: np.ndarray, asked: Sequence[Chunk], call: Outcome | Collected,
-        on_progress: Progress | None, meanwhile: Meanwhile | None,
-    ) -> None:  # fmt: skip
+    def _share_out(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         """Have the workers do all that is asked for."""
-        collecting = isinstance(task, CollectTask)
-        metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in asked]
-        parcels = cut(task, asked, self._asked * (FINER if collecting else 1), metre_s)
-        dispatch = Dispatch(parcels, collecting)
+        task = call.task
+        metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in call.asked]
+        shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
+        dispatch = Dispatch(cut(task, call.asked, shares, metre_s))
         self._serial += 1
         shared, call.broadcast_bytes = self._shared.put(task)
-        job = _Job(task, shared, recipes, dispatch, call)
+        job = _Job(call, dispatch, shared)
         alone_since = time.monotonic()
 
         while not dispatch.finished():
@@ -189,13 +176,14 @@ class RayPool(WorkerPool):
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         finish(meanwhile)
 
-    def _measure(self, task: Task | CollectTask, asked: Sequence[Chunk], call: Outcome | Collected) -> None:
+    def _measure(self, call: Call) -> None:
         """Remember how long a metre took."""
         seconds: defaultdict[_Kind, float] = defaultdict(float)
         whole: defaultdict[_Kind, float] = defaultdict(float)
-        for part in asked:
-            seconds[_kind(task, part)] += call.episode_s[part.columns].sum()
-            whole[_kind(task, part)] += metres(task, part)
+        for part in call.asked:
+            kind = _kind(call.task, part)
+            seconds[kind] += call.episode_s[part.columns].sum()
+            whole[kind] += metres(call.task, part)
         self._metre_s |= {kind: max(seconds[kind] / whole[kind], 1e-9) for kind in seconds if whole[kind]}
 
     def _ready(self, refs: list[Any], timeout_s: float) -> list[Any]:
@@ -211,21 +199,22 @@ class RayPool(WorkerPool):
         return ready
 
     def _send(self, slot: _Slot, parcel: int, job: _Job) -> None:
-        chunks = job.dispatch.parcels[parcel]
-        payloads = [job.recipes[rows].tobytes() for rows, _ in chunks]
-        work = [(recipes, columns.start, columns.stop) for recipes, (_, columns) in zip(payloads, chunks, strict=True)]
+        work: list[Work] = []
+        for chunk in job.dispatch.parcels[parcel]:
+            recipes, first, stop = job.call.work(chunk)
+            work.append((recipes.tobytes(), first, stop))
+            job.call.bytes_down += recipes.nbytes
         if not slot.sent:
             slot.heard = time.monotonic()
         answer = slot.actor.run.remote(work, *self._update(slot, job))
         slot.sent.append((self._serial, answer))
-        job.call.bytes_down += sum(map(len, payloads))
 
     def _update(self, slot: _Slot, job: _Job) -> list[Any]:
         """What a worker still has to be sent of the task."""
         if slot.serial == self._serial:
             return []
         slot.serial = self._serial
-        return self._shared.update(slot.maps, job.task, job.shared)
+        return self._shared.update(slot.maps, job.call.task, job.shared)
 
     def _receive(self, slot: _Slot, job: _Job) -> bool:
         """Take in a worker's oldest answer, or its death. Returns whether there is progress."""
@@ -240,7 +229,7 @@ class RayPool(WorkerPool):
                 return self._bury(slot, job, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = job.dispatch.at(slot.number)
-                what = describe(job.task, at, job.dispatch.parcels[at])
+                what = job.call.describe(at, job.dispatch.parcels[at])
                 raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
         except ray.exceptions.RayError as error:
             return self._bury(slot, job, ray_session.reason(error), ray_session.is_to_blame(error))
@@ -261,7 +250,7 @@ class RayPool(WorkerPool):
         for part in lost:
             call.lose(part)
         if lost:
-            lost_one = identify(job.task, lost[0], job.recipes)
+            lost_one = call.identify(lost[0].rows.start)
             call.warnings.append(
                 f"{lost_one} killed its worker {MAX_KILLS} times and is lost; the last time {reason}{self._logs}"
             )

@@ -20,15 +20,12 @@ from gridsim.maps.roads import freeze
 
 
 @dataclass(frozen=True)
-class Task:
-    """What all chunks of one generation share; broadcast once. Its arrays become read-only.
+class _Common:
+    """What all chunks of a call share; broadcast once. Its arrays become read-only.
 
     Attributes:
         policy: the network, as in `mlp:6,7`.
-        parents: genomes float32 [parents, genes] that the recipes name.
-        key: the generation's number for breeding, 64 bits.
-        mutation: how children differ from their parents.
-        episodes: EPISODE [episodes]; a call says which members drive which of them.
+        episodes: EPISODE [episodes].
         worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
         maps: (scenario, seed) of each map that `episodes` indexes.
         limits: where an episode ends if nothing happens.
@@ -36,9 +33,6 @@ class Task:
     """
 
     policy: str
-    parents: np.ndarray
-    key: int
-    mutation: Mutation
     episodes: np.ndarray
     worlds: np.ndarray
     maps: tuple[tuple[str, int], ...]
@@ -46,39 +40,43 @@ class Task:
     config: SimConfig
 
     def __post_init__(self) -> None:
-        _freeze_arrays(self)
+        """Make arrays read-only, like those from the object store: Numba would compile again for writable ones."""
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, freeze(value))
 
 
 @dataclass(frozen=True)
-class CollectTask:
-    """What all chunks of a batch of experience share; broadcast once. Its arrays become read-only.
+class Task(_Common):
+    """A generation. A call says which members (recipes) drive which episodes.
 
     Attributes:
-        policy, episodes, worlds, maps, limits, config: as a Task's.
+        parents: genomes float32 [parents, genes] that the recipes name.
+        key: the generation's number for breeding, 64 bits.
+        mutation: how children differ from their parents.
+    """
+
+    parents: np.ndarray
+    key: int
+    mutation: Mutation
+
+
+@dataclass(frozen=True)
+class CollectTask(_Common):
+    """A batch of experience: one network drives all episodes.
+
+    Attributes:
         weights: float32 [genes].
         epsilons: float32 [episodes], the share of random actions in each.
         keys: uint64 [episodes], of the random numbers of each.
     """
 
-    policy: str
     weights: np.ndarray
-    episodes: np.ndarray
-    worlds: np.ndarray
-    maps: tuple[tuple[str, int], ...]
     epsilons: np.ndarray
     keys: np.ndarray
-    limits: Limits
-    config: SimConfig
-
-    def __post_init__(self) -> None:
-        _freeze_arrays(self)
 
 
-def _freeze_arrays(task: Task | CollectTask) -> None:
-    """Make arrays read-only, like those from the object store: Numba would compile again for writable ones."""
-    for name, value in vars(task).items():
-        if isinstance(value, np.ndarray):
-            object.__setattr__(task, name, freeze(value))
+AnyTask = Task | CollectTask
 
 
 class Worker:
@@ -87,9 +85,7 @@ class Worker:
     The `maps` of its methods are those of `task.maps`, in that order.
     """
 
-    def answer(
-        self, task: Task | CollectTask, maps: Sequence[Map], recipes: np.ndarray, first: int, stop: int
-    ) -> tuple[Any, ...]:
+    def answer(self, task: AnyTask, maps: Sequence[Map], recipes: np.ndarray, first: int, stop: int) -> tuple[Any, ...]:
         """Do a chunk: recipes RECIPE [n] of a `Task`, and the task's episodes from `first` to before `stop`.
 
         Returns: what `evaluate` or `collect` does.

@@ -66,10 +66,8 @@ def empty(spec: PolicySpec, *shape: int) -> Experience:
     )
 
 
-def join(spec: PolicySpec, parts: Sequence[Experience]) -> Experience:
-    """Concatenate parts in their order."""
-    if not parts:
-        return empty(spec, 0)
+def join(parts: Sequence[Experience]) -> Experience:
+    """Concatenate parts, of which there are some, in their order."""
     return Experience(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 

@@ -22,22 +22,21 @@ def rows(*sizes: int) -> list[Parcel]:
 
 
 def new(*sizes: int) -> Dispatch:
-    return Dispatch(rows(*sizes), by_episode=False)
+    return Dispatch(rows(*sizes))
 
 
 class World:
     """Workers that hold what they were given, and die of killers. They answer in the order in which they were given."""
 
-    def __init__(self, dispatch: Dispatch, workers: int, killers: set[int], by_episode: bool):
-        self.dispatch, self.killers, self.by_episode = dispatch, killers, by_episode
+    def __init__(self, dispatch: Dispatch, workers: int, killers: set[int]):
+        self.dispatch, self.killers = dispatch, killers
         self.queues: dict[int, deque[int]] = {worker: deque() for worker in range(workers)}
-        self.answered: Counter[int] = Counter()  # members, or episodes
+        self.answered: Counter[int] = Counter()  # members
         self.lost: set[int] = set()
         self.deaths = 0
 
     def units(self, parcel: int) -> list[int]:
-        spans = [part.columns if self.by_episode else part.rows for part in self.dispatch.parcels[parcel]]
-        return [unit for span in spans for unit in range(span.start, span.stop)]
+        return [unit for part in self.dispatch.parcels[parcel] for unit in range(part.rows.start, part.rows.stop)]
 
     def give(self) -> None:
         idle = [worker for worker, queue in self.queues.items() if not queue]
@@ -62,7 +61,6 @@ class World:
 
 
 @given(
-    by_episode=st.booleans(),
     sizes=st.lists(st.integers(1, 40), min_size=1, max_size=12),
     workers=st.integers(1, 5),
     killers=st.sets(st.integers(0, 200), max_size=3),
@@ -70,15 +68,12 @@ class World:
     seed=st.integers(0, 1 << 32),
 )
 def test_everything_is_answered_once_but_those_that_kill(
-    by_episode: bool, sizes: list[int], workers: int, killers: set[int], chance: float, seed: int
+    sizes: list[int], workers: int, killers: set[int], chance: float, seed: int
 ) -> None:
     """Whatever dies by chance: each of those that kill is lost, alone, and nobody else."""
-    parts = rows(*sizes)
-    if by_episode:
-        parts = [tuple(Chunk(part.columns, part.rows) for part in parcel) for parcel in parts]
     killers &= set(range(sum(sizes)))
     rng = random.Random(seed)
-    world = World(Dispatch(parts, by_episode), workers, killers, by_episode)
+    world = World(new(*sizes), workers, killers)
     chances = 2  # no member can be unlucky three times
     for _ in range(20_000):
         if world.dispatch.finished():
@@ -99,7 +94,7 @@ def test_everything_is_answered_once_but_those_that_kill(
 
 @pytest.mark.parametrize("size", [1, 2, 100, 3000])
 def test_finding_the_killer_of_a_chunk_costs_few_workers(size: int) -> None:
-    world = World(new(size), 1, {size // 3}, False)
+    world = World(new(size), 1, {size // 3})
     while not world.dispatch.finished():
         world.give()
         world.work(0)
@@ -110,7 +105,7 @@ def test_finding_the_killer_of_a_chunk_costs_few_workers(size: int) -> None:
 def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     """Validation gives one member's episodes to many workers: they are lost together."""
     parts = [(Chunk(slice(0, 1), slice(k, k + 1)),) for k in range(4)] + [(Chunk(slice(1, 2), slice(0, 4)),)]
-    dispatch = Dispatch(parts, by_episode=False)
+    dispatch = Dispatch(parts)
     assert [parcel for _, parcel in dispatch.give([0, 1, 2])] == [0, 1, 2]
     assert dispatch.answered(2) == 2
     for _ in range(MAX_KILLS - 1):

@@ -9,7 +9,7 @@ from cluster.runs.settings import DqnSettings, SettingsError
 from cluster.training import dqn as dqn_loop
 from cluster.training.dqn import Dqn
 from cluster.training.trainer import Maps
-from cluster.workers.pool import Chunk, PoolError, SerialPool, new_collected
+from cluster.workers.pool import Chunk, Collected, PoolError, SerialPool
 from cluster.workers.worker import Worker
 from gridsim.config import SimConfig
 
@@ -136,10 +136,10 @@ class Losing(SerialPool):
     one_in = 3
 
     def collect(self, task, on_progress=None, meanwhile=None):
-        collected, worker = new_collected(task), Worker()
+        collected, worker = Collected(task), Worker()
         maps = [self._build_map(*name) for name in task.maps]
         for k in range(len(task.episodes)):
-            chunk = Chunk(slice(0, 1), slice(k, k + 1))
+            chunk = Chunk(slice(k, k + 1), slice(0, 1))
             if k % self.one_in:
                 collected.add(0, chunk, *worker.collect(task, maps, k, k + 1))
             else:

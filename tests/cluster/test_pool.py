@@ -19,14 +19,13 @@ from cluster.workers.pool import (
     UNMEASURED_METRE_S,
     WORTH_SENDING_S,
     Chunk,
+    Collected,
+    Outcome,
     PoolError,
     SerialPool,
     cut,
-    identify,
     last_line,
     metres,
-    new_collected,
-    new_outcome,
     rectangle,
 )
 from cluster.workers.worker import CollectTask, Task, Worker
@@ -87,7 +86,7 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
         episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
         episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
     worlds = no_traffic(len(episodes))
-    return Task("mlp:6,7", parents, 12345, Mutation(), episodes, worlds, maps, Limits(150.0, 300), SimConfig())
+    return Task("mlp:6,7", episodes, worlds, maps, Limits(150.0, 300), SimConfig(), parents, 12345, Mutation())
 
 
 def make_collect_task(n: int) -> CollectTask:
@@ -95,7 +94,7 @@ def make_collect_task(n: int) -> CollectTask:
     policy, keys = "mlp:6,7", np.arange(n, dtype=np.uint64)
     weights, epsilons = np.zeros(PolicySpec.parse(policy).size, dtype=np.float32), np.zeros(n, dtype=np.float32)
     episodes = np.zeros(n, dtype=EPISODE)
-    return CollectTask(policy, weights, episodes, no_traffic(n), (), epsilons, keys, Limits(150.0, 300), SimConfig())
+    return CollectTask(policy, episodes, no_traffic(n), (), Limits(150.0, 300), SimConfig(), weights, epsilons, keys)
 
 
 def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:
@@ -106,7 +105,7 @@ def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:
     weights = (rng.standard_normal(311) * 0.4).astype(np.float32)
     keys, epsilons = rng.integers(1 << 63, size=n, dtype=np.uint64), np.full(n, 0.2, dtype=np.float32)
     limits = Limits(150.0, 300)
-    return CollectTask("mlp:6,7", weights, episodes, worlds, MAPS, epsilons, keys, limits, SimConfig()), scenarios
+    return CollectTask("mlp:6,7", episodes, worlds, MAPS, limits, SimConfig(), weights, epsilons, keys), scenarios
 
 
 def make_recipes(n: int) -> np.ndarray:
@@ -223,7 +222,7 @@ def test_only_what_is_asked_for_is_driven() -> None:
     wanted = np.zeros((20, 2))
     wanted[15:, 1], wanted[:10, 0] = recipes["seed"][15:] * 16.0 + 1, recipes["seed"][:10] * 16.0
     assert np.array_equal(outcome.results["distance"], wanted)
-    assert outcome.whole()
+    assert outcome.done == outcome.total
     assert progress[-1] == (20, 20)
 
 
@@ -236,7 +235,8 @@ def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
             lambda of: pool.collect(make_collect_task(count), meanwhile=of),  # noqa: B023
         ):
             left = [1, 2, 3, 4]
-            assert call(lambda: bool(left.pop() and left)).whole()  # noqa: B023
+            called = call(lambda: bool(left.pop() and left))  # noqa: B023
+            assert called.done == called.total
             assert left == []
     with pytest.raises(KeyboardInterrupt):
         pool.collect(make_collect_task(9), meanwhile=interrupted)
@@ -250,11 +250,11 @@ def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
     """And what a task holds is read-only."""
     task, maps = collect_drive_task(9)
     whole = SerialPool(lambda *name: maps[name[1]]).collect(task)
-    collected = new_collected(task)
+    collected = Collected(task)
     for first, stop in ((5, 9), (0, 2), (2, 5)):
         answer = Worker().answer(task, maps, make_recipes(0), first, stop)
-        collected.add(first, Chunk(slice(0, 1), slice(first, stop)), *answer)
-    assert collected.whole()
+        collected.add(first, Chunk(slice(first, stop), slice(0, 1)), *answer)
+    assert collected.done == collected.total
     assert to_bytes(collected.experience) == to_bytes(whole.experience)
     assert collected.results.tobytes() == whole.results.tobytes()
     assert set(collected.busy_s) == {0, 2, 5}
@@ -264,22 +264,22 @@ def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
 def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
     """A member whose first episode came back and whose second kills; and an episode of a batch."""
     task, recipes = make_task(), make_recipes(3)
-    outcome = new_outcome(task, recipes, rectangle(3, 2))
+    outcome = Outcome(task, recipes, rectangle(3, 2))
     none, no_cars = np.zeros((2, 0, 5), dtype=np.float32), np.zeros((2, 0, 0, FIELDS), dtype=np.float32)
     outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), none, no_cars, 0.1)
     outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), none[:1], no_cars[:1], 0.1)
-    assert not outcome.whole()
+    assert outcome.done < outcome.total
     outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
-    assert outcome.whole()
+    assert outcome.done == outcome.total
     assert outcome.lost.tolist() == [False, False, True]
     assert (outcome.results["distance"] == [[1, 1], [1, 1], [0, 0]]).all()
 
     task_of_10 = make_collect_task(10)
-    collected = new_collected(task_of_10)
+    collected = Collected(task_of_10)
     for first, stop in ((4, 10), (0, 3)):
-        collected.add(0, Chunk(slice(0, 1), slice(first, stop)), *Answering().collect(task_of_10, [], first, stop))
-    collected.lose(Chunk(slice(0, 1), slice(3, 4)))
-    assert collected.whole()
+        collected.add(0, Chunk(slice(first, stop), slice(0, 1)), *Answering().collect(task_of_10, [], first, stop))
+    collected.lose(Chunk(slice(3, 4), slice(0, 1)))
+    assert collected.done == collected.total
     assert np.flatnonzero(collected.lost).tolist() == [3]
     assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
@@ -287,7 +287,8 @@ def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
 def test_a_member_is_identified_by_its_recipe() -> None:
     recipes = make_recipes(9)
     recipes["kind"][8] = Kind.MIRRORED
-    assert [identify(make_task(), Chunk(slice(k, k + 1), slice(0, 2)), recipes) for k in (1, 7, 8)] == [
+    outcome = Outcome(make_task(), recipes, [])
+    assert [outcome.identify(k) for k in (1, 7, 8)] == [
         "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
         "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",
         "member 8 (mirrored of rows 0 and 0, seed 8, key 0x3039)",

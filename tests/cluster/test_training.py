@@ -198,7 +198,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         validation = evolution.drive("alone", candidate[None], curriculum.validation(), curriculum.goal_limits())
         assert validation.results[0].tobytes() == outcome.results[51, -config.validation :].tobytes()
         assert evolution.champion.success_rate == (validation.results["end"] == End.SUCCESS).mean()
-    assert outcome.whole()
+    assert outcome.done == outcome.total
     tell(score)
 
 

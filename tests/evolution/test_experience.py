@@ -38,7 +38,7 @@ def made(spec: PolicySpec, lengths: list[int], seed: int = 0) -> Experience:
         x.ends[:] = 0
         x.ends[:-1][-1:] = 1 + steps % 4
         parts.append(x)
-    return join(spec, parts)
+    return join(parts)
 
 
 @given(st.floats(-20.0, 20.0, width=32))
@@ -72,7 +72,7 @@ def test_frames_are_stacked_as_the_network_stacks_them(frames: int, turn: int) -
     assert np.abs(seen[:, -1] - (speeds[rows] / SPEED_SCALE - 1)).max() <= 0.5 / UNITS + 1e-6
 
 
-@given(st.lists(st.integers(0, 300), max_size=6))
+@given(st.lists(st.integers(0, 300), min_size=1, max_size=6))
 def test_ages_count_from_each_episodes_first_row(lengths: list[int]) -> None:
     wanted = [min(k, OLDEST) for steps in lengths for k in range(steps + 1)]
     assert ages(made(MlpSpec((5,)), lengths)).tolist() == wanted

@@ -84,7 +84,7 @@ def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, spec):
         for rewards, end in added:
             new.append(episode(rewards, end, first, spec))
             first += len(rewards) + 1
-        replay.add(join(spec, new))
+        replay.add(join(new))
         parts += new
         known = expected(parts, capacity, getattr(spec, "frames", 1))
         assert len(replay) == min(first, capacity)
