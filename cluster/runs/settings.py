@@ -237,10 +237,8 @@ class EvolveSettings(RunSettings):
         classic = self.recombination == "two" or self.search == "random"
         if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
             raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
-        try:
-            self.search_config().check()
-        except ValueError as error:
-            raise SettingsError(str(error)) from error
+        self._check_range(1, MAX_STEPS, "tournament")
+        self._check_positive("sigma")
 
 
 @dataclass(frozen=True)

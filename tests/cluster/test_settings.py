@@ -97,8 +97,8 @@ def test_there_are_no_more_groups_than_members_for_them(population, groups):
         ({"recombination": "two", "elites": 10_001, "population": 20_000}, "--elites must be"),
         ({"recombination": "two", "mutation_rate": 1.5}, "--mutation-rate must be 0 to 1"),
         ({"population": 1_000_001}, "--population must be 4 to 1,000,000"),
-        ({"tournament": 0}, "tournament"),
-        ({"sigma": float("nan")}, "sigma must be above 0"),
+        ({"tournament": 0}, "--tournament must be 1 to"),
+        ({"sigma": float("nan")}, "--sigma must be above 0"),
         ({"generations": -1}, "--generations"),
     ],
 )

@@ -139,21 +139,3 @@ def test_a_restored_search_goes_on_bit_for_bit(kind, generations):
     for _ in range(3):
         members = told(search, first_gene).tobytes()
         assert told(again, first_gene).tobytes() == members != told(other, first_gene).tobytes()
-
-
-@pytest.mark.parametrize(
-    ("wrong", "text"),
-    [
-        ({"population": 3}, "population must be 4 or more"),
-        ({"population": 10, "groups": 6}, "no 6 groups"),
-        ({"groups": 0}, "no 0 groups"),
-        ({"tournament": 0}, "tournament"),
-        ({"sigma": 0.0}, "sigma"),
-        ({"sigma": np.nan}, "sigma"),
-        ({"mutation_rate": 1.1}, "mutation rate"),
-        ({"mutation_rate": np.nan}, "mutation rate"),
-    ],
-)
-def test_parameters_that_do_not_fit_are_refused_in_one_line(wrong, text):
-    with pytest.raises(ValueError, match=rf"^[^\n]*{text}[^\n]*$"):
-        Recombination(SPEC, SearchConfig(**wrong), seed=1)
