@@ -112,11 +112,8 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     settings = EvolveSettings(scenario=scenario, traffic=traffic, seed=seed, **variant.settings)
     maps = Maps(scenario, SimConfig())
     learner = Evolution(settings, SerialPool(maps.build), maps)
-    episode = learner.sim.episode
     config = dataclasses.replace(settings.curriculum(), promising=2.0, **variant.curriculum)  # so nothing is validated
-    learner.curriculum = Curriculum(
-        config, seed, maps.get, episode.target, episode.time_limit, episode.control_period, settings.traffic
-    )
+    learner.curriculum = Curriculum(config, seed, maps.get, learner.sim.episode, settings.traffic)
     search = dataclasses.replace(settings.search_config(), groups=config.groups)
     learner.search = variant.search(learner.spec, search, seed)
     found = []

@@ -141,10 +141,7 @@ class Learning(ABC):
         s = self.settings
         self.sim = SimConfig()
         self.spec = PolicySpec.parse(s.policy)
-        episode = self.sim.episode
-        self.curriculum = Curriculum(
-            s.curriculum(), s.seed, self.maps.get, episode.target, episode.time_limit, episode.control_period, s.traffic
-        )
+        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim.episode, s.traffic)
         self.outcomes: list[Outcome] = []  # of the last step, for statistics
         self._lines: list[str] = []  # of history.csv
 

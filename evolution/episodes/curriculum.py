@@ -17,10 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evolution.episodes.rollout import EPISODE, Limits
+from evolution.episodes.rollout import EPISODE, Limits, with_limits
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
 from gridsim.car.ego import End
+from gridsim.config import EpisodeConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
 from gridsim.traffic.world import FIELDS, LANE
@@ -74,16 +75,13 @@ class Curriculum:
         config: CurriculumConfig,
         seed: int,
         build: Callable[[int], Map],
-        target_m: float,
-        time_s: float,
-        period_s: float,
+        episode: EpisodeConfig,
         traffic: int = 0,
     ):
-        self.config, self.seed, self.build = config, seed, build
+        self.config, self.seed, self.build, self.episode = config, seed, build, episode
         self.traffic, self.crowd = traffic, round(config.crowd * traffic)
-        self.goal, self.period = target_m, period_s
-        self.goal_steps = round(time_s / period_s)
-        self.target = min(config.first_target, target_m)
+        self.goal, self.period = episode.target, episode.control_period
+        self.target = min(config.first_target, self.goal)
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
         self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
         self._validation: dict[range, Episodes] = {}
@@ -101,20 +99,19 @@ class Curriculum:
 
     def limits(self) -> Limits:
         """Limits of training episodes."""
-        return Limits(self.target, self._steps(self.target))
+        return self._limits(self.target)
 
     def leader_limits(self) -> Limits:
         """Limits of the leader's episodes, which are longer than the members'."""
-        target = min(self.config.leader_stretch * self.target, self.goal)
-        return Limits(target, self._steps(target))
+        return self._limits(min(self.config.leader_stretch * self.target, self.goal))
 
-    def _steps(self, target: float) -> int:
-        """Time limit (control steps) of a training episode with this target (m)."""
-        return math.ceil((target / self.config.pace + self.config.slack) / self.period)
+    def _limits(self, target: float) -> Limits:
+        """Limits of a training episode with this target (m)."""
+        return Limits(target, math.ceil((target / self.config.pace + self.config.slack) / self.period))
 
     def goal_limits(self) -> Limits:
         """Limits of a full episode, in validation and held-out evaluation."""
-        return Limits(self.goal, self.goal_steps)
+        return Limits(self.goal, self.episode.steps)
 
     def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Training maps [count] as indices into `map_seeds`; without repetition if there are enough."""
@@ -138,14 +135,14 @@ class Curriculum:
         if not len(self.crashes) or not config.crash_starts:
             return fresh
         chosen = self._choose_crashes(generation)
-        crashes, worlds = self.crashes[chosen].copy(), self.crash_worlds[chosen]
-        target = min(config.crash_target, self.target)
-        crashes["target"], crashes["steps"] = target, self._steps(target)
+        crashes = with_limits(self.crashes[chosen], self._limits(min(config.crash_target, self.target)))
         seeds = [self.map_seeds[m] for m in crashes["map"]]
         used = sorted({*fresh.maps, *seeds})
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
         crashes["map"] = np.searchsorted(used, seeds)
-        return Episodes(used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, worlds))
+        return Episodes(
+            used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, self.crash_worlds[chosen])
+        )
 
     def _choose_crashes(self, generation: int) -> np.ndarray:
         """Indices of a generation's crash starts, group by group: likeliest where half of the members failed."""
@@ -172,17 +169,14 @@ class Curriculum:
         parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
         return np.concatenate(np.concatenate(parts, axis=1))
 
-    def starts(self, batch: int, count: int) -> Episodes:
-        """`count` new episodes on the training maps, for the DQN's batches."""
-        return self._drawn(batch, count, 3)
-
-    def _drawn(self, generation: int, count: int, purpose: int) -> Episodes:
-        rng = self._rng(generation, purpose)
-        return self._new_starts(self._some_maps(generation, count, rng), rng)
+    def starts(self, batch: int, count: int, purpose: int = 3) -> Episodes:
+        """`count` new episodes on the training maps, by default for the DQN's batches."""
+        rng = self._rng(batch, purpose)
+        return self._new_starts(self._some_maps(batch, count, rng), rng)
 
     def leader_episodes(self, generation: int) -> Episodes:
         """The leader's episodes alongside a generation, with `rewind` set for crash starts."""
-        episodes = self._drawn(generation, self.config.leader_episodes, 2).with_limits(self.leader_limits())
+        episodes = self.starts(generation, self.config.leader_episodes, purpose=2).with_limits(self.leader_limits())
         episodes.rows["rewind"] = self.config.rewind
         return episodes
 

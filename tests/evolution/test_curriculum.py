@@ -6,13 +6,14 @@ import pytest
 from evolution.episodes.curriculum import Curriculum, CurriculumConfig
 from evolution.episodes.rollout import RESULT
 from gridsim.car.ego import End
+from gridsim.config import EpisodeConfig
 from gridsim.maps.scenarios import build
 
 CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
 
 
 def new():
-    return Curriculum(CONFIG, 7, lambda seed: build("seamless", seed), 2000.0, 400.0, 0.1, traffic=2)
+    return Curriculum(CONFIG, 7, lambda seed: build("seamless", seed), EpisodeConfig(), traffic=2)
 
 
 def led(curriculum, generation, ends, distance=0.0, steps=50):
