@@ -257,7 +257,7 @@ class Session:
             while not learning.done() and not (learning.steps and self._out_of_time()):
                 row = learning.step()
                 self.maps.ahead(HELD_OUT_SEEDS, later=True)  # `finish` needs them
-                learning.add_wall_clock(row, self._wall_s(), learning.history[-2] if learning.steps > 1 else None)
+                learning.add_wall_clock(self._wall_s())
                 self._state = learning.state(self._saved_steps)
                 self.reporter.row(learning.steps, row)
                 self.report_outage()

@@ -68,9 +68,7 @@ class Maps:
         return self._built[seed].result()
 
     def build(self, scenario: str, seed: int) -> Map:
-        """The map of a scenario and seed, which is how pools ask for it."""
-        if scenario != self._scenario:
-            raise ValueError(f"a run on {self._scenario} has no map of {scenario}")
+        """The map of the run's scenario and a seed, which is how pools ask for it."""
         return self.get(seed)
 
     def close(self) -> None:
@@ -243,13 +241,11 @@ class Learning(ABC):
         copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
         return self._evaluate(stage, copies, episodes, limits, meanwhile=meanwhile)
 
-    def add_wall_clock(self, row: dict[str, float], wall_s: float, previous: dict[str, float] | None) -> None:
-        """Add the wall clock's columns to a row."""
-        row["wall_s"] = wall_s
-        steps, seconds = row["car_steps"], wall_s
-        if previous is not None:
-            steps, seconds = steps - previous["car_steps"], wall_s - previous["wall_s"]
-        row["car_steps_per_s"] = steps / max(seconds, 1e-9)
+    def add_wall_clock(self, wall_s: float) -> None:
+        """Add the wall clock's columns to the last row."""
+        row, before = self.history[-1], self.history[-2] if self.steps > 1 else {"car_steps": 0.0, "wall_s": 0.0}
+        steps, seconds = row["car_steps"] - before["car_steps"], wall_s - before["wall_s"]
+        row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
 
     def held_out(self) -> dict[str, float]:
         """The champion on roads never used in training or selection: the same 64 episodes in all runs of a scenario."""
@@ -265,11 +261,11 @@ class Learning(ABC):
 
     def state(self, first: int = 0) -> State:
         """All that an exact resume needs, arrays and plain numbers; of the history the rows from step `first` on."""
-        champion = self.champion
+        champion, none = self.champion, np.zeros(0, dtype=np.float32)
         arrays: dict[str, np.ndarray] = {
             "history": self.table(first),
-            "tried": genes_of(self.tried),
-            "champion": genes_of(champion.genome if champion else None),
+            "tried": none if self.tried is None else self.tried,
+            "champion": champion.genome if champion else none,
         }
         meta: dict[str, Any] = {
             "solved": self.solved,
@@ -307,11 +303,6 @@ class Learning(ABC):
 def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """The arrays whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-
-
-def genes_of(genome: np.ndarray | None) -> np.ndarray:
-    """A genome as a checkpoint has it: float32 [genes], or [0] for none."""
-    return np.zeros(0, dtype=np.float32) if genome is None else genome
 
 
 def check_any_left(lost: np.ndarray, stage: str) -> None:

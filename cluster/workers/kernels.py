@@ -134,21 +134,16 @@ def everything_by_default() -> list[RunSettings]:
     ]
 
 
-def compile_everything() -> None:
-    """Compile what `everything_by_default` needs."""
-    for settings in everything_by_default():
-        compile_kernels(settings.policy, settings.traffic, settings.command)
-        compile_roads(settings.scenario, settings.traffic)
-        compile_drive(settings.policy, settings.traffic)
-        _marker(settings).touch()
-        print(_marker(settings).name, flush=True)
-
-
 def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", command: str = "") -> None:
     """Compile one part, in a process of its own."""
     traffic = int(cars)
     if part == "everything":
-        compile_everything()
+        for settings in everything_by_default():
+            compile_kernels(settings.policy, settings.traffic, settings.command)
+            compile_roads(settings.scenario, settings.traffic)
+            compile_drive(settings.policy, settings.traffic)
+            _marker(settings).touch()
+            print(_marker(settings).name, flush=True)
     elif part == "kernels":
         compile_kernels(policy, traffic, command)
         print("ready", flush=True)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.episodes.rollout import EPISODE, Limits, no_traffic, with_limits
+from evolution.episodes.rollout import EPISODE, Limits, with_limits
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
 from gridsim.traffic.world import FIELDS, spawn
@@ -46,13 +46,12 @@ def lane_starts(
 
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
     """
-    episodes, worlds = np.zeros(len(maps), dtype=EPISODE), no_traffic(len(maps))
+    episodes, worlds = np.zeros(len(maps), dtype=EPISODE), np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
     episodes["map"] = maps
     for m in np.unique(maps):
         of = np.flatnonzero(episodes["map"] == m)
         episodes["start"][of] = sample_starts(road_maps[m], len(of), rng)
     if traffic:
-        worlds = np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
         for m in np.unique(maps):
             of = np.flatnonzero(episodes["map"] == m)
