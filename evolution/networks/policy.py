@@ -53,12 +53,9 @@ class PolicySpec(ABC):
         if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", text):
             sizes = tuple(int(n) for n in match[1].split(","))
             spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]))
-            if min(spec.hidden) < 1 or spec.size > MAX_GENES:
-                raise ValueError(
-                    f"policy {text!r}: hidden layers need 1 unit or more, and {MAX_GENES:,} genes at most in all"
-                )
-            return spec
-        if match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
+            if min(sizes) < 1:
+                raise ValueError(f"policy {text!r}: hidden layers need 1 unit or more")
+        elif match := re.fullmatch(r"cnn(?::(\d{1,5}),(\d{1,5}),(\d{1,5})(?:@(\d{1,2}))?)?", text):
             hidden = tuple(int(n) for n in match.groups()[:3]) if match[1] else CnnSpec.hidden
             spec = CnnSpec(hidden, frames=int(match[4] or CnnSpec.frames))
             if any(n < UNIT_MULTIPLE or n % UNIT_MULTIPLE for n in hidden) or not 1 <= spec.frames <= MAX_FRAMES:
@@ -66,13 +63,14 @@ class PolicySpec(ABC):
                     f"policy {text!r}: layers of a cnn need a positive multiple of {UNIT_MULTIPLE} units, "
                     f"and it sees 1 to {MAX_FRAMES} frames"
                 )
-            if spec.size > MAX_GENES:
-                raise ValueError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
-            return spec
-        raise ValueError(
-            f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "
-            "mlp:6,7+steering, or cnn for the grid, as in cnn:8,16,32@1"
-        )
+        else:
+            raise ValueError(
+                f"unknown policy {text!r}; write mlp: and the hidden layers' sizes, as in mlp:6,7, mlp:6,7+motion or "
+                "mlp:6,7+steering, or cnn for the grid, as in cnn:8,16,32@1"
+            )
+        if spec.size > MAX_GENES:
+            raise ValueError(f"policy {text!r} has {spec.size:,} genes; the maximum is {MAX_GENES:,}")
+        return spec
 
     @property
     @abstractmethod
