@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from evolution.dqn.experience import Experience
-from evolution.episodes.collecting import collect
-from evolution.episodes.rollout import Limits, evaluate
+from evolution.episodes.rollout import Limits, collect, evaluate
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import Mutation, breed
 from gridsim.config import SimConfig

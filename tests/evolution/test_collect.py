@@ -11,8 +11,7 @@ from driving import to_bytes
 
 from cluster.runs.champion import load_champion
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
-from evolution.episodes.collecting import collect
-from evolution.episodes.rollout import Limits, evaluate, no_traffic
+from evolution.episodes.rollout import Limits, collect, evaluate, no_traffic
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode
 from gridsim.car.ego import STEERING, End
