@@ -48,18 +48,11 @@ class Experience(NamedTuple):
     ends: np.ndarray  # uint8 [rows], End
 
 
-def observation_dtype_and_width(spec: PolicySpec) -> tuple[np.dtype, int]:
-    """Type and length of a row of `Experience.observations` for a policy."""
-    if isinstance(spec, CnnSpec):
-        return np.dtype(np.uint8), _FRAME + 2
-    return np.dtype(np.int16), spec.inputs
-
-
 def empty(spec: PolicySpec, *shape: int) -> Experience:
-    """Uninitialised experience of shape [rows] or [episodes, rows]."""
-    dtype, width = observation_dtype_and_width(spec)
+    """Uninitialised experience of shape [rows] or [episodes, rows]. Memory that is not written to is not taken."""
+    grids = isinstance(spec, CnnSpec)
     return Experience(
-        np.empty((*shape, width), dtype=dtype),
+        np.empty((*shape, _FRAME + 2 if grids else spec.inputs), dtype=np.uint8 if grids else np.int16),
         np.empty(shape, dtype=np.uint8),
         np.empty(shape, dtype=np.float32),
         np.empty(shape, dtype=np.uint8),

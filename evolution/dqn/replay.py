@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evolution.dqn.experience import NO_ACTION, Experience, ages, observation_dtype_and_width, unpack
+from evolution.dqn.experience import NO_ACTION, Experience, ages, empty, unpack
 from evolution.networks.policy import CnnSpec, PolicySpec
 from gridsim.car.ego import End
 from gridsim.counter import GOLDEN, mix, uniform64
@@ -60,15 +60,8 @@ class Replay:
         self.added = 0  # rows added in total: the next one's place is added % capacity
         self.transitions = 0  # rows that can be drawn
         self._earlier_frames = spec.frames - 1 if isinstance(spec, CnnSpec) else 0
-        dtype, width = observation_dtype_and_width(spec)
-        # Zeros take no memory before they are written, so a large ring grows as it fills.
-        self._rings = {
-            "observations": np.zeros((capacity, width), dtype=dtype),
-            "actions": np.zeros(capacity, dtype=np.uint8),
-            "rewards": np.zeros(capacity, dtype=np.float32),
-            "ends": np.zeros(capacity, dtype=np.uint8),
-            "ages": np.zeros(capacity, dtype=np.uint8),  # earlier rows of the episode, at most `_earlier_frames`
-        }
+        age = np.empty(capacity, dtype=np.uint8)  # earlier rows of the episode, at most `_earlier_frames`
+        self._rings = {**empty(spec, capacity)._asdict(), "ages": age}  # a large ring grows as it fills
         self._drawable = np.zeros(capacity, dtype=np.bool_)
 
     def __len__(self) -> int:

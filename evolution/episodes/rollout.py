@@ -397,7 +397,7 @@ def collect(
     traffic = freeze(worlds.copy()) if worlds.shape[1] else None
     exploration = freeze(epsilons.astype(np.float32)), freeze(keys.astype(np.uint64))
     results = np.zeros(len(episodes), dtype=RESULT)
-    # Room for episodes of any length: memory that is not written to is not taken.
+    # Room for episodes of any length.
     experience = empty(spec, len(episodes), int(episodes["steps"].max(initial=0)) + 1)
     for m in np.unique(episodes["map"]):
         which = np.flatnonzero(episodes["map"] == m)

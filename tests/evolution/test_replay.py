@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from evolution.dqn.experience import NO_ACTION, Experience, join, observation_dtype_and_width
+from evolution.dqn.experience import NO_ACTION, Experience, empty, join
 from evolution.dqn.replay import Replay
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
@@ -20,9 +20,9 @@ TERMINAL = (End.COLLISION, End.IDLE, End.SUCCESS)
 def episode(rewards, end, first=0, spec=RAYS):
     """An episode whose row t has the observation `first + t`, by which a row is known again, and the action t % 8."""
     steps = len(rewards)
-    dtype, width = observation_dtype_and_width(spec)
     number = np.arange(first, first + steps + 1)
-    observations = np.zeros((steps + 1, width), dtype=dtype)
+    observations = empty(spec, steps + 1).observations
+    observations[:] = 0
     if spec is RAYS:
         observations[:, 0], observations[:, 1] = number % 4096, number // 4096
     else:
