@@ -28,7 +28,7 @@ from cluster.runs.train import Session
 from cluster.tracking.address import check_uri
 from cluster.training.trainer import Maps
 from cluster.workers import ray_pool
-from cluster.workers.pool import Chunk, WorkerPool
+from cluster.workers.pool import Chunk, Outcome, WorkerPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import Task, Worker
 from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, no_traffic, targets
@@ -77,6 +77,16 @@ class SleepingWorker(InstantWorker):
         columns = task.episodes["start"][:, 4].astype(int)
         time.sleep(float(naps()[np.ix_(recipes["seed"], columns)].sum()))
         return *super().evaluate(task, maps, recipes)[:3], time.perf_counter() - started
+
+
+class Watched(RayPool):
+    """A pool that remembers what it was last asked for, and what came of it."""
+
+    outcome: Outcome
+
+    def evaluate(self, *arguments: Any) -> Outcome:
+        self.outcome = super().evaluate(*arguments)
+        return self.outcome
 
 
 def naps(members: int = 400, mean_s: float = 0.02) -> np.ndarray:
@@ -266,13 +276,13 @@ def coordinate(population: int, generations: int = 16) -> dict[str, float]:
     settings = EvolveSettings(population=population, generations=generations, until=2.0)
     with tempfile.TemporaryDirectory() as folder:
         maps = Maps(settings.scenario, SimConfig())
-        pool = RayPool(2, maps.build, worker_factory=InstantWorker)
+        pool = Watched(2, maps.build, worker_factory=InstantWorker)
         this = session(Path(folder), "large", settings, pool, maps)
         curriculum = this.learning.curriculum
         curriculum.config = dataclasses.replace(curriculum.config, first_target=curriculum.config.last_target)
         curriculum.target = curriculum.config.last_target
         broadcast: list[int] = []
-        this.reporter.row = lambda step, row: broadcast.append(this.learning.outcomes[0].broadcast_bytes)
+        this.reporter.row = lambda step, row: broadcast.append(pool.outcome.broadcast_bytes)
         begun = time.perf_counter()
         learn(this)
         maps.close()

@@ -35,7 +35,6 @@ import sys
 import tempfile
 import time
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,6 +45,7 @@ from ceilings import (  # beside this file
     CHUNKS,
     EPISODES,
     InstantWorker,
+    Watched,
     children_per_s,
     chunk_costs,
     gene_costs,
@@ -63,9 +63,7 @@ from simulation import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, t
 from cluster.runs.settings import MAX_STEPS, EvolveSettings
 from cluster.training.trainer import Maps
 from cluster.workers.kernels import compile_kernels
-from cluster.workers.pool import Chunk, Meanwhile, Outcome, Progress
 from cluster.workers.ray_pool import RayPool
-from cluster.workers.worker import Task
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
 from evolution.episodes.rollout import targets
 from evolution.networks.policy import PolicySpec
@@ -80,20 +78,6 @@ MEMBER_S = 1.0  # of evaluation, in the simulation
 
 
 State = tuple[dict[str, np.ndarray], dict[str, Any]]
-
-
-class Watched(RayPool):
-    """A pool that remembers what it was asked for last."""
-
-    task: Task
-    asked: Sequence[Chunk]
-
-    def evaluate(
-        self, task: Task, recipes: np.ndarray, on_progress: Progress | None = None,
-        asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
-    ) -> Outcome:  # fmt: skip
-        self.task, self.asked = task, asked or []
-        return super().evaluate(task, recipes, on_progress, asked, meanwhile)
 
 
 def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> State:
@@ -145,7 +129,7 @@ def last_generations(
     def measure(generation: int, row: dict[str, float]) -> None:
         nonlocal begun
         end = time.perf_counter()
-        (outcome,) = learning.outcomes
+        outcome = pool.outcome
         figures["wall"].append(end - begun)
         figures["overhead"].append(end - begun - max(outcome.busy_s.values()))
         figures["bytes"].append((outcome.bytes_down + outcome.bytes_up) / settings.population)
@@ -156,10 +140,10 @@ def last_generations(
     this.reporter.row = measure
     begun = time.perf_counter()
     learn(this)
-    n, goals = settings.population, targets(pool.task.episodes, pool.task.limits)
-    seconds = learning.outcomes[0].results["steps"] * curriculum.period  # driven; `at` scales them to evaluation
-    groups = [part for part in pool.asked if part.rows.stop <= n]
-    leader = next(part for part in pool.asked if part.rows.start == n)
+    n, goals = settings.population, targets(pool.outcome.task.episodes, pool.outcome.task.limits)
+    seconds = pool.outcome.results["steps"] * curriculum.period  # driven; `at` scales them to evaluation
+    groups = [part for part in pool.outcome.asked if part.rows.stop <= n]
+    leader = next(part for part in pool.outcome.asked if part.rows.start == n)
     load = Load(
         goals[groups[0].columns], np.concatenate([seconds[part] for part in groups]),
         goals[leader.columns], seconds[leader][0], learning.spec.size,

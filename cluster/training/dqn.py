@@ -75,7 +75,6 @@ class Dqn(Learning):
 
     def step(self) -> dict[str, float]:
         """Train until the next evaluation is due, and evaluate. Returns its row of the history (COLUMNS)."""
-        self.outcomes.clear()
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
         steps, rewards = 0, 0.0
         results: list[np.ndarray] = []

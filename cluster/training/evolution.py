@@ -73,7 +73,6 @@ class Evolution(Learning):
 
     def step(self) -> dict[str, float]:
         """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
-        self.outcomes.clear()
         curriculum, limits, period = self.curriculum, self.curriculum.limits(), self.sim.episode.control_period
         leader = self.search.leader()
         candidate = leader if self._promising() else None

@@ -140,7 +140,6 @@ class Learning(ABC):
         self.sim = SimConfig()
         self.spec = PolicySpec.parse(s.policy)
         self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim.episode, s.traffic)
-        self.outcomes: list[Outcome] = []  # of the last step, for statistics
         self._lines: list[str] = []  # of history.csv
 
     # ------------------------------------------------------------------------------------------------------ the loop
@@ -218,7 +217,6 @@ class Learning(ABC):
         own = {"parents": members.parents, "key": members.key, "mutation": members.mutation}
         task = self._task(Task, episodes, limits, **own)
         outcome = self.pool.evaluate(task, members.recipes, partial(self.on_progress, stage), asked, meanwhile)
-        self.outcomes.append(outcome)
         self.car_steps += int(outcome.results["steps"].sum())
         self._report(stage, outcome)
         return outcome
