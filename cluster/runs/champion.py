@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,14 +89,7 @@ class Champion:
             if speed is None:
                 raise ValueError(f'{spec} needs the speed (m/s) besides the grid: act(grid, info["speed_mps"])')
             return convnet.act_on(spec, self.genome, observation, speed)
-        return act_on(
-            spec,
-            self.genome,
-            np.asarray(observation),
-            self.sim.sensors.range,
-            self.sim.vehicle.speed_limit,
-            math.radians(self.sim.vehicle.steering_limit),
-        )
+        return act_on(spec, self.genome, np.asarray(observation), self.sim)
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:
         """A Gymnasium environment on the champion's scenario, or another."""

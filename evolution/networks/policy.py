@@ -7,6 +7,7 @@ outputs], then the biases [outputs]. The forward pass of `cnn` policies is in `c
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from evolution.networks.dense import tile
+from gridsim.config import SimConfig
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
@@ -345,27 +347,20 @@ def outputs_of(
     return outputs
 
 
-def act_on(
-    spec: PolicySpec,
-    genome: np.ndarray,
-    observation: np.ndarray,
-    reach: float,
-    speed_limit: float,
-    steering_limit: float,
-) -> int | np.ndarray:
-    """Actions of a genome for the environment's observations.
+def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config: SimConfig) -> int | np.ndarray:
+    """Actions of a genome for the environment's observations, whose scales are the configuration's.
 
-    Args: observation float32 [32] or [n, 32]: ranges / reach, then speed / speed_limit; with motion [63] or [n, 63],
-    closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit; reach m;
-    speed limit m/s; steering limit rad.
+    Args: observation float32 [32] or [n, 32]: ranges / the sensor's range, then speed / speed_limit; with motion [63]
+    or [n, 63], closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit.
     Returns: an action, or int64 [n]; -1 if an output is NaN.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
-    closing = many[:, RAYS : 2 * RAYS] * _F(speed_limit)
-    speeds = many[:, 2 * RAYS if spec.motion else RAYS] * _F(speed_limit)
-    angles = many[:, -1] * _F(steering_limit)
-    outputs = outputs_of(spec, genome, many[:, :RAYS] * _F(reach), closing, speeds, angles)
+    fastest = _F(config.vehicle.speed_limit)
+    closing = many[:, RAYS : 2 * RAYS] * fastest
+    speeds = many[:, 2 * RAYS if spec.motion else RAYS] * fastest
+    angles = many[:, -1] * _F(math.radians(config.vehicle.steering_limit))
+    outputs = outputs_of(spec, genome, many[:, :RAYS] * _F(config.sensors.range), closing, speeds, angles)
     actions = np.where(np.isnan(outputs).any(axis=1), -1, outputs.argmax(axis=1))
     return int(actions[0]) if np.ndim(observation) == 1 else actions

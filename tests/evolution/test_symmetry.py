@@ -9,8 +9,10 @@ from searching import new_genomes
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, act_on
 from evolution.networks.symmetry import MIRRORED_ACTIONS, symmetry
 from gridsim.car.vehicle import Action
+from gridsim.config import SimConfig, VehicleConfig
 
 F = np.float32
+CONFIG = SimConfig(VehicleConfig(speed_limit=20.0))
 SPECS = st.builds(
     MlpSpec,
     st.lists(st.integers(4, 12), min_size=1, max_size=3).map(tuple),
@@ -44,7 +46,7 @@ def test_in_a_mirrored_world_it_takes_the_mirrored_action(spec, seed):
     observations[:, RAYS:] = 2.0 * observations[:, RAYS:] - 1.0
     genome = new_genomes(spec, seed=seed)[0]
     mirrored = in_a_mirror(spec, observations)
-    one, other = (act_on(spec, genome, seen, 50.0, 20.0, 0.5) for seen in (observations, mirrored))
+    one, other = (act_on(spec, genome, seen, CONFIG) for seen in (observations, mirrored))
     # But for near ties, where the order of sums decides.
     assert (MIRRORED_ACTIONS[one] == other).mean() > 0.9
 
@@ -66,7 +68,7 @@ def test_a_layer_of_one_unit_can_tell_left_from_right(policy):
     spec = PolicySpec.parse(policy)
     assert len(symmetry(spec).free) == spec.size
     observations = np.random.default_rng(1).random((300, spec.inputs)).astype(F)
-    done = np.array([act_on(spec, genome, observations, 50.0, 20.0, 0.5) for genome in new_genomes(spec, 40)])
+    done = np.array([act_on(spec, genome, observations, CONFIG) for genome in new_genomes(spec, 40)])
     assert {*np.unique(done)} >= {Action.LEFT, Action.RIGHT, Action.ACCELERATE_LEFT, Action.ACCELERATE_RIGHT}
 
 
