@@ -376,7 +376,6 @@ class Session:
         path = self.run.path
         arrays, meta = checkpoint.load(path / CHECKPOINT)
         kept = {name: array for name, array in arrays.items() if not name.startswith("replay_")}
-        meta.pop("replay", None)
         checkpoint.save(path / CHECKPOINT, kept | {"history": self.learning.table()}, meta)
         write_summary(path, self.summary)
         (path / STEPS).unlink(missing_ok=True)

@@ -213,13 +213,10 @@ class Dqn(Learning):
 
     def state(self, first: int = 0) -> State:
         arrays, meta = super().state(first)
-        learner, replay = self.learner.state(), self.replay.state()
-        arrays |= {f"learner_{name}": array for name, array in learner[0].items()}
-        arrays |= {f"replay_{name}": array for name, array in replay[0].items()}
+        arrays |= {f"learner_{name}": array for name, array in self.learner.state().items()}
+        arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
         arrays |= {"probe": self.probe, "probe_q": self.probe_q}
         meta |= {
-            "learner": learner[1],
-            "replay": replay[1],
             "batches": self.batches,
             "calm": self.calm,
             "owed": self._owed,
@@ -229,9 +226,9 @@ class Dqn(Learning):
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super().restore(arrays, meta)
-        self.learner.restore(named(arrays, "learner_"), meta["learner"])
-        if "replay" in meta:  # an ended run saves none; if it is extended, it fills a new one before it learns on
-            self.replay.restore(named(arrays, "replay_"), meta["replay"])
+        self.learner.restore(named(arrays, "learner_"))
+        if "replay_added" in arrays:  # an ended run saves none; if it is extended, it fills a new one before it learns
+            self.replay.restore(named(arrays, "replay_"))
         self.probe, self.probe_q = arrays["probe"], arrays["probe_q"]
         self.batches, self.episodes, self.calm = meta["batches"], meta["episodes"], meta["calm"]
         self._owed, self._mean_steps = meta["owed"], meta["mean_steps"]

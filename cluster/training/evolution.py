@@ -163,16 +163,13 @@ class Evolution(Learning):
 
     def state(self, first: int = 0) -> State:
         arrays, meta = super().state(first)
-        curriculum = self.curriculum
-        searched, numbers = self.search.state()
-        arrays |= {f"search_{name}": array for name, array in searched.items()}
-        arrays |= {name: getattr(curriculum, name) for name in CRASHES}
-        meta |= {"search": numbers, "target": curriculum.target}
-        return arrays, meta
+        arrays |= {f"search_{name}": array for name, array in self.search.state().items()}
+        arrays |= {name: getattr(self.curriculum, name) for name in CRASHES}
+        return arrays, meta | {"target": self.curriculum.target}
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         super().restore(arrays, meta)
-        self.search.restore(named(arrays, "search_"), meta["search"])
+        self.search.restore(named(arrays, "search_"))
         self.search.generation = meta["generation"]
         if self.champion is not None:
             self.search.keep_champion(self.champion.genome)

@@ -252,14 +252,14 @@ class DqnLearner:
             "adam_variance": self._variance,
         }
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The learner's state as copied arrays and plain numbers."""
+    def state(self) -> dict[str, np.ndarray]:
+        """The learner's state as copied arrays."""
         arrays = {name: tensor.cpu().numpy().copy() for name, tensor in self._tensors().items()}
-        return arrays, {"updates": self.updates}
+        return arrays | {"updates": np.array(self.updates)}
 
-    def restore(self, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Restore a `state` of a learner with the same network."""
         for name, tensor in self._tensors().items():
             tensor.copy_(torch.from_numpy(arrays[name].reshape(self.spec.size)))
-        self.updates = int(meta["updates"])
+        self.updates = int(arrays["updates"])
         self._steps.fill_(self.updates)

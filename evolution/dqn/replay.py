@@ -10,7 +10,7 @@ The oldest rows are overwritten first. Rows of grids that have lost earlier fram
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -113,16 +113,13 @@ class Replay:
             np.where(goes_on, self.discount, 0.0).astype(np.float32),
         )
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """The replay's state as arrays and plain numbers.
+    def state(self) -> dict[str, np.ndarray]:
+        """The replay's state as arrays, which are views of the ring: save them before more is added."""
+        return {name: ring[: len(self)] for name, ring in self._rings.items()} | {"added": np.array(self.added)}
 
-        The arrays are views of the ring: save them before more is added.
-        """
-        return {name: ring[: len(self)] for name, ring in self._rings.items()}, {"rows_added": self.added}
-
-    def restore(self, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Restore a `state` of a replay of the same capacity and network."""
-        self.added = int(meta["rows_added"])
+        self.added = int(arrays["added"])
         for name, ring in self._rings.items():
             ring[: len(self)] = arrays[name]
         self._drawable[: len(self)] = arrays["actions"] != NO_ACTION

@@ -8,14 +8,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation, breed
-
-Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,8 @@ class Generation(NamedTuple):
 class Search(ABC):
     """A search by ask and tell. Random numbers depend on (seed, generation); the state is a few arrays and numbers."""
 
+    kept: ClassVar[tuple[str, ...]]  # attributes that make up the state, besides the generation
+
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         self.spec, self.config, self.seed = spec, config, seed
         self.generation = 0  # completed generations
@@ -67,13 +67,14 @@ class Search(ABC):
     def leader(self) -> np.ndarray | None:
         """The best genome known so far, float32 [genes], also the candidate for champion; None if there is none yet."""
 
-    @abstractmethod
-    def state(self) -> tuple[Arrays, dict[str, float]]:
-        """The arrays and numbers that an exact resume needs, besides the generation."""
+    def state(self) -> dict[str, np.ndarray]:
+        """What an exact resume needs, besides the generation."""
+        return {name: np.asarray(getattr(self, name)) for name in self.kept}
 
-    @abstractmethod
-    def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """The inverse of `state`."""
+        for name in self.kept:
+            setattr(self, name, arrays[name] if arrays[name].ndim else arrays[name].item())
 
     @abstractmethod
     def _ask(self, key: int) -> Generation: ...

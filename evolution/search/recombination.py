@@ -15,7 +15,7 @@ import numpy as np
 
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
-from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournament_weights
+from evolution.search.base import Generation, Search, SearchConfig, ranks, recipes, split, tournament_weights
 from evolution.search.breeding import Kind, Mutation, noise_sum
 
 _CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
@@ -26,7 +26,6 @@ _KEPT = 0.9  # decay of the average of centres in each generation
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
 _MAX_GROWTH = 2.0
-_ARRAYS = ("centre", "average", "path")  # of the state
 
 
 class Recombination(Search):
@@ -39,6 +38,8 @@ class Recombination(Search):
         average: float64 [genes], exponential moving average of the centres.
         champion: float32 [genes], the run's champion, or None.
     """
+
+    kept = ("centre", "average", "path", "sigma")
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         super().__init__(spec, config, seed)
@@ -100,11 +101,3 @@ class Recombination(Search):
             self.path = (1.0 - rate) * self.path + math.sqrt(rate * (2.0 - rate)) * step
             self.sigma *= math.exp(rate / damping * (float(np.linalg.norm(self.path)) / expected - 1.0))
             self.sigma = min(self.sigma, _MAX_GROWTH * self.config.sigma)
-
-    def state(self) -> tuple[Arrays, dict[str, float]]:
-        return {name: getattr(self, name) for name in _ARRAYS}, {"sigma": self.sigma}
-
-    def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
-        for name in _ARRAYS:
-            setattr(self, name, arrays[name])
-        self.sigma = numbers["sigma"]

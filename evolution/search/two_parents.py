@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from evolution.networks.policy import PolicySpec
-from evolution.search.base import Arrays, Generation, Search, SearchConfig, ranks, recipes, split, tournaments
+from evolution.search.base import Generation, Search, SearchConfig, ranks, recipes, split, tournaments
 from evolution.search.breeding import Kind, Mutation
 
 PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
@@ -16,6 +16,8 @@ PARENTS = 64  # size of the mating pool, which bounds the size of a broadcast
 
 class TwoParents(Search):
     """Elites are kept unmodified. Both parents of each other member are drawn from the winners of tournaments."""
+
+    kept = ("parents", "elites")
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int, random: bool = False):
         super().__init__(spec, config, seed)
@@ -50,9 +52,3 @@ class TwoParents(Search):
         winners = tournaments(standing, self.config.tournament, PARENTS, self._rng(2))
         self.parents = self.genomes(np.concatenate([best, winners]))
         self.elites = len(best)
-
-    def state(self) -> tuple[Arrays, dict[str, float]]:
-        return {"parents": self.parents}, {"elites": self.elites}
-
-    def restore(self, arrays: Arrays, numbers: dict[str, float]) -> None:
-        self.parents, self.elites = arrays["parents"], int(numbers["elites"])

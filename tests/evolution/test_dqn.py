@@ -103,7 +103,7 @@ def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
         learner.update(batch)
         assert learner.weights == pytest.approx(network.genome.numpy(), abs=1e-6)
         target = learner.weights if k == 2 else target
-        assert np.array_equal(learner.state()[0]["target"], target)
+        assert np.array_equal(learner.state()["target"], target)
 
 
 # --- Learning --------------------------------------------------------------------------------------------------------
@@ -147,12 +147,12 @@ def test_training_may_be_cut_and_resumed_anywhere():
         parts.train(replay, updates)
     saved = copy.deepcopy(parts.state())
     resumed.train(replay, 3)  # whatever it was before
-    resumed.restore(*saved)
+    resumed.restore(saved)
     resumed.train(replay, 50)
-    assert resumed.state()[1] == whole.state()[1] == {"updates": 100}
-    for name, array in whole.state()[0].items():
-        assert np.array_equal(array, resumed.state()[0][name]), name
-    assert not np.array_equal(whole.weights, whole.state()[0]["target"])
+    assert resumed.updates == whole.updates == 100
+    for name, array in whole.state().items():
+        assert np.array_equal(array, resumed.state()[name]), name
+    assert not np.array_equal(whole.weights, whole.state()["target"])
 
 
 def test_seeds_differ_and_repeat():

@@ -107,7 +107,7 @@ def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, spec):
                     assert inputs[:-1].reshape(-1, 6400)[:, [0, 4]] == pytest.approx(stacked(spec, row, starts))
         # What is restored draws the same, and goes on as the first does.
         again, goes_on = Replay(spec, capacity, 0.9), copy.deepcopy(replay)
-        again.restore(*replay.state())
+        again.restore(replay.state())
         for _ in range(2):
             for one, other in zip(goes_on.sample(7, 32), again.sample(7, 32), strict=True):
                 assert np.array_equal(one, other)

@@ -133,8 +133,7 @@ def test_a_restored_search_goes_on_bit_for_bit(kind, generations):
     search, again, other = (kind(SPEC, SearchConfig(population=20, groups=2), seed=seed) for seed in (10, 10, 11))
     for _ in range(generations):
         told(search, first_gene)
-    arrays, numbers = search.state()
-    again.restore({name: array.copy() for name, array in arrays.items()}, dict(numbers))
+    again.restore({name: array.copy() for name, array in search.state().items()})
     again.generation = search.generation
     for _ in range(3):
         members = told(search, first_gene).tobytes()

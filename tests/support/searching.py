@@ -21,9 +21,8 @@ def leader(search):
 
 
 def state_of(search):
-    """All that a search, or a run with one, saves, to be compared."""
-    arrays, numbers = search.state()
-    return {name: array.tobytes() for name, array in arrays.items()}, numbers
+    """All that a search saves, to be compared."""
+    return {name: array.tobytes() for name, array in search.state().items()}
 
 
 def first_gene(genomes):
