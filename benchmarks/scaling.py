@@ -118,7 +118,7 @@ def last_generations(
     # Before the measurement MLflow's run is opened, and all workers are put to work and sent nearly all maps.
     this.tracker.wait_ready()
     restore()
-    coming = [curriculum.episodes(learning.generation + k) for k in range(LAST + 1)]
+    coming = [curriculum.episodes(learning.steps + k) for k in range(LAST + 1)]
     for episodes in (curriculum.validation(), *coming):
         while len(learning.drive("warm", nobody, episodes, curriculum.goal_limits()).busy_s) < workers:
             pass

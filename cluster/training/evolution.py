@@ -66,25 +66,20 @@ class Evolution(Learning):
 
     # ------------------------------------------------------------------------------------------------ a generation
 
-    @property
-    def generation(self) -> int:
-        """Generations that are done."""
-        return self.search.generation
-
     def step(self) -> dict[str, float]:
         """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
         curriculum, limits, period = self.curriculum, self.curriculum.limits(), self.sim.episode.control_period
         leader = self.search.leader()
         candidate = leader if self._promising() else None
-        asked, episodes = self.search.ask(), curriculum.episodes(self.generation)
+        asked, episodes = self.search.ask(), curriculum.episodes(self.steps)
         n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
         goals = targets(episodes.rows, limits)[:e]  # the same in each group
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
-        self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.generation + AHEAD)])
+        self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.steps + AHEAD)])
 
         call = _Call(asked, episodes, list(groups))
         if leader is not None:
-            followed = curriculum.leader_episodes(self.generation)
+            followed = curriculum.leader_episodes(self.steps)
             leading = call.add(leader, followed)
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
@@ -92,7 +87,7 @@ class Evolution(Learning):
         check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
-        curriculum.learn_from_members(self.generation, [driven.results[part] for part in groups])
+        curriculum.learn_from_members(self.steps, [driven.results[part] for part in groups])
 
         if leader is None:  # in the first generation, the best member takes its place
             best = int(score.argmax())
@@ -106,7 +101,7 @@ class Evolution(Learning):
             curriculum.learn_from_leader(followed, led, driven.rewound[columns], driven.worlds[columns])
         self.search.tell(score)
         if candidate is not None and not driven.lost[trial.rows][0]:
-            self._judge(candidate, driven.results[trial], self.generation - 2)
+            self._judge(candidate, driven.results[trial], self.steps - 1)
         if self.champion is not None:
             self.search.keep_champion(self.champion.genome)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
@@ -145,17 +140,17 @@ class Evolution(Learning):
     # ------------------------------------------------------------------------------------------------------- state
 
     def counts(self) -> dict[str, int]:
-        return {"generation": self.generation, "car_steps": self.car_steps}
+        return {"generation": self.steps, "car_steps": self.car_steps}
 
     def progress(self) -> tuple[float, float, str]:
         s = self.settings
         if s.car_steps and not s.generations:
             return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
-        return self.generation, s.generations, "generations"
+        return self.steps, s.generations, "generations"
 
     def describe(self, row: dict[str, float]) -> str:
-        plural = "" if self.generation == 1 else "s"
-        done = f"{self.generation} generation{plural}  " if self.progress()[2] != "generations" else ""
+        plural = "" if self.steps == 1 else "s"
+        done = f"{self.steps} generation{plural}  " if self.progress()[2] != "generations" else ""
         return (
             f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
             f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"

@@ -73,7 +73,7 @@ class Actor:
 
 
 class Shared:
-    """The coordinator's end: the maps in the object store, those of the latest task's scenario.
+    """The coordinator's end: the latest task, and the maps of its scenario in the object store.
 
     Args:
         put: puts something into the store; returns its reference.
@@ -83,12 +83,11 @@ class Shared:
     def __init__(self, put: Callable[[Any], Any], build_map: BuildMap):
         self._put, self._build_map = put, build_map
         self._maps: dict[Name, Any] = {}  # references
+        self._names: tuple[Name, ...] = ()  # of the latest task's maps
+        self._task: Any = None  # the latest one, pickled, or a reference to that
 
-    def put(self, task: AnyTask) -> tuple[Any, int]:
-        """Put a task, unless it is small, and those of its maps that are not there yet.
-
-        Returns: the pickled task or its reference, and the bytes of all arrays.
-        """
+    def put(self, task: AnyTask) -> int:
+        """Put a task, unless it is small, and those of its maps that are new. Returns: the bytes of all arrays."""
         sent = sum(value.nbytes for value in vars(task).values() if isinstance(value, np.ndarray))
         scenarios = {scenario for scenario, _ in task.maps}
         self._maps = {name: ref for name, ref in self._maps.items() if name[0] in scenarios}
@@ -98,16 +97,17 @@ class Shared:
                 self._maps[name] = self._put(arrays)
                 sent += sum(array.nbytes for array in arrays.values())
         data = pickle.dumps(task, protocol=5)
-        return data if len(data) <= INLINE else self._put(data), sent
+        self._names, self._task = task.maps, data if len(data) <= INLINE else self._put(data)
+        return sent
 
-    def update(self, known: set[Name], task: AnyTask, shared: Any) -> list[Any]:
-        """What an actor with the maps `known` needs to take up a task; `known` is updated to what it then has.
+    def update(self, known: set[Name]) -> list[Any]:
+        """What an actor with the maps `known` needs to take up the task; `known` is updated to what it then has.
 
-        Returns: the names of the maps that it lacks, those to forget, the task as `put` returned it, and references to
+        Returns: the names of the maps that it lacks, those to forget, the task or a reference to it, and references to
         the maps.
         """
         gone = [name for name in known if name not in self._maps]  # the store keeps what an actor holds
-        lacking = [name for name in dict.fromkeys(task.maps) if name not in known]
+        lacking = [name for name in dict.fromkeys(self._names) if name not in known]
         known.difference_update(gone)
         known.update(lacking)
-        return [lacking, gone, shared, *(self._maps[name] for name in lacking)]
+        return [lacking, gone, self._task, *(self._maps[name] for name in lacking)]

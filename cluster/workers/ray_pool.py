@@ -69,15 +69,6 @@ class _Slot:
         return self.hello or (self.sent[0][1] if self.sent else None)
 
 
-@dataclass
-class _Job:
-    """One call while it is being done."""
-
-    call: Call
-    dispatch: Dispatch
-    shared: Any  # the task as workers get it
-
-
 _Kind = tuple[type, Limits, bool]
 
 
@@ -144,30 +135,29 @@ class RayPool(WorkerPool):
         task = call.task
         metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in call.asked]
         shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
-        dispatch = Dispatch(cut(task, call.asked, shares, metre_s))
+        self._call, self._dispatch = call, Dispatch(cut(task, call.asked, shares, metre_s))
         self._serial += 1
-        shared, call.broadcast_bytes = self._shared.put(task)
-        job = _Job(call, dispatch, shared)
+        call.broadcast_bytes = self._shared.put(task)
         alone_since = time.monotonic()
 
-        while not dispatch.finished():
+        while not self._dispatch.finished():
             now = time.monotonic()
             for slot in self._slots:
                 silent_s = now - slot.heard if slot.pid and slot.due else 0.0
                 if silent_s > self._patience_s and not self._ready([slot.due], 0.0):
                     silence = f"did not answer for {silent_s:.0f} s"
                     call.warnings.append(f"a worker {silence} (--patience) and is replaced")
-                    self._bury(slot, job, f"it {silence}")
+                    self._bury(slot, f"it {silence}")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.due]
-            for number, parcel in dispatch.give(idle):
-                self._send(self._slots[number], parcel, job)
+            for number, parcel in self._dispatch.give(idle):
+                self._send(self._slots[number], parcel)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
             waiting = {slot.due: slot for slot in self._slots if slot.due}
             for ref in self._ready(list(waiting), 0.0 if meanwhile and self.pids() else 1.0):
                 if waiting[ref].hello:
-                    self._greet(waiting[ref], job)
-                elif self._receive(waiting[ref], job) and on_progress:
+                    self._greet(waiting[ref])
+                elif self._receive(waiting[ref]) and on_progress:
                     on_progress(*call.progress())
             if self.pids():
                 alone_since = time.monotonic()
@@ -198,25 +188,25 @@ class RayPool(WorkerPool):
             ready, _ = ray.wait(refs, num_returns=1, timeout=timeout_s)
         return ready
 
-    def _send(self, slot: _Slot, parcel: int, job: _Job) -> None:
+    def _send(self, slot: _Slot, parcel: int) -> None:
         work: list[Work] = []
-        for chunk in job.dispatch.parcels[parcel]:
-            recipes, first, stop = job.call.work(chunk)
+        for chunk in self._dispatch.parcels[parcel]:
+            recipes, first, stop = self._call.work(chunk)
             work.append((recipes.tobytes(), first, stop))
-            job.call.bytes_down += recipes.nbytes
+            self._call.bytes_down += recipes.nbytes
         if not slot.sent:
             slot.heard = time.monotonic()
-        answer = slot.actor.run.remote(work, *self._update(slot, job))
+        answer = slot.actor.run.remote(work, *self._update(slot))
         slot.sent.append((self._serial, answer))
 
-    def _update(self, slot: _Slot, job: _Job) -> list[Any]:
+    def _update(self, slot: _Slot) -> list[Any]:
         """What a worker still has to be sent of the task."""
         if slot.serial == self._serial:
             return []
         slot.serial = self._serial
-        return self._shared.update(slot.maps, job.call.task, job.shared)
+        return self._shared.update(slot.maps)
 
-    def _receive(self, slot: _Slot, job: _Job) -> bool:
+    def _receive(self, slot: _Slot) -> bool:
         """Take in a worker's oldest answer, or its death. Returns whether there is progress."""
         import ray
 
@@ -226,25 +216,25 @@ class RayPool(WorkerPool):
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
             if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
-                return self._bury(slot, job, ray_session.reason(cause), ray_session.is_to_blame(cause))
+                return self._bury(slot, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
-                at = job.dispatch.at(slot.number)
-                what = job.call.describe(at, job.dispatch.parcels[at])
+                at = self._dispatch.at(slot.number)
+                what = self._call.describe(at, self._dispatch.parcels[at])
                 raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
         except ray.exceptions.RayError as error:
-            return self._bury(slot, job, ray_session.reason(error), ray_session.is_to_blame(error))
+            return self._bury(slot, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
-        parcel = job.dispatch.answered(slot.number) if serial == self._serial else None  # else from an interrupted call
+        parcel = self._dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
         if parcel is not None:
-            for chunk, found in zip(job.dispatch.parcels[parcel], pickle.loads(answer), strict=True):
-                job.call.add(slot.number, chunk, *found)
-            job.call.bytes_up += len(answer)
+            for chunk, found in zip(self._dispatch.parcels[parcel], pickle.loads(answer), strict=True):
+                self._call.add(slot.number, chunk, *found)
+            self._call.bytes_up += len(answer)
         return parcel is not None
 
-    def _bury(self, slot: _Slot, job: _Job, reason: str, blamed: bool = True) -> bool:
+    def _bury(self, slot: _Slot, reason: str, blamed: bool = True) -> bool:
         """Replace a worker, and have what it held sent again. Returns whether anything is lost."""
-        dispatch, call = job.dispatch, job.call
+        dispatch, call = self._dispatch, self._call
         lost = [chunk for parcel in dispatch.died(slot.number, blamed) for chunk in dispatch.parcels[parcel]]
         call.retries = dispatch.retries
         for part in lost:
@@ -324,7 +314,7 @@ class RayPool(WorkerPool):
         ray.kill(slot.actor)  # it may be alive and merely out of reach
         self._slots[slot.number] = self._start(slot.number)
 
-    def _greet(self, slot: _Slot, job: _Job) -> None:
+    def _greet(self, slot: _Slot) -> None:
         """Take in a `hello`: a worker is up and is to be prepared, or it is prepared, or it could not start."""
         import ray
 
@@ -334,15 +324,14 @@ class RayPool(WorkerPool):
         except ray.exceptions.RayError as error:
             reason, blamed = ray_session.reason(error), ray_session.is_to_blame(error)
             if preparing:  # it has no parcel yet, and so no member is blamed
-                self._bury(slot, job, reason, blamed)
+                self._bury(slot, reason, blamed)
                 return
-            if not blamed:
-                return self._replace(slot)
-            if ray_session.failed_as_it_began(error) and not self.pids():
-                raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
-            self._last_failure = f"; the last one: {reason}{self._logs}"
+            if blamed:
+                if ray_session.failed_as_it_began(error) and not self.pids():
+                    raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
+                self._last_failure = f"; the last one: {reason}{self._logs}"
             self._replace(slot)
         else:
             self._last_failure = ""
             slot.heard = time.monotonic()
-            slot.hello = None if preparing else slot.actor.prepare.remote(*self._update(slot, job))
+            slot.hello = None if preparing else slot.actor.prepare.remote(*self._update(slot))

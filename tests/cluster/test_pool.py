@@ -353,10 +353,10 @@ def test_the_store_keeps_one_scenarios_maps_and_a_worker_gets_each_once() -> Non
     ):
         task = make_task(tuple((scenario, seed) for seed in seeds))
         before = len(built)
-        ref, sent = shared.put(task)
+        sent = shared.put(task)
         assert built[before:] == new
         assert sent >> 20 == len(new)
-        lacking, forgotten, *refs = shared.update(known, task, ref)
+        lacking, forgotten, *refs = shared.update(known)
         assert [seed for _, seed in lacking] == new
         assert sorted(seed for _, seed in forgotten) == gone
         assert len(refs) == 1 + len(new)
