@@ -51,11 +51,14 @@ class Dqn(Learning):
     columns: ClassVar[tuple[str, ...]] = COLUMNS
     step_name: ClassVar[str] = "evaluation"
     verb: ClassVar[str] = "training"
+    kept: ClassVar[tuple[str, ...]] = (*Learning.kept, "batches", "episodes", "calm", "owed", "mean_steps")
 
     settings: DqnSettings
     batches: int = 0
     episodes: int = 0
     calm: int = 0  # evaluations in a row with little change of the Q values
+    owed: float = 0.0  # updates that the last batch still requires
+    mean_steps: float = 32.0  # of the last batch's episodes
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,8 +73,6 @@ class Dqn(Learning):
             self.learner.load_weights(self.initial)
         self.probe = np.zeros((0, self.spec.inputs), dtype=np.float32)
         self.probe_q = np.zeros((0, self.spec.outputs), dtype=np.float32)
-        self._owed = 0.0  # updates that the last batch still requires
-        self._mean_steps = 32.0  # of the last batch's episodes
 
     def step(self) -> dict[str, float]:
         """Train until the next evaluation is due, and evaluate. Returns its row of the history (COLUMNS)."""
@@ -109,7 +110,7 @@ class Dqn(Learning):
         Returns: RESULT [episodes] and the sum of their rewards, without episodes that killed their workers.
         """
         s, k = self.settings, self.batches
-        n = int(np.clip(BATCH_STEPS / self._mean_steps, *EPISODES))
+        n = int(np.clip(BATCH_STEPS / self.mean_steps, *EPISODES))
         episodes = self.curriculum.starts(k, n)
         self.maps.ahead(self.curriculum.map_seeds[: k + 8])
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
@@ -122,8 +123,8 @@ class Dqn(Learning):
         self.replay.add(brought.experience)
         results = brought.results[~brought.lost, 0]
         steps = int(results["steps"].sum())
-        self._owed += steps * s.updates / 1000.0
-        self._mean_steps = steps / len(results)
+        self.owed += steps * s.updates / 1000.0
+        self.mean_steps = steps / len(results)
         self.car_steps += steps
         self.episodes += len(results)
         self.batches += 1
@@ -140,12 +141,12 @@ class Dqn(Learning):
         """Make some of the updates that the batches so far require. Returns whether any are left."""
         self.meanwhile()
         if len(self.replay) < min(WARM_UP, self.replay.capacity):
-            self._owed = 0.0
-        n = min(int(self._owed), SLICE)
+            self.owed = 0.0
+        n = min(int(self.owed), SLICE)
         if n:
             self._losses.append((n, *self.learner.train(self.replay, n)))
-            self._owed -= n
-        return self._owed >= 1.0
+            self.owed -= n
+        return self.owed >= 1.0
 
     def candidate(self) -> np.ndarray | None:
         return self.tried  # each evaluation tries its network
@@ -216,12 +217,6 @@ class Dqn(Learning):
         arrays |= {f"learner_{name}": array for name, array in self.learner.state().items()}
         arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
         arrays |= {"probe": self.probe, "probe_q": self.probe_q}
-        meta |= {
-            "batches": self.batches,
-            "calm": self.calm,
-            "owed": self._owed,
-            "mean_steps": self._mean_steps,
-        }
         return arrays, meta
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
@@ -230,8 +225,6 @@ class Dqn(Learning):
         if "replay_added" in arrays:  # an ended run saves none; if it is extended, it fills a new one before it learns
             self.replay.restore(named(arrays, "replay_"))
         self.probe, self.probe_q = arrays["probe"], arrays["probe_q"]
-        self.batches, self.episodes, self.calm = meta["batches"], meta["episodes"], meta["calm"]
-        self._owed, self._mean_steps = meta["owed"], meta["mean_steps"]
 
 
 def _finite(numbers: np.ndarray, updates: int) -> np.ndarray:

@@ -115,6 +115,7 @@ class Learning(ABC):
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number, and their names in MLflow
     step_name: ClassVar[str]  # what a step is called
     verb: ClassVar[str]  # what is done to a network
+    kept: ClassVar[tuple[str, ...]] = ("solved", "car_steps", "validation_steps", "lost_chunks")  # in checkpoints
     save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved as the next step begins, which changes it
 
     settings: RunSettings
@@ -266,9 +267,7 @@ class Learning(ABC):
             "champion": champion.genome if champion else none,
         }
         meta: dict[str, Any] = {
-            "solved": self.solved,
-            "lost_chunks": self.lost_chunks,
-            "validation_steps": self.validation_steps,
+            **{name: getattr(self, name) for name in self.kept},
             **self.counts(),
             "columns": list(self.columns),  # of the history, which is also read without its learner
             "champion": champion and [champion.score, champion.success_rate, champion.distance_m, champion.step],
@@ -277,8 +276,8 @@ class Learning(ABC):
 
     def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
         """Continue from a `state` of the same settings; its checksum and digest were verified."""
-        self.car_steps, self.solved = meta["car_steps"], meta["solved"]
-        self.lost_chunks, self.validation_steps = meta["lost_chunks"], meta["validation_steps"]
+        for name in self.kept:
+            setattr(self, name, meta[name])
         self.history = [dict(zip(self.columns, row, strict=True)) for row in arrays["history"].tolist()]
         self.elites, self._lines = {}, []
         self.tried = arrays["tried"] if arrays["tried"].size else None

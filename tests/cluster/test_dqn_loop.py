@@ -162,7 +162,7 @@ def test_lost_episodes_are_in_no_replay_and_in_no_mean(loop, maps):
     assert (results["steps"] > 0).all()
     assert learning.replay.added == learning.car_steps + len(results)
     assert learning.episodes == len(results)
-    assert learning._mean_steps == learning.car_steps / len(results)
+    assert learning.mean_steps == learning.car_steps / len(results)
     assert np.isfinite(rewards)
     learning.pool.one_in = 1
     with pytest.raises(PoolError, match=r"^collect: nothing is left, all \d+ that were tried killed their workers"):
