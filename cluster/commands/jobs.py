@@ -159,7 +159,7 @@ def _at_once(cells: deque[Cell], how: How, number: int, tell: Tell) -> None:
 def _compile(cells: Iterable[Cell], tell: Tell) -> None:
     """Compile the runs' kernels, once for all processes."""
     for cell in cells:
-        warming = kernels.begin(cell.settings)
+        warming = kernels.Warming(cell.settings)
         try:
             if warming.processes:
                 tell(cell, "note", ("compiling the simulator for this machine, once", ""))

@@ -129,7 +129,7 @@ def train(
     status: Status = "KILLED"
     session: Session | None = None
     maps = Maps(settings.scenario, SimConfig())
-    warming = kernels.begin(settings)
+    warming = kernels.Warming(settings)
     try:
         session = Session(
             run, workers.open(maps), maps, uri, experiment, reporter, now() if started is None else started, initial,

@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import get_args
 
@@ -35,35 +34,14 @@ from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.traffic.world import spawn
 
-STEPS = 1  # of the episodes that are driven only to compile kernels
 
-
-@dataclass
 class Warming:
-    """Processes that compile, and the file that marks what they compile as done."""
+    """Processes that compile what a run needs, if it is not in the cache."""
 
-    done: Path
-    processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
-
-    def wait(self) -> None:
-        """Wait for what a run needs first. If a process fails, this one compiles its part when it is needed."""
-        if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
-            self.done.touch()
-
-    def stop(self) -> None:
-        """End what still runs."""
-        for process in self.processes:
-            process.kill()
-            process.communicate()
-        self.processes.clear()
-
-
-def begin(settings: RunSettings) -> Warming:
-    """Begin to compile what such a run needs, if it is not in the cache."""
-    warming = Warming(_marker(settings))
-    if not warming.done.exists():
+    def __init__(self, settings: RunSettings):
+        self._done = _marker(settings)
         what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
-        warming.processes += [
+        self.processes = [
             subprocess.Popen(
                 [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],  # -P: not from this folder
                 stdin=subprocess.DEVNULL,
@@ -71,9 +49,19 @@ def begin(settings: RunSettings) -> Warming:
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C does not reach it: `stop` ends it
             )
-            for part in ("kernels", "roads")
+            for part in (() if self._done.exists() else ("kernels", "roads"))
         ]
-    return warming
+
+    def wait(self) -> None:
+        """Wait for what the run needs first. If a process fails, this one compiles its part when it is needed."""
+        if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
+            self._done.touch()
+
+    def stop(self) -> None:
+        """End what still runs."""
+        for process in self.processes:
+            process.kill()
+            process.communicate()
 
 
 def _marker(settings: RunSettings) -> Path:
@@ -91,7 +79,7 @@ def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np
     config, genome = SimConfig(), np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)
     road, episodes = blank(config), np.zeros(1, dtype=EPISODE)
     worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config)
-    return config, road, genome, episodes, worlds, Limits(1.0, STEPS)
+    return config, road, genome, episodes, worlds, Limits(1.0, 1)
 
 
 def compile_kernels(policy: str, traffic: int, command: str) -> None:
