@@ -148,10 +148,8 @@ class Curriculum:
         """Indices of a generation's crash starts, group by group: likeliest where half of the members failed."""
         count = self.config.groups * self.config.crash_starts
         weights = np.maximum(4.0 * self.failures * (1.0 - self.failures), LEAST_CRASH_WEIGHT)
-        chosen = self._rng(generation, 1).choice(
-            len(weights), count, replace=count > len(weights), p=weights / weights.sum()
-        )
-        return chosen.astype(np.intp)
+        rng, shares = self._rng(generation, 1), weights / weights.sum()
+        return rng.choice(len(weights), count, replace=count > len(weights), p=shares)
 
     def learn_from_members(self, generation: int, results: Sequence[np.ndarray]) -> None:
         """Learn how hard the crash starts of a generation's `episodes` are, from each group's RESULT [members, e]."""

@@ -48,13 +48,11 @@ def lane_starts(
     """
     episodes, worlds = np.zeros(len(maps), dtype=EPISODE), np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
     episodes["map"] = maps
-    for m in np.unique(maps):
-        of = np.flatnonzero(episodes["map"] == m)
-        episodes["start"][of] = sample_starts(road_maps[m], len(of), rng)
+    on_each = [(road_maps[m], np.flatnonzero(maps == m)) for m in np.unique(maps)]
+    for road_map, of in on_each:
+        episodes["start"][of] = sample_starts(road_map, len(of), rng)
     if traffic:
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
-        for m in np.unique(maps):
-            of = np.flatnonzero(episodes["map"] == m)
-            starts = episodes["start"][of]
-            worlds[of] = spawn(road_maps[m].network, starts, traffic, keys[of], config or SimConfig())
+        for road_map, of in on_each:
+            worlds[of] = spawn(road_map.network, episodes["start"][of], traffic, keys[of], config or SimConfig())
     return episodes, worlds
