@@ -17,7 +17,7 @@ import numpy as np
 from cluster.runs.settings import DqnSettings
 from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
 from cluster.workers.worker import CollectTask
-from evolution.dqn.learner import DqnConfig, DqnLearner, diverged
+from evolution.dqn.learner import DqnConfig, DqnLearner, finite
 from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import Limits
@@ -114,7 +114,7 @@ class Dqn(Learning):
         episodes = self.curriculum.starts(k, n)
         self.maps.ahead(self.curriculum.map_seeds[: k + 8])
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
-        weights = _finite(self.learner.weights, self.learner.updates)
+        weights = finite(self.learner.weights, self.learner.updates)
         limits = Limits(self.curriculum.goal, EPISODE_STEPS)
         task = self._task(CollectTask, episodes, limits, weights=weights, epsilons=self._epsilons(n), keys=keys)
         brought = self.pool.collect(task, partial(self.on_progress, "collect"), self._train)
@@ -153,7 +153,7 @@ class Dqn(Learning):
 
     def _evaluate_network(self) -> dict[str, float]:
         """Validate the averaged network. Returns its figures."""
-        network = _finite(self.learner.average, self.learner.updates)
+        network = finite(self.learner.average, self.learner.updates)
         self.elites[self.steps] = network
         driven = self.drive(
             "validate", network[None], self.curriculum.validation(), self.curriculum.goal_limits(), self._train
@@ -177,8 +177,8 @@ class Dqn(Learning):
             key = int(np.random.SeedSequence([self.settings.seed, 15]).generate_state(1, np.uint64)[0])
             self.probe = self.replay.sample(key, PROBE[self.spec.observation]).observations
         before, self.probe_q = self.probe_q, self.learner.q_values(self.probe)
-        _finite(self.learner.weights, self.learner.updates)
-        _finite(self.probe_q, self.learner.updates)
+        finite(self.learner.weights, self.learner.updates)
+        finite(self.probe_q, self.learner.updates)
         change = 1.0
         if len(before):
             q = self.probe_q.astype(np.float64)  # squares of large values are beyond float32
@@ -225,10 +225,3 @@ class Dqn(Learning):
         if "replay_added" in arrays:  # an ended run saves none; if it is extended, it fills a new one before it learns
             self.replay.restore(named(arrays, "replay_"))
         self.probe, self.probe_q = arrays["probe"], arrays["probe_q"]
-
-
-def _finite(numbers: np.ndarray, updates: int) -> np.ndarray:
-    """Weights or values, unchanged. Raises: FloatingPointError, with a one-line message, if they are not finite."""
-    if not np.isfinite(numbers).all():
-        raise diverged(updates)
-    return numbers

@@ -22,7 +22,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from evolution.networks.export import layers_of, outputs
 from evolution.networks.policy import PolicySpec, squash
 from gridsim.jit import njit
 
+T = TypeVar("T", np.ndarray, float)
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 # PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step.
 _adam = partial(adam, fused=True, amsgrad=False, beta1=0.9, beta2=0.999, weight_decay=0.0, maximize=False)
@@ -60,9 +61,11 @@ class DqnConfig:
         return self.learning_rate * (1.0 + (self.final_learning_rate - 1.0) * share)
 
 
-def diverged(update: int) -> FloatingPointError:
-    """The error for a network whose loss is no longer finite."""
-    return FloatingPointError(f"the Q network diverged at update {update}: try a lower learning rate")
+def finite(numbers: T, update: int) -> T:
+    """Weights, values or a loss, unchanged. Raises: FloatingPointError with one line if they are not finite."""
+    if not np.isfinite(numbers).all():
+        raise FloatingPointError(f"the Q network diverged at update {update}: try a lower learning rate")
+    return numbers
 
 
 def device_of(name: str) -> torch.device:
@@ -207,8 +210,7 @@ class DqnLearner:
         Raises: FloatingPointError with one line if the network has diverged.
         """
         loss, q = self.loss(batch)
-        if not math.isfinite(loss.item()):
-            raise diverged(self.updates)
+        finite(loss.item(), self.updates)
         gradients = torch.autograd.grad(loss, self._leaves)
         torch.cat([gradient.flatten() for gradient in gradients], out=self._gradient)
         norm = torch.linalg.vector_norm(self._gradient)
