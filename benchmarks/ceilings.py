@@ -53,7 +53,7 @@ SEED = 7  # of the sleeping workers' naps
 class InstantWorker(Worker):
     """Answers at once: most episodes succeed, the others end on the way; those that crash do so where they started."""
 
-    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         goals = targets(task.episodes, task.limits)
         mark = 2 * recipes["seed"].astype(np.int64) + (recipes["kind"] == Kind.MIRRORED)
@@ -66,17 +66,16 @@ class InstantWorker(Worker):
         rewound, worlds = (
             np.repeat(states[back][None], len(recipes), axis=0) for states in (task.episodes["start"], task.worlds)
         )
-        return results, rewound, worlds, 0.0
+        return results, rewound, worlds
 
 
 class SleepingWorker(InstantWorker):
     """Sleeps instead of evaluating, for as long as `naps` gives for a member's seed and an episode's mark."""
 
-    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        started = time.perf_counter()
+    def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         columns = task.episodes["start"][:, 4].astype(int)
         time.sleep(float(naps()[np.ix_(recipes["seed"], columns)].sum()))
-        return *super().evaluate(task, maps, recipes)[:3], time.perf_counter() - started
+        return super().evaluate(task, maps, recipes)
 
 
 class Watched(RayPool):

@@ -87,31 +87,30 @@ class Worker:
     def answer(self, task: AnyTask, maps: Sequence[Map], recipes: np.ndarray, first: int, stop: int) -> tuple[Any, ...]:
         """Do a chunk: recipes RECIPE [n] of a `Task`, and the task's episodes from `first` to before `stop`.
 
-        Returns: what `evaluate` or `collect` does.
+        Returns: what `evaluate` or `collect` does, and the seconds it took (for statistics only).
         """
+        started = time.perf_counter()
+        found: tuple[Any, ...]
         if isinstance(task, CollectTask):
-            return self.collect(task, maps, first, stop)
-        if stop - first < len(task.episodes):
-            task = replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
-        return self.evaluate(task, maps, freeze(recipes))
+            found = self.collect(task, maps, first, stop)
+        else:
+            if stop - first < len(task.episodes):
+                task = replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
+            found = self.evaluate(task, maps, freeze(recipes))
+        return *found, time.perf_counter() - started
 
     def evaluate(
         self, task: Task, maps: Sequence[Map], recipes: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-        """What `rollout.evaluate` returns for recipes RECIPE [n], and the seconds it took (for statistics only)."""
-        started = time.perf_counter()
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What `rollout.evaluate` returns for recipes RECIPE [n]."""
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
-        found = evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.worlds)
-        return *found, time.perf_counter() - started
+        return evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.worlds)
 
-    def collect(
-        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
-    ) -> tuple[Experience, np.ndarray, float]:
-        """Experience and RESULT [stop - first] of the task's episodes from `first` on, and the seconds it took."""
-        started = time.perf_counter()
+    def collect(self, task: CollectTask, maps: Sequence[Map], first: int, stop: int) -> tuple[Experience, np.ndarray]:
+        """Experience and RESULT [stop - first] of the task's episodes from `first` on."""
         these = slice(first, stop)
-        experience, results = collect(
+        return collect(
             PolicySpec.parse(task.policy),
             task.weights,
             maps,
@@ -122,4 +121,3 @@ class Worker:
             task.config,
             task.worlds[these],
         )
-        return experience, results, time.perf_counter() - started

@@ -141,7 +141,7 @@ class Losing(SerialPool):
         for k in range(len(task.episodes)):
             chunk = Chunk(slice(k, k + 1), slice(0, 1))
             if k % self.one_in:
-                collected.add(0, chunk, *worker.collect(task, maps, k, k + 1))
+                collected.add(0, chunk, *worker.answer(task, maps, collected.recipes, k, k + 1))
             else:
                 collected.lose(chunk)
                 collected.warnings.append(f"episode {k} is lost")

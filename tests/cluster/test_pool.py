@@ -3,7 +3,6 @@
 import dataclasses
 import pickle
 import re
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,14 +39,13 @@ from gridsim.maps.scenarios import build
 from gridsim.traffic.world import FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
-Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray, float]  # what `Worker.evaluate` returns
+Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray]  # what `Worker.evaluate` returns
 
 
 class Answering(Worker):
     """A stand-in that answers at once: each result is a function of the recipe and the episode."""
 
     def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
-        started = time.perf_counter()
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         results["distance"] = recipes["seed"][:, None] * 16.0 + task.episodes["start"][:, 4]
         results["paced"] = task.parents[recipes["a"], 0][:, None]
@@ -55,20 +53,17 @@ class Answering(Worker):
         back = task.episodes["start"][task.episodes["rewind"] > 0]
         rewound = np.repeat(back[None], len(recipes), axis=0)
         worlds = np.repeat(task.worlds[task.episodes["rewind"] > 0][None], len(recipes), axis=0)
-        return results, rewound, worlds, time.perf_counter() - started
+        return results, rewound, worlds
 
-    def collect(
-        self, task: CollectTask, maps: Sequence[Map], first: int, stop: int
-    ) -> tuple[Experience, np.ndarray, float]:
+    def collect(self, task: CollectTask, maps: Sequence[Map], first: int, stop: int) -> tuple[Experience, np.ndarray]:
         """Episodes of key % 5 steps whose rows are all marked by their keys."""
-        started = time.perf_counter()
         keys = task.keys[first:stop]
         results = np.zeros(len(keys), dtype=RESULT)
         results["steps"] = keys % 5
         row = np.repeat(keys, results["steps"] + 1)
         observations = np.repeat(row[:, None], PolicySpec.parse(task.policy).inputs, axis=1).astype(np.int16)
         experience = Experience(observations, row.astype(np.uint8), row.astype(np.float32), row.astype(np.uint8))
-        return experience, results, time.perf_counter() - started
+        return experience, results
 
 
 class Failing(Answering):
@@ -277,7 +272,8 @@ def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
     task_of_10 = make_collect_task(10)
     collected = Collected(task_of_10)
     for first, stop in ((4, 10), (0, 3)):
-        collected.add(0, Chunk(slice(first, stop), slice(0, 1)), *Answering().collect(task_of_10, [], first, stop))
+        answer = Answering().answer(task_of_10, [], make_recipes(0), first, stop)
+        collected.add(0, Chunk(slice(first, stop), slice(0, 1)), *answer)
     collected.lose(Chunk(slice(3, 4), slice(0, 1)))
     assert collected.done == collected.total
     assert np.flatnonzero(collected.lost).tolist() == [3]
@@ -318,13 +314,13 @@ def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
     for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (30, Kind.MIRRORED), (35, Kind.COPY)):
         recipes["kind"][first : first + 5] = kind
     outcome = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes)
-    whole, rewound, _, seconds = Worker().evaluate(task, maps, recipes)
+    whole, rewound, _ = Worker().evaluate(task, maps, recipes)
     assert outcome.results.tobytes() == whole.tobytes()
     for i, e in np.ndindex(whole.shape):
-        alone, back, _, _ = Worker().answer(task, maps, recipes[i : i + 1], e, e + 1)
+        alone, back, _, seconds = Worker().answer(task, maps, recipes[i : i + 1], e, e + 1)
         assert (alone.tobytes(), back.tobytes()) == (whole[i, e].tobytes(), rewound[i, e].tobytes())
+        assert seconds > 0
     assert whole["distance"].max() > 0
-    assert seconds > 0
 
 
 # --- Both ends of what is sent to an actor, joined without Ray --------------------------------------------------------

@@ -70,7 +70,7 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     recipes = np.zeros(3, dtype=RECIPE)
     names = tuple((scenario.name, scenario.seed) for scenario in maps)
     task = Task("mlp:6,7", episodes.copy(), worlds.copy(), names, AMONG, CONFIG, genome[None].copy(), 0, Mutation())
-    shared, _, _, _ = Worker().evaluate(task, maps, recipes)
+    shared, _, _ = Worker().evaluate(task, maps, recipes)
     assert all(row.tobytes() == results[0].tobytes() for row in shared)
 
     wheel = Wheel(spec, genome)
