@@ -35,7 +35,7 @@ from cluster.commands.common import (
 )
 from cluster.commands.entry import STARTED
 from cluster.commands.progress import Progress
-from cluster.comparison.errors import series
+from cluster.comparison.results import series
 from cluster.report.pictures import errors_table, held_out_table
 from cluster.runs.champion import evaluate, load_champion
 from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError

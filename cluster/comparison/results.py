@@ -1,7 +1,8 @@
-"""Finished training runs as a comparison reads them: their settings, how well they drove, and their errors."""
+"""Finished training runs as a comparison reads them: settings, figures, and errors against the reference driver."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -10,15 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from cluster.comparison.errors import series
-from cluster.runs.champion import load_champion
+from cluster.runs.champion import Champion, held_out, load_champion
 from cluster.runs.checkpoint import CHAMPION
 from cluster.runs.run import CONFIG, SUMMARY, read_config
 from cluster.runs.settings import RunSettings
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
+from evolution.episodes.rollout import Limits, trajectory
+from evolution.networks.policy import PolicySpec
 from gridsim.config import VehicleConfig
 from gridsim.errors import GridSimError
-from gridsim.reference.errors import errors
+from gridsim.maps.scenarios import HELD_OUT_SEED
+from gridsim.reference.errors import Series, error_series, errors
+from gridsim.view.drive import poses_of
 
 Learner = Literal["evolution", "two-parents", "dqn", "random"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
@@ -87,6 +91,31 @@ def read_run(folder: Path) -> Run:
 def measured(run: Run) -> Run:
     """A run with its errors. Raises ExperimentError."""
     return dataclasses.replace(run, figures={**run.figures, **errors_of(run)})
+
+
+def series(
+    champion: Champion,
+    scenario: str | None = None,
+    episodes: int = 64,
+    seed: int = HELD_OUT_SEED,
+    traffic: int | None = None,
+) -> list[Series]:
+    """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference.errors`.
+
+    Episodes in which it does not drive a metre forward are left out.
+
+    Args and errors: as for `champion.evaluate`.
+    """
+    chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
+    sim, spec = champion.sim, PolicySpec.parse(champion.policy)
+    limits = Limits(sim.episode.target, sim.episode.steps)
+    found = []
+    for row, world in zip(chosen.rows, chosen.worlds, strict=True):
+        road = roads[row["map"]]
+        _, states, _ = trajectory(spec, champion.genome, road, row["start"], limits, sim, world)
+        with contextlib.suppress(ValueError):  # not a metre forward
+            found.append(error_series(poses_of(states), road, sim.vehicle))
+    return [part for part in found if len(part.arc) > 1]
 
 
 def errors_of(run: Run) -> dict[str, float]:

@@ -20,7 +20,7 @@ from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
 from cluster.runs.run import read_config
 from cluster.runs.settings import MAX_TRAFFIC, EvolveSettings
-from cluster.training.trainer import Maps, summarise
+from cluster.training.trainer import summarise
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
 from evolution.episodes.rollout import Limits
 from evolution.episodes.rollout import evaluate as roll_out
@@ -29,7 +29,8 @@ from evolution.networks import convnet
 from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
 from gridsim.errors import GridSimError
-from gridsim.maps.scenarios import HELD_OUT_SEED, check_name, default_traffic
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import HELD_OUT_SEED, build, check_name, default_traffic
 
 GONE = ("apart", "kerb")  # former parameters of traffic, which older champions hold
 
@@ -178,28 +179,27 @@ def evaluate(
     road (default: as many as it learned among, or as the other scenario has by default).
     Returns: episodes, success_rate, distance_m, speed_mps, collision_rate (means). With the defaults these are the
     held-out figures of summary.json.
-    Raises: ValueError for an unknown scenario or fewer than one episode.
+    Raises: GridSimError, a ValueError, for an unknown scenario or fewer than one episode.
     """
-    name, episode = scenario or champion.scenario, champion.sim.episode
-    limits = Limits(episode.target, episode.steps)
-    maps = Maps(name, champion.sim)
-    try:
-        chosen = held_out(champion, maps, name, episodes, seed, traffic)
-        spec, roads = PolicySpec.parse(champion.policy), [maps.get(s) for s in chosen.maps]
-        genomes = champion.genome[None]
-        results = roll_out(spec, genomes, roads, chosen.rows, limits, champion.sim, worlds=chosen.worlds)[0]
-        return summarise(results[0], episode.control_period)
-    finally:
-        maps.close()
+    chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
+    spec, sim, genomes = PolicySpec.parse(champion.policy), champion.sim, champion.genome[None]
+    limits = Limits(sim.episode.target, sim.episode.steps)
+    results = roll_out(spec, genomes, roads, chosen.rows, limits, sim, worlds=chosen.worlds)[0]
+    return summarise(results[0], sim.episode.control_period)
 
 
-def held_out(champion: Champion, maps: Maps, name: str, episodes: int, seed: int, traffic: int | None) -> Episodes:
-    """The episodes that `evaluate` drives. Raises: ValueError as it does."""
+def held_out(
+    champion: Champion, scenario: str | None, episodes: int, seed: int, traffic: int | None
+) -> tuple[Episodes, list[Map]]:
+    """The episodes that `evaluate` drives, and their maps. Raises: GridSimError as it does."""
+    name = scenario or champion.scenario
     check_name(name)
     if episodes < 1:
-        raise ValueError(f"episodes must be 1 or more, not {episodes}")
+        raise GridSimError(f"episodes must be 1 or more, not {episodes}")
     traffic = champion.traffic_on(name) if traffic is None else traffic
     if not 0 <= traffic <= MAX_TRAFFIC:
-        raise ValueError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
-    used = max(len(HELD_OUT_SEEDS), episodes // 8)
-    return spread_starts(maps.get, range(seed, seed + used), episodes, traffic)
+        raise GridSimError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
+    seeds = range(seed, seed + max(len(HELD_OUT_SEEDS), episodes // 8))
+    roads = {k: build(name, k, champion.sim) for k in seeds}
+    chosen = spread_starts(roads.__getitem__, seeds, episodes, traffic)
+    return chosen, [roads[k] for k in chosen.maps]

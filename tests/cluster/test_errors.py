@@ -9,7 +9,7 @@ import pytest
 from commands import call
 
 from cluster.commands.cli import evaluate_main
-from cluster.comparison.errors import series
+from cluster.comparison.results import series
 from cluster.runs.champion import load_champion
 from gridsim.config import VehicleConfig
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
