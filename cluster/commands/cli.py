@@ -31,7 +31,6 @@ from cluster.commands.common import (
     select,
     short_path,
     warn_of_many_workers,
-    wrong_use,
 )
 from cluster.commands.entry import STARTED
 from cluster.commands.progress import Progress
@@ -272,16 +271,14 @@ def evaluate_main() -> None:
 def _evaluate() -> int:
     flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
     champion = load_champion(flags.champion)
-    traffic = None if flags.traffic == -1 else flags.traffic
-    chosen = (flags.scenario or None, flags.episodes, flags.seed, traffic)
-    with wrong_use():
-        figures = evaluate(champion, *chosen)
-        missed = errors(series(champion, *chosen), champion.sim.vehicle) if flags.errors else None
+    road = flags.scenario or champion.scenario
+    traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
+    chosen = (road, flags.episodes, flags.seed, traffic)
+    figures = evaluate(champion, *chosen)
+    missed = errors(series(champion, *chosen), champion.sim.vehicle) if flags.errors else None
     if flags.json:
         print(json.dumps(figures if missed is None else {**figures, "errors": missed}))
         return 0
-    road = flags.scenario or champion.scenario
-    traffic = champion.traffic_on(road) if traffic is None else traffic
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
     Console().print(held_out_table(title, figures))

@@ -204,15 +204,6 @@ def select(kind: type[T], flags: Any) -> T:
     return kind(**{f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)})  # type: ignore[arg-type]
 
 
-@contextlib.contextmanager
-def wrong_use() -> Iterator[None]:
-    """Report a ValueError of the simulator (a map, its name, a number of episodes) as wrong use."""
-    try:
-        yield
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-
-
 def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
     """Exit with one clear line, and perhaps a second one that says what to do."""
     line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: command_path(name[0]), " ".join(message.split()))

@@ -20,7 +20,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cluster.commands.common import FAILED, RoadFlags, UsageError, command_path, fail, main, parse, wrong_use
+from cluster.commands.common import FAILED, RoadFlags, UsageError, command_path, fail, main, parse
 from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
@@ -106,9 +106,8 @@ def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[in
 
 
 def _map(name: str, seed: int, config: SimConfig) -> tuple[Map, np.ndarray]:
-    """A map and a start float32 [5] on it, both of this seed. Raises UsageError."""
-    with wrong_use():
-        scenario = build(name, seed, config)
+    """A map and a start float32 [5] on it, both of this seed. Raises GridSimError."""
+    scenario = build(name, seed, config)
     return scenario, sample_starts(scenario, 1, np.random.default_rng(np.random.SeedSequence([seed, 7])))[0]
 
 
@@ -130,8 +129,7 @@ def _watch() -> int:
         flags.size or ("640x360" if flags.output else "960x640"), flags.seconds, flags.traffic
     )
     if flags.scenario:
-        with wrong_use():
-            check_name(flags.scenario)
+        check_name(flags.scenario)
     if flags.beside and not flags.output.lower().endswith(".html"):
         raise UsageError("several champions can only be shown on a page: --output drive.html")
     if flags.output.lower().endswith(".html"):

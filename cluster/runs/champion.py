@@ -27,7 +27,7 @@ from evolution.episodes.rollout import evaluate as roll_out
 from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
 from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
-from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig
+from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, build, check_name, default_traffic
@@ -145,8 +145,9 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
             EpisodeConfig(**sim["episode"]),
             TrafficConfig(**{k: v for k, v in sim.get("traffic", {}).items() if k not in GONE}),
         )
+        constants(config)  # which checks it
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path}: not a champion: {error}") from error
 
 

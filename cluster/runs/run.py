@@ -21,7 +21,7 @@ import numpy as np
 
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, CheckpointError
-from cluster.runs.settings import SETTINGS, RunSettings, SettingsError, from_dict
+from cluster.runs.settings import SETTINGS, RunSettings, from_dict
 from cluster.tracking import description
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
@@ -106,7 +106,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
         return settings, str(config.get("init", ""))
     except RunError:
         raise
-    except SettingsError as error:
+    except GridSimError as error:
         raise RunError(f"{path}: {error}") from error
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from error
@@ -115,11 +115,8 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
 
 
 def _map_sha256(settings: RunSettings) -> str:
-    """Digest of the map's file, or "". Raises SettingsError."""
-    try:
-        return map_digest(settings.scenario) if is_map_file(settings.scenario) else ""
-    except ValueError as error:
-        raise SettingsError(str(error)) from error
+    """Digest of the map's file, or "". Raises GridSimError."""
+    return map_digest(settings.scenario) if is_map_file(settings.scenario) else ""
 
 
 @functools.cache  # so that a process may lock a folder again

@@ -111,11 +111,15 @@ class RunSettings:
     def check(self) -> None:
         """Raises SettingsError, one line that says what to change."""
         try:
-            check_name(self.scenario)
-            if is_map_file(self.scenario):
-                build(self.scenario, 0)  # cached, so that it is read once
+            self._check()
         except ValueError as error:
             raise SettingsError(str(error)) from error
+
+    def _check(self) -> None:
+        """Raises ValueError, one line."""
+        check_name(self.scenario)
+        if is_map_file(self.scenario):
+            build(self.scenario, 0)  # cached, so that it is read once
         self._check_range(0, MAX_TRAFFIC, "traffic")
         if self.traffic and is_map_file(self.scenario):
             raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
@@ -125,10 +129,7 @@ class RunSettings:
         low, high = speed_interval(self.scenario)
         if self.pace and not low <= self.pace <= high:
             raise SettingsError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
-        try:
-            spec = PolicySpec.parse(self.policy)
-        except ValueError as error:
-            raise SettingsError(str(error)) from error
+        spec = PolicySpec.parse(self.policy)
         if spec.observation != self.observation:
             raise SettingsError(
                 f"policy {self.policy} sees the {spec.observation}; "
@@ -222,19 +223,15 @@ class EvolveSettings(RunSettings):
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or 0 < self.generations <= int(so_far["generation"])
 
-    def check(self) -> None:
-        super().check()
+    def _check(self) -> None:
+        super()._check()
         self._check_range(0, MAX_STEPS, "generations")
         self._check_range(4, MAX_POPULATION, "population")
         self._check_range(0, 1, "mutation_rate")
-        for name in ("elites", "mutation_rate"):
-            if (
-                self.recombination == "all"
-                and self.search != "random"
-                and getattr(self, name) != getattr(EvolveSettings, name)
-            ):
-                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two; add that, or leave it out")
         classic = self.recombination == "two" or self.search == "random"
+        for name in ("elites", "mutation_rate"):
+            if not classic and getattr(self, name) != getattr(EvolveSettings, name):
+                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two; add that, or leave it out")
         if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
             raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
         self._check_range(1, MAX_STEPS, "tournament")
@@ -310,8 +307,8 @@ class DqnSettings(RunSettings):
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or bool(so_far["converged"]) or 0 < self.episodes <= int(so_far["episodes"])
 
-    def check(self) -> None:
-        super().check()
+    def _check(self) -> None:
+        super()._check()
         self._check_range(1, MAX_STEPS, "evaluate_every", "batch", "anneal", "target_period")
         self._check_range(0, MAX_STEPS, "episodes")
         self._check_range(0, 1, "discount", "epsilon", "converged")

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import VehicleConfig
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.reference.profile import BRAKING, WINDOW, arc_length, profile
 
@@ -35,12 +36,12 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
     Velocity in percent is relative to the reference's mean speed, since its speed at a place may be 0; steering to the
     steering limit to one side, since the reference's angle is 0 on a straight.
 
-    Raises: ValueError if nothing was driven.
+    Raises: GridSimError, a ValueError, if nothing was driven.
     """
     parts = [part for part in parts if len(part.arc) > 1]
     metres = sum(float(part.arc[-1] - part.arc[0]) for part in parts)
     if not metres > 0.0:
-        raise ValueError("nothing was driven that could be compared with a reference")
+        raise GridSimError("nothing was driven that could be compared with a reference")
 
     def mean(values: Sequence[np.ndarray]) -> float:
         return sum(float(np.trapezoid(each, part.arc)) for each, part in zip(values, parts, strict=True)) / metres
