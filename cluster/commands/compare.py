@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -32,7 +33,7 @@ from cluster.commands.common import (
     short_path,
     warn_of_many_workers,
 )
-from cluster.commands.jobs import How, Kind, train_all
+from cluster.commands.jobs import Kind, train_all
 from cluster.commands.progress import Line, clock
 from cluster.comparison import tables
 from cluster.comparison.page import page
@@ -42,6 +43,7 @@ from cluster.report import pictures
 from cluster.runs import checkpoint
 from cluster.runs.run import lock, new_folder
 from cluster.runs.settings import IN_WORDS, check_workers
+from cluster.runs.train import Workers, train
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
@@ -146,11 +148,12 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
                     parent = tracker.wait_ready()
                 except TrackingError as error:
                     print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
-            how = How(
-                flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience, uri,
-                flags.experiment, parent, limits(folder.plan.budget)[1] or math.inf,
+            workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
+            learn = partial(
+                train, workers=workers, uri=uri, experiment=flags.experiment, parent_id=parent,
+                wall_limit_s=limits(folder.plan.budget)[1] or math.inf,
             )  # fmt: skip
-            train_all([cell for cell in cells if not cell.finished()], how, flags.jobs, shown.tell)
+            train_all([cell for cell in cells if not cell.finished()], workers, learn, flags.jobs, shown.tell)
     except KeyboardInterrupt:
         code, status = INTERRUPTED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:

@@ -26,7 +26,7 @@ from cluster.commands.entry import GC_THRESHOLDS, interrupt
 from cluster.commands.progress import progress_of
 from cluster.comparison.plan import Cell
 from cluster.comparison.results import measured, read_run
-from cluster.runs.train import Reporter, Session, Workers, train
+from cluster.runs.train import Reporter, Session, Workers
 from cluster.workers import kernels
 from gridsim.errors import GridSimError
 
@@ -35,47 +35,31 @@ Kind = Literal["begin", "note", "warning", "done", "failed"]
 Tell = Callable[[Cell, Kind, Any], None]
 """Receives what happens to a run: "begin"; "note" with two texts; "warning" or "failed" with a text; "done" with its
 `Run`."""
+Learn = Callable[..., Session]
+"""`train` with all that it needs but the run and the reporter; it is sent to the jobs with its workers."""
 
 
-class StoppedError(GridSimError):
-    """What stops all runs, such as a full disk; the message is one line for the user."""
+def train_all(cells: Iterable[Cell], workers: Workers, learn: Learn, jobs: int, tell: Tell) -> None:
+    """Train runs, as many at once as `jobs` says, each with such workers. A run that fails does not stop the others.
 
-
-@dataclass(frozen=True)
-class How:
-    """How runs are trained: the flags of `Workers`, MLflow's address, experiment and parent run, the limit in s."""
-
-    workers: int
-    address: str | None
-    patience_s: float
-    uri: str
-    experiment: str
-    parent_id: str
-    wall_limit_s: float
-
-
-def train_all(cells: Iterable[Cell], how: How, jobs: int, tell: Tell) -> None:
-    """Train runs, as many at once as `jobs` says. A run that fails does not stop the others.
-
-    Raises: KeyboardInterrupt, once all are saved; StoppedError; MemoryError and OSError with `jobs` = 1.
+    Raises: KeyboardInterrupt, once all are saved; for what stops all of them, such as a full disk, MemoryError and
+    OSError, or with several `jobs` GridSimError.
     """
     if jobs > 1:
-        _at_once(deque(cells), how, jobs, tell)
+        _at_once(deque(cells), workers, learn, jobs, tell)
         return
-    workers = Workers(how.workers, how.address, how.patience_s)
     try:
         for cell in cells:
-            _train(cell, how, workers, tell)
+            _train(cell, workers, learn, tell)
     finally:
         workers.close()
 
 
-def _train(cell: Cell, how: How, workers: Workers, tell: Tell) -> None:
+def _train(cell: Cell, workers: Workers, learn: Learn, tell: Tell) -> None:
     tell(cell, "begin", None)
     try:
         reporter = _Teller(cell, tell)
-        run = cell.open()
-        train(run, workers, how.uri, how.experiment, reporter, parent_id=how.parent_id, wall_limit_s=how.wall_limit_s)
+        learn(cell.open(), reporter=reporter)
         reporter.note("measuring errors")
         tell(cell, "done", measured(read_run(cell.folder)))
     except (GridSimError, FloatingPointError) as error:  # the other runs go on
@@ -123,31 +107,34 @@ class _Job:
     def give(self, cells: deque[Cell]) -> None:
         """Have it train the next run, or end."""
         self.cell = cells.popleft() if cells else None
-        with contextlib.suppress(OSError):  # it has died, which its sentinel tells
+        with contextlib.suppress(OSError):  # it has died, which the pipe's end tells
             self.pipe.send(self.cell)
 
 
-def _at_once(cells: deque[Cell], how: How, number: int, tell: Tell) -> None:
+def _at_once(cells: deque[Cell], workers: Workers, learn: Learn, number: int, tell: Tell) -> None:
     _compile(cells, tell)
     jobs: list[_Job] = []
     try:
-        for _ in range(min(number, len(cells))):
-            jobs.append(_start(how))
-            jobs[-1].give(cells)
-        while jobs:
-            ready = wait([job.pipe for job in jobs] + [job.process.sentinel for job in jobs])
-            for job in list(jobs):
-                if job.pipe in ready and _hear(job, tell):
-                    if job.cell is None:
-                        job.give(cells)
-                elif job.pipe in ready or job.process.sentinel in ready:
+        while cells or jobs:
+            while cells and len(jobs) < number:  # at first, and in place of one that has died
+                jobs.append(_start(workers, learn))
+                jobs[-1].give(cells)
+            ready = wait([job.pipe for job in jobs])
+            for job in [job for job in jobs if job.pipe in ready]:
+                try:
+                    kind, content = job.pipe.recv()
+                except (EOFError, OSError):  # its process has ended
                     jobs.remove(job)
                     job.process.join()
                     if job.cell is not None:
                         tell(job.cell, "failed", f"its process ended with exit code {job.process.exitcode}")
-                        if cells:
-                            jobs.append(_start(how))
-                            jobs[-1].give(cells)
+                    continue
+                if kind == "stopped":
+                    raise GridSimError(content)
+                assert job.cell is not None
+                tell(job.cell, kind, content)
+                if kind in ("done", "failed"):
+                    job.give(cells)
     finally:
         for job in jobs:
             job.process.terminate()
@@ -168,10 +155,10 @@ def _compile(cells: Iterable[Cell], tell: Tell) -> None:
             warming.stop()
 
 
-def _start(how: How) -> _Job:
+def _start(workers: Workers, learn: Learn) -> _Job:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    process = context.Process(target=_main, args=(there, how))
+    process = context.Process(target=_main, args=(there, workers, learn))
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it
     process.start()
     signal.signal(signal.SIGINT, before)
@@ -179,23 +166,7 @@ def _start(how: How) -> _Job:
     return _Job(process, here)
 
 
-def _hear(job: _Job, tell: Tell) -> bool:
-    """Pass on the next message of a job. Returns whether there was one. Raises StoppedError."""
-    try:
-        kind, content = job.pipe.recv()
-    except (EOFError, OSError):
-        return False
-    if kind == "stopped":
-        raise StoppedError(content)
-    cell = job.cell
-    assert cell is not None
-    if kind in ("done", "failed"):
-        job.cell = None
-    tell(cell, kind, content)
-    return True
-
-
-def _main(pipe: Connection, how: How) -> None:
+def _main(pipe: Connection, workers: Workers, learn: Learn) -> None:
     """A job's process: train the runs that come through the pipe. SIGTERM stops it."""
     gc.set_threshold(*GC_THRESHOLDS)
     signal.signal(signal.SIGTERM, interrupt)
@@ -206,11 +177,10 @@ def _main(pipe: Connection, how: How) -> None:
         except OSError:
             raise KeyboardInterrupt from None  # the parent has died
 
-    workers = Workers(how.workers, how.address, how.patience_s)
     try:
         while (cell := pipe.recv()) is not None:
             warnings.showwarning = lambda message, *_, cell=cell, **__: tell(cell, "warning", str(message))
-            _train(cell, how, workers, tell)
+            _train(cell, workers, learn, tell)
     except (KeyboardInterrupt, EOFError):
         pass
     except (MemoryError, OSError) as error:

@@ -13,7 +13,7 @@ import tracked
 from commands import call, finish, refused, start, summary, wait_until
 from finished_runs import make_run
 
-from cluster.commands import compare, jobs
+from cluster.commands import compare
 from cluster.commands.compare import compare_main
 from cluster.comparison import results
 from cluster.comparison.plan import ComparisonFolder, Plan
@@ -69,7 +69,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
         make_run(run.path, settings=run.settings)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(jobs, "train", train)
+    monkeypatch.setattr(compare, "train", train)
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     run = functools.partial(call, compare_main, monkeypatch, capsys)
@@ -103,7 +103,7 @@ def test_a_finished_run_that_is_damaged_counts_as_failed_and_stops_no_other(tmp_
         make_run(cell.folder, settings=cell.settings)
     folder.write()
     (damaged.folder / "champion.npz").write_text("PK")
-    monkeypatch.setattr(jobs, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     monkeypatch.chdir(tmp_path)
@@ -120,7 +120,7 @@ def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, m
     folder = ComparisonFolder(tmp_path / "c", Plan(("curved",), ("evolution",), 1, budget="1k"), away)
     folder.path.mkdir()
     folder.write()
-    monkeypatch.setattr(jobs, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
+    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     code, _, err = call(compare_main, monkeypatch, capsys, "--resume", folder.path, "--workers", 0)
     assert code == 0
