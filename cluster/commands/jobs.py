@@ -72,7 +72,7 @@ class _Teller(Reporter):
 
     def __init__(self, cell: Cell, tell: Tell):
         self._tell = partial(tell, cell)
-        self._resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
+        self.resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
 
     def note(self, text: str, more: str = "") -> None:
         self._tell("note", (text, more))
@@ -91,9 +91,6 @@ class _Teller(Reporter):
     def row(self, steps: int, row: dict[str, float]) -> None:
         success = f"success {row['validation/success_rate']:.0%}"
         self.note(f"{progress_of(self._learning, bound=False)}  {success}", self._learning.describe(row))
-
-    def unsent(self, text: str, finished: bool) -> None:
-        self.warn(f"{text}; send it later with: {self._resume}" if finished else text)
 
 
 @dataclass

@@ -23,14 +23,11 @@ WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time
 BAR = 10  # characters
 
 
-class Line(Reporter):
-    """On a terminal: `head`, `facts`, a bar and the elapsed time if `share` is known, and `rest` on a second line.
+class Line:
+    """On a terminal: `head`, `facts`, a bar and the elapsed time if `share` is known, and `rest` on a second line."""
 
-    Warnings begin with `name`; `resume` is the command that later sends what MLflow lacks.
-    """
-
-    def __init__(self, console: Console, name: str = "", resume: str = ""):
-        self.console, self.name, self.resume = console, name, resume
+    def __init__(self, console: Console):
+        self.console = console
         self.head = self.facts = self.rest = ""
         self.share: float | None = None
         self._started = time.perf_counter()
@@ -53,14 +50,8 @@ class Line(Reporter):
             line.append(f"  {clock(time.perf_counter() - self._started)}", "progress.elapsed")
         return line.append(f"\n{self.rest}")
 
-    def warn(self, text: str) -> None:
-        print(f"{self.name}: warning: {text}", file=sys.stderr, flush=True)
 
-    def unsent(self, text: str, finished: bool) -> None:
-        self.warn(f"{text}; send it later with: {self.resume}" if finished else text)
-
-
-class Progress(Line):
+class Progress(Line, Reporter):
     """Shows a run's progress, success and ETA, then distance, speed and car-steps per second.
 
     Args: the console; the command's name; the run's folder and the command that resumes it, as the user would type
@@ -68,12 +59,15 @@ class Progress(Line):
     """
 
     def __init__(self, console: Console, prog: str, folder: str, resume: str):
-        super().__init__(console, prog, resume)
-        self._folder = folder
+        super().__init__(console)
+        self._prog, self._folder, self.resume = prog, folder, resume
         self._steps: deque[tuple[float, float, float]] = deque()  # of each: end time, progress, car-steps
         self._printed = 0.0
         self._text = ""
         self.facts, self.rest = "success 0%  ETA -:--", "starting the workers"
+
+    def warn(self, text: str) -> None:
+        print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
 
     def compiling(self) -> AbstractContextManager[object]:
         return self.console.status("compiling the simulator for this machine, once (some 20 s)")

@@ -48,7 +48,9 @@ NOT_LOGGED = ("target_m",)  # columns of the history that are not metrics
 
 
 class Reporter:
-    """Shows how a run goes; this one shows only warnings."""
+    """Shows how a run goes; this one shows only warnings. `resume` is the command that goes on with the run."""
+
+    resume = ""
 
     def warn(self, text: str) -> None:
         """One line."""
@@ -73,10 +75,6 @@ class Reporter:
 
     def stopping(self) -> None:
         """A run that was interrupted is being closed."""
-
-    def unsent(self, text: str, finished: bool) -> None:
-        """One line about what MLflow lacks of a run that is finished, or is to be resumed."""
-        self.warn(text)
 
 
 @dataclass
@@ -163,7 +161,8 @@ def train(
             maps.close()
             if session:
                 if lost := session.tracker.close(status):
-                    reporter.unsent(lost, status == "FINISHED")
+                    later = f"; send it later with: {reporter.resume}" if status == "FINISHED" else ""
+                    reporter.warn(lost + later)
                 else:
                     session.report_outage()
 

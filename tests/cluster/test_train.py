@@ -18,7 +18,7 @@ class Notes(train.Reporter):
     """Keeps what it is shown."""
 
     def __init__(self):
-        self.seen, self.told = [], []
+        self.seen, self.told, self.resume = [], [], "again"
 
     def warn(self, text):
         self.told.append((len(self.seen), text))
@@ -28,9 +28,6 @@ class Notes(train.Reporter):
 
     def stopping(self):
         self.seen.append("stopping")
-
-    def unsent(self, text, finished):
-        self.seen.append(text)
 
 
 INTERRUPTED_RAY = SystemError()
