@@ -77,13 +77,12 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
     Raises: GridSimError, with a one-line message, for a folder that is not a finished run.
     """
     from cluster.comparison.plan import read_runs
-    from cluster.comparison.results import errors_of
+    from cluster.comparison.results import measured
 
     names = ("scenario", "learner", "seed", "traffic")
     return [
-        {"run": str(run.folder), **{name: getattr(run.settings, name) for name in names}}
-        | {**run.figures, **errors_of(run)}
-        for run in read_runs(map(Path, runs))
+        {"run": str(run.folder), **{name: getattr(run.settings, name) for name in names}, **run.figures}
+        for run in map(measured, read_runs(map(Path, runs)))
     ]
 
 

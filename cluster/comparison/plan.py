@@ -125,16 +125,12 @@ class Plan:
 
     def cells(self, folder: Path) -> list[Cell]:
         """All runs of a comparison in that folder, in the order in which they are made."""
-        return [
-            Cell(
-                folder / "-".join([file_name(label(scenario)), learner, *_words(variant), f"s{seed}"]),
-                self.settings(scenario, learner, seed, variant),
-            )
-            for seed in range(self.seeds)
-            for scenario in self.scenarios
-            for learner in self.learners
-            for variant in self.variants(learner)
-        ]
+        found = []
+        for seed, scenario, learner in itertools.product(range(self.seeds), self.scenarios, self.learners):
+            for variant in self.variants(learner):
+                words = [label(scenario), learner, *(f"{name}={value}" for name, value in variant.items()), f"s{seed}"]
+                found.append(Cell(folder / file_name("-".join(words)), self.settings(scenario, learner, seed, variant)))
+        return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
         """The combinations of `grid` for a learner, by the settings' names. Raises ExperimentError."""
@@ -180,11 +176,6 @@ class Plan:
             car_steps=car_steps,
             generations=self.generations or UNBOUND,
         )
-
-
-def _words(variant: Mapping[str, Any]) -> list[str]:
-    """A variant as parts of a folder's name."""
-    return [file_name(f"{name}={value}") for name, value in variant.items()]
 
 
 def limits(budget: str) -> tuple[int, float]:

@@ -22,11 +22,11 @@ import numpy as np
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, CheckpointError
 from cluster.runs.settings import SETTINGS, RunSettings, from_dict
-from cluster.tracking import description
+from cluster.tracking.description import file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.files import map_digest
-from gridsim.maps.scenarios import is_map_file
+from gridsim.maps.scenarios import is_map_file, label
 
 HISTORY, ELITES, SUMMARY, PAGE = "history.csv", "elites.npz", "summary.json", "drive.html"
 CONFIG_FORMAT = 2
@@ -46,7 +46,6 @@ class RunFolder:
         settings: what decides its champion.
         init: path of the champion it started from, or "".
         init_sha256: digest of that genome, or "".
-        map_sha256: digest of the map's file, or "".
         saved: arrays and meta of its checkpoint, if it is resumed.
         tracking_key: by which its MLflow run is found again.
     """
@@ -55,7 +54,6 @@ class RunFolder:
     settings: RunSettings
     init: str = ""
     init_sha256: str = ""
-    map_sha256: str = ""
     saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None
     tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)
 
@@ -65,6 +63,7 @@ class RunFolder:
 
     def config(self) -> dict[str, Any]:
         """What config.json holds: enough to repeat the run."""
+        map_sha256 = _map_sha256(self.settings)
         return {
             "format": CONFIG_FORMAT,
             "command": self.settings.command,
@@ -74,7 +73,7 @@ class RunFolder:
             "simulator": dataclasses.asdict(SimConfig()),
             "init": self.init,
             "init_sha256": self.init_sha256,
-            **({"map_sha256": self.map_sha256} if self.map_sha256 else {}),
+            **({"map_sha256": map_sha256} if map_sha256 else {}),
         }
 
     def digest(self) -> str:
@@ -142,7 +141,7 @@ def open_run(folder: Path) -> RunFolder:
         raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
     lock(folder.resolve())
     settings, init = read_config(folder / CONFIG)
-    run = RunFolder(folder.resolve(), settings, init, map_sha256=_map_sha256(settings))
+    run = RunFolder(folder.resolve(), settings, init)
     if not (folder / CHECKPOINT).is_file():
         raise RunError(f"{folder} has no {CHECKPOINT} to resume from; start it anew with --config {folder / CONFIG}")
     try:
@@ -162,8 +161,8 @@ def open_run(folder: Path) -> RunFolder:
 
 def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init_sha256: str = "") -> RunFolder:
     """A new run's folder, checked but not yet made. Raises RunError."""
-    path = new_folder(output, name, description.default_name(settings))
-    return RunFolder(path, settings, init, init_sha256, _map_sha256(settings))
+    kind = file_name(f"{label(settings.scenario)}-{settings.algorithm}-s{settings.seed}")
+    return RunFolder(new_folder(output, name, kind), settings, init, init_sha256)
 
 
 def new_folder(output: Path, name: str, kind: str) -> Path:

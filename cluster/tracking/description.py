@@ -22,13 +22,8 @@ if TYPE_CHECKING:
 
 
 def file_name(words: str) -> str:
-    """A scenario's label, or other words, as part of a folder's name."""
+    """A scenario's label and other words as a folder's name."""
     return re.sub(r"[^\w.+=@-]", "_", words)
-
-
-def default_name(settings: RunSettings) -> str:
-    """Scenario, algorithm and seed in one word, with which the default name of a run begins."""
-    return f"{file_name(label(settings.scenario))}-{settings.algorithm}-s{settings.seed}"
 
 
 def group(settings: RunSettings) -> str:
