@@ -52,17 +52,12 @@ class ExperimentError(GridSimError):
 
 @dataclass(frozen=True)
 class Run:
-    """A finished training run, of a comparison or any other.
-
-    Attributes:
-        champion_sha256: digest of its champion's genome.
-        figures: RUN_FIGURES, and ERROR_FIGURES once they are measured; nan where they could not be.
-    """
+    """A finished training run, of a comparison or any other."""
 
     folder: Path
     settings: RunSettings
-    champion_sha256: str
-    figures: Mapping[str, float]
+    champion_sha256: str  # digest of its genome
+    figures: Mapping[str, float]  # RUN_FIGURES, and ERROR_FIGURES once they are measured; nan where they could not be
 
 
 def read_run(folder: Path) -> Run:

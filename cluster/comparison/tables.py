@@ -45,25 +45,17 @@ def spread(values: Iterable[float]) -> Spread:
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of one learner on one road with all seeds.
-
-    Attributes:
-        variant: its settings, in words, in which others of this learner on this road differ.
-        road: the scenario's name, with the traffic if the comparison has several amounts of it.
-        name: the learner's name with its variant, and with the observation if the comparison has both.
-        runs: the finished ones.
-        seeds: all of the plan's.
-    """
+    """The runs of one learner on one road with all seeds."""
 
     scenario: str
     traffic: int
     observation: str
     learner: str
-    variant: str
-    road: str
-    name: str
-    runs: tuple[Run, ...]
-    seeds: tuple[int, ...]
+    variant: str  # its settings, in words, in which others of this learner on this road differ
+    road: str  # the scenario's name, with the traffic if the comparison has several amounts of it
+    name: str  # the learner's, with its variant, and with the observation if the comparison has both
+    runs: tuple[Run, ...]  # the finished ones
+    seeds: tuple[int, ...]  # all of the plan's
 
     def values(self, figure: str) -> list[float]:
         """One number for each run."""

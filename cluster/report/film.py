@@ -35,25 +35,15 @@ class VideoError(GridSimError):
 
 @dataclass(frozen=True)
 class Recording:
-    """A drive, state by state, from its start on.
-
-    Attributes:
-        scenario: the map.
-        cars: float32 [steps + 1, FIELDS], the car's states (`gridsim.car.ego`).
-        ranges: float32 [steps + 1, rays], the lengths of its rays, m.
-        boxes: float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine).
-        end: how it ended; RUNNING if only the recording did.
-        period: s from state to state.
-        outputs: float32 [steps + 1, 8], the network's for each action; None if they are unknown.
-    """
+    """A drive, state by state, from its start on."""
 
     scenario: Map
-    cars: np.ndarray
-    ranges: np.ndarray
-    boxes: np.ndarray
-    end: End
-    period: float
-    outputs: np.ndarray | None = None
+    cars: np.ndarray  # float32 [steps + 1, FIELDS], the car's states (`gridsim.car.ego`)
+    ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
+    boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
+    end: End  # how it ended; RUNNING if only the recording did
+    period: float  # s from state to state
+    outputs: np.ndarray | None = None  # float32 [steps + 1, 8], the network's for each action, if they are known
 
     @property
     def seconds(self) -> float:

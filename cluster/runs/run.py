@@ -39,23 +39,14 @@ class RunError(GridSimError):
 
 @dataclass
 class RunFolder:
-    """Where a run is kept, and what it was asked to do.
-
-    Attributes:
-        path: the folder.
-        settings: what decides its champion.
-        init: path of the champion it started from, or "".
-        init_sha256: digest of that genome, or "".
-        saved: arrays and meta of its checkpoint, if it is resumed.
-        tracking_key: by which its MLflow run is found again.
-    """
+    """Where a run is kept, and what it was asked to do."""
 
     path: Path
-    settings: RunSettings
-    init: str = ""
-    init_sha256: str = ""
-    saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None
-    tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)
+    settings: RunSettings  # what decides its champion
+    init: str = ""  # path of the champion it started from
+    init_sha256: str = ""  # digest of that genome
+    saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None  # its checkpoint, if it is resumed
+    tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)  # by which its MLflow run is found again
 
     @property
     def name(self) -> str:

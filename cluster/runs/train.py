@@ -79,17 +79,11 @@ class Reporter:
 
 @dataclass
 class Workers:
-    """The worker pool of a run, or of several one after another, opened for the first one.
+    """The worker pool of a run, or of several one after another, opened for the first one."""
 
-    Attributes:
-        number: of workers; 0 evaluates in this process.
-        address: of a Ray cluster, or None.
-        patience_s: seconds without any worker after which a run stops.
-    """
-
-    number: int
-    address: str | None
-    patience_s: float
+    number: int  # 0 evaluates in this process
+    address: str | None  # of a Ray cluster
+    patience_s: float  # without any worker, after which a run stops
     _pool: WorkerPool | None = None
     _maps: Maps | None = None
 
@@ -190,32 +184,19 @@ def new_learning(settings: RunSettings, pool: WorkerPool, maps: Maps, initial: n
 
 @dataclass
 class Session:
-    """One process's share of a run, from start or resume to its end.
-
-    Attributes:
-        run: the folder.
-        pool: evaluates.
-        maps: builds maps.
-        uri, experiment: of MLflow.
-        reporter: shows progress and warnings.
-        started: time.perf_counter() from which the run's time counts.
-        initial: a genome to start from, float32 [genes].
-        parent_id: MLflow's run that this one belongs to, or "".
-        wall_limit_s: seconds of learning, including those before it was resumed, after which only a first step begins.
-        summary: what summary.json holds, once it is finished.
-    """
+    """One process's share of a run, from start or resume to its end."""
 
     run: RunFolder
     pool: WorkerPool
     maps: Maps
-    uri: str
+    uri: str  # MLflow's address
     experiment: str
     reporter: Reporter = field(default_factory=Reporter)
-    started: float = field(default_factory=now)
-    initial: np.ndarray | None = None
-    parent_id: str = ""
-    wall_limit_s: float = math.inf
-    summary: dict[str, Any] = field(default_factory=dict)
+    started: float = field(default_factory=now)  # time.perf_counter() from which the run's time counts
+    initial: np.ndarray | None = None  # a genome to start from, float32 [genes]
+    parent_id: str = ""  # MLflow's run that this one belongs to
+    wall_limit_s: float = math.inf  # of learning, also before it was resumed, after which only a first step begins
+    summary: dict[str, Any] = field(default_factory=dict)  # what summary.json holds, once it is finished
     learning: Learning = field(init=False)
     tracker: Tracker = field(init=False)
     _state: State = field(init=False)  # after the last whole step, with the unsaved rows of the history

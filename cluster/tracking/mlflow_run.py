@@ -95,24 +95,17 @@ class Identity:
 
     What differs in a resumed run (more generations, another commit) is added as tag `resumed/<name>`, as MLflow does
     not let parameters change.
-
-    Attributes:
-        uri: what `address.check_uri` returned.
-        note: its description, Markdown.
-        key: the run's own unique name, made before MLflow is imported, by which the run is found again (KEY_TAG).
-        finished: whether the run has ended, so that what MLflow has of it stays as it is: status, times, files.
-        started: seconds since the epoch at which a new one began; None: now.
     """
 
-    uri: str
+    uri: str  # what `address.check_uri` returned
     experiment: str
     name: str
     params: Mapping[str, str]
     tags: Mapping[str, str]
-    note: str = ""
-    key: str = field(default_factory=lambda: uuid.uuid4().hex)
-    finished: bool = False
-    started: float | None = None
+    note: str = ""  # its description, Markdown
+    key: str = field(default_factory=lambda: uuid.uuid4().hex)  # made before MLflow is imported; the run's KEY_TAG
+    finished: bool = False  # whether it has ended, so that what MLflow has of it stays as it is: status, times, files
+    started: float | None = None  # s since the epoch at which a new one began; None: now
 
 
 @dataclass(frozen=True)
