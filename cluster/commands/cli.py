@@ -20,7 +20,6 @@ from cluster.commands.common import (
     FAILED,
     INTERRUPTED,
     RoadFlags,
-    UsageError,
     WorkFlags,
     as_flag,
     check_unchanged,
@@ -140,7 +139,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     flags = parse(kind, prog, arguments)
     resume, config = flags.resume, flags.config
     if resume and config:
-        raise UsageError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
+        raise GridSimError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
     if resume or config:  # the settings of that run are the defaults
         if resume:
             run = open_run(Path(resume))
@@ -149,7 +148,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
             settings, init = read_config(Path(config))
         if settings.command != prog:
             flag, path = ("--resume", resume) if resume else ("--config", config)
-            raise UsageError(f"{path} belongs to another learner; use {settings.command} {flag} {path}")
+            raise GridSimError(f"{path} belongs to another learner; use {settings.command} {flag} {path}")
         base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
@@ -171,7 +170,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
             device_of(flags.device)
         except ValueError as error:
             there = f"{resume} was trained with --device cuda, and PyTorch finds no GPU; continue it where there is one"
-            raise UsageError(there if resume else f"--device cuda: {error}") from error
+            raise GridSimError(there if resume else f"--device cuda: {error}") from error
     if resume:
         run.settings = settings
         return flags, run
@@ -179,9 +178,9 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     if flags.init:
         champion = load_champion(flags.init)
         if PolicySpec.parse(champion.policy) != PolicySpec.parse(settings.policy):
-            raise UsageError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
+            raise GridSimError(f"--init {flags.init} is a {champion.policy}; use --policy {champion.policy}")
         if not np.isfinite(champion.genome).all():
-            raise UsageError(f"--init {flags.init}: some of its genes are not numbers; choose another champion")
+            raise GridSimError(f"--init {flags.init}: some of its genes are not numbers; choose another champion")
         digest = champion.sha256
     return flags, new_run(Path(flags.output), flags.name, settings, flags.init, digest)
 

@@ -68,10 +68,6 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
     )
 
 
-class UsageError(GridSimError):
-    """Wrong use; the message is one line for the user."""
-
-
 def cores() -> int:
     """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -161,7 +157,7 @@ def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
         if not argument.startswith("--") or {flag, flag.replace("--no-", "--")} & {"--", "--help", *known}:
             continue
         if instead := getattr(kind, "removed", {}).get(flag):
-            raise UsageError(f"{flag} was removed: {instead}")
+            raise GridSimError(f"{flag} was removed: {instead}")
         like = difflib.get_close_matches(flag, known, 1)
         meant = f"; did you mean {like[0]}?" if like else ""
         fail(prog, f"unrecognized {flag}{meant}", f"see {command_path(prog)} --help")
@@ -181,7 +177,7 @@ def _about(kind: type) -> str:
 
 
 def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Collection[str], what: str) -> None:
-    """Raises UsageError if flags contradict those of the run or comparison (`what`) that is resumed.
+    """Raises GridSimError if flags contradict those of the run or comparison (`what`) that is resumed.
 
     Args: `free` fields may differ; fields that `may_grow` may be greater, where 0 means unlimited.
     """
@@ -196,7 +192,7 @@ def check_unchanged(flags: Any, before: Any, free: Collection[str], may_grow: Co
         if f.name in may_grow:
             problem = problem if old else f"does not limit the {what}"
             remedy = f"give a greater {' or '.join(as_flag(name) for name in may_grow if getattr(before, name))}"
-        raise UsageError(f"{as_flag(f.name)} {new} {problem}; {remedy}, or start a new {what}")
+        raise GridSimError(f"{as_flag(f.name)} {new} {problem}; {remedy}, or start a new {what}")
 
 
 def select(kind: type[T], flags: Any) -> T:

@@ -21,7 +21,6 @@ from rich.table import Table
 from cluster.commands.common import (
     FAILED,
     INTERRUPTED,
-    UsageError,
     WorkFlags,
     as_flag,
     check_unchanged,
@@ -111,7 +110,7 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
     """The comparison's folder, checked; nothing is written yet. Raises GridSimError."""
     check_workers(flags.workers, flags.address, flags.patience)
     if not 1 <= flags.jobs <= MAX_JOBS:
-        raise UsageError(f"--jobs must be 1 to {MAX_JOBS}, not {flags.jobs}")
+        raise GridSimError(f"--jobs must be 1 to {MAX_JOBS}, not {flags.jobs}")
     if flags.resume:
         folder = open_comparison(Path(flags.resume))
         before = CompareFlags(**vars(folder.plan), output=str(folder.path.parent), name=folder.path.name)
@@ -230,7 +229,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     default = CompareFlags()
     for f in dataclasses.fields(CompareFlags):
         if f.name not in WITH_RUNS and getattr(flags, f.name) != getattr(default, f.name):
-            raise UsageError(f"{as_flag(f.name)}: finished runs are compared as they are; leave it out")
+            raise GridSimError(f"{as_flag(f.name)}: finished runs are compared as they are; leave it out")
     runs = read_runs([Path(name) for name in flags.runs])
     results = Results(new_folder(Path(flags.output), flags.name, "comparison"))
     with console.status("measuring errors") as shown:

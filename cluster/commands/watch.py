@@ -20,7 +20,7 @@ import tyro
 from rich.console import Console
 from rich.progress import track
 
-from cluster.commands.common import FAILED, RoadFlags, UsageError, command_path, fail, main, parse
+from cluster.commands.common import FAILED, RoadFlags, command_path, fail, main, parse
 from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
@@ -30,6 +30,7 @@ from cluster.runs.settings import IN_WORDS, MAX_TRAFFIC
 from cluster.runs.steps import read_elites
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.scenarios import build, check_name, default_traffic, label
 from gridsim.traffic.world import spawn
@@ -93,15 +94,15 @@ class DriveFlags:
 
 
 def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
-    """Width and height in pixels, and seconds, infinite for 0. Raises UsageError if these or --traffic are wrong."""
+    """Width and height in pixels, and seconds, infinite for 0. Raises GridSimError if these or --traffic are wrong."""
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
     width, height = (int(match[1]), int(match[2])) if match else (0, 0)
     if not (64 <= min(width, height) <= max(width, height) <= 4096) or width % 2 or height % 2:
-        raise UsageError(f"--size {size}: give width x height, even and from 64 to 4096, as in 640x360")
+        raise GridSimError(f"--size {size}: give width x height, even and from 64 to 4096, as in 640x360")
     if not 0.0 <= seconds <= 36_000.0:
-        raise UsageError(f"--seconds must be 0 to 36,000, not {seconds:g}")
+        raise GridSimError(f"--seconds must be 0 to 36,000, not {seconds:g}")
     if not -1 <= traffic <= MAX_TRAFFIC:
-        raise UsageError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {traffic}")
+        raise GridSimError(f"--traffic must be 0 to {MAX_TRAFFIC}, not {traffic}")
     return (width, height), seconds or math.inf
 
 
@@ -124,14 +125,14 @@ def watch_main() -> None:
 def _watch() -> int:
     flags = parse(WatchFlags, WATCH, sys.argv[1:])
     if not 0 <= flags.fps <= 120:
-        raise UsageError(f"--fps must be 1 to 120, not {flags.fps}")
+        raise GridSimError(f"--fps must be 1 to 120, not {flags.fps}")
     size, seconds = _size_and_seconds(
         flags.size or ("640x360" if flags.output else "960x640"), flags.seconds, flags.traffic
     )
     if flags.scenario:
         check_name(flags.scenario)
     if flags.beside and not flags.output.lower().endswith(".html"):
-        raise UsageError("several champions can only be shown on a page: --output drive.html")
+        raise GridSimError("several champions can only be shown on a page: --output drive.html")
     if flags.output.lower().endswith(".html"):
         _page(flags, seconds)
     elif flags.output:
@@ -152,29 +153,29 @@ def checkpoint_time(run: Path) -> int:
 def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     """A run's elite of a generation (of a DQN: the network of an evaluation), or the newest, and its title.
 
-    Raises: RunError, CheckpointError, UsageError.
+    Raises: GridSimError.
     """
     settings, _ = read_config(run / CONFIG)
     genomes = read_elites(run, settings.policy)
     step = settings.counts[0]  # generation, or evaluation
     number = len(genomes) - 1 if generation is None else generation
     if not 0 <= number < len(genomes):
-        raise UsageError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
+        raise GridSimError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
     champion = Champion(genomes[number], settings.policy, settings.scenario, SimConfig(), settings.traffic)
     return champion, f"elite of {step} {number}"
 
 
 def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
-    """A function that returns each drive's driver and its title. Raises UsageError, RunError, CheckpointError."""
+    """A function that returns each drive's driver and its title. Raises GridSimError."""
     source, of_run = Path(flags.source), flags.generation is not None or flags.follow
     if flags.generation is not None and flags.follow:
-        raise UsageError("--generation and --follow exclude each other; leave one out")
+        raise GridSimError("--generation and --follow exclude each other; leave one out")
     if of_run and source.is_file():
-        raise UsageError(f"{source} holds one driver; give a run's folder with --generation or --follow")
+        raise GridSimError(f"{source} holds one driver; give a run's folder with --generation or --follow")
     if flags.follow and flags.output:
-        raise UsageError("--follow needs a window; leave out --output, or film one elite with --generation")
+        raise GridSimError("--follow needs a window; leave out --output, or film one elite with --generation")
     if not source.exists():
-        raise UsageError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
+        raise GridSimError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
     if of_run and not (source / CONFIG).is_file():
         raise RunError(f"{source} is not a run's folder: it has no {CONFIG}")
     if not flags.follow:
@@ -214,7 +215,7 @@ def _drives_once(flags: WatchFlags, seconds: float) -> list[tuple[Recording, str
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     """The episodes of a recorded drive."""
     if flags.generation is not None or flags.follow or flags.scenario or flags.traffic != -1:
-        raise UsageError(
+        raise GridSimError(
             "a recorded drive has its own driver and road; leave out --generation, --follow, --scenario and --traffic"
         )
     recorded, config = read_drive(flags.source), SimConfig()
@@ -229,12 +230,12 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
 
 
 def _output(flags: WatchFlags) -> Path:
-    """Where to write. Raises UsageError for another kind of file, or if there is no such folder."""
+    """Where to write. Raises GridSimError for another kind of file, or if there is no such folder."""
     output = Path(flags.output)
     if output.suffix.lower() not in (*CODING, ".html"):
-        raise UsageError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
+        raise GridSimError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
     if not output.parent.is_dir():
-        raise UsageError(f"--output {output}: there is no folder {output.parent}; create it first")
+        raise GridSimError(f"--output {output}: there is no folder {output.parent}; create it first")
     return output
 
 
@@ -251,7 +252,7 @@ def _page(flags: WatchFlags, limit: float) -> None:
             if not recorded:  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
-        raise UsageError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
+        raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     title = f"GridSim: {', '.join((flags.source, *flags.beside))} on {shown[0].drive.scenario.name}"
     write_page(output, title, shown, SimConfig())
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
@@ -263,7 +264,7 @@ def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     suffix = output.suffix.lower()
     fps = flags.fps or (10 if suffix == ".gif" else 20)
     if suffix == ".gif" and 100 % fps:
-        raise UsageError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
+        raise GridSimError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
     if not (flags.seconds or _is_recording(flags)):
         limit = FILM_S
     drives = _drives_once(flags, limit)

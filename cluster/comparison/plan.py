@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from cluster.comparison.results import LEARNERS, ExperimentError, Learner, Run, read_run
+from cluster.comparison.results import LEARNERS, Learner, Run, read_run
 from cluster.runs import checkpoint
 from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, new_run, open_run, read_config
 from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
@@ -56,16 +56,16 @@ class Cell(NamedTuple):
         return (self.folder / SUMMARY).is_file()
 
     def check(self) -> None:
-        """Raises ExperimentError or RunError if the folder holds something else."""
+        """Raises GridSimError if the folder holds something else."""
         if (self.folder / CONFIG).is_file():
             if read_config(self.folder / CONFIG)[0] != self.settings:
-                raise ExperimentError(
+                raise GridSimError(
                     f"{self.folder} is not what {COMPARISON} asks for: one of them was edited, or another version of "
                     "GridSim wrote it; start a new comparison"
                 )
         # A run that is killed while it writes its first file leaves a hidden one.
         elif self.folder.is_file() or any(self.folder.glob("[!.]*")):
-            raise ExperimentError(f"{self.folder} is in the way and is not a run; move it elsewhere")
+            raise GridSimError(f"{self.folder} is in the way and is not a run; move it elsewhere")
 
     def open(self) -> RunFolder:
         """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""
@@ -109,17 +109,17 @@ class Plan:
         """Raises GridSimError, one line that says what to change."""
         for flag, given in (("scenarios", self.scenarios), ("learners", self.learners)):
             if not given:
-                raise ExperimentError(f"--{flag}: name at least one")
+                raise GridSimError(f"--{flag}: name at least one")
             if len(set(given)) != len(given):
-                raise ExperimentError(f"--{flag}: {next(n for n in given if given.count(n) > 1)} is named twice")
+                raise GridSimError(f"--{flag}: {next(n for n in given if given.count(n) > 1)} is named twice")
         for learner in self.learners:
             if learner not in LEARNERS:
-                raise ExperimentError(f"--learners: {learner!r:.40} is not a learner; use {', '.join(LEARNERS)}")
+                raise GridSimError(f"--learners: {learner!r:.40} is not a learner; use {', '.join(LEARNERS)}")
         if not 1 <= self.seeds <= MAX_SEEDS:
-            raise ExperimentError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
+            raise GridSimError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
         cells = dataclasses.replace(self, seeds=1).cells(Path())
         if len({cell.name for cell in cells}) != len(cells):
-            raise ExperimentError("two runs would have the same name: rename a map, or name a value of --grid once")
+            raise GridSimError("two runs would have the same name: rename a map, or name a value of --grid once")
         for cell in cells:
             cell.settings.check()
 
@@ -133,7 +133,7 @@ class Plan:
         return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
-        """The combinations of `grid` for a learner, by the settings' names. Raises ExperimentError."""
+        """The combinations of `grid` for a learner, by the settings' names. Raises GridSimError."""
         plain = self.settings(self.scenarios[0], learner, 0)
         choices: list[list[tuple[str, Any]]] = []
         for text in self.grid:
@@ -141,13 +141,13 @@ class Plan:
             name = flag.replace("-", "_")
             if name in PLANNED or name not in vars(plain):
                 what = "the comparison sets it" if name in PLANNED else f"{learner} has no such setting"
-                raise ExperimentError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
+                raise GridSimError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
             kind = type(getattr(plain, name))
             try:  # a name may have commas, and begins with a letter
                 words = re.split(",(?=[a-z])" if kind is str else ",", values)
                 choices.append([(name, kind(float(word)) if kind is int else kind(word)) for word in words])
             except ValueError:
-                raise ExperimentError(f"--grid {text:.80}: give numbers, as in {flag}=1,2") from None
+                raise GridSimError(f"--grid {text:.80}: give numbers, as in {flag}=1,2") from None
         return [dict(chosen) for chosen in itertools.product(*choices)]
 
     def settings(
@@ -181,22 +181,22 @@ class Plan:
 def limits(budget: str) -> tuple[int, float]:
     """Car-steps and seconds of wall time that a run may use at most; 0 for the one that is not limited.
 
-    Reads `20M`, `500k` or `20,000,000` car-steps; `60s`, `5min` or `1h` of wall time. Raises ExperimentError.
+    Reads `20M`, `500k` or `20,000,000` car-steps; `60s`, `5min` or `1h` of wall time. Raises GridSimError.
     """
     match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?)\s*(k|M|G|s|min|h)?", re.sub(r"(?<=\d)[,_](?=\d)", "", budget))
     if not match:
-        raise ExperimentError(
+        raise GridSimError(
             f"--budget {budget[:40]}: give car-steps, as in 20M or 500k, or wall time, as in 60s, 5min or 1h"
         )
     number, unit = float(match[1]), match[2] or ""
     if unit in ("s", "min", "h"):
         seconds = round(number * {"s": 1.0, "min": 60.0, "h": 3600.0}[unit], 3)
         if not 1.0 <= seconds <= MAX_WALL_S:
-            raise ExperimentError(f"--budget {budget[:40]}: wall time must be 1 s to 30 days")
+            raise GridSimError(f"--budget {budget[:40]}: wall time must be 1 s to 30 days")
         return 0, seconds
     steps = round(number * {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}[unit])
     if not 1 <= steps <= MAX_CAR_STEPS:
-        raise ExperimentError(f"--budget {budget[:40]}: car-steps must be 1 to {MAX_CAR_STEPS:,}")
+        raise GridSimError(f"--budget {budget[:40]}: car-steps must be 1 to {MAX_CAR_STEPS:,}")
     return steps, 0.0
 
 
@@ -223,15 +223,15 @@ class ComparisonFolder:
 
 
 def open_comparison(folder: Path) -> ComparisonFolder:
-    """A comparison's folder, to be resumed or read. Raises ExperimentError."""
+    """A comparison's folder, to be resumed or read. Raises GridSimError."""
     path = folder / COMPARISON
     if not path.is_file():
         reason = f"it has no {COMPARISON}" if folder.is_dir() else "no such folder"
-        raise ExperimentError(f"{folder} is not a comparison's folder: {reason}")
+        raise GridSimError(f"{folder} is not a comparison's folder: {reason}")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
-            raise ExperimentError(f"not a {COMPARISON} of this GridSim")
+            raise GridSimError(f"not a {COMPARISON} of this GridSim")
         values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in content["plan"].items()
         }
@@ -240,9 +240,9 @@ def open_comparison(folder: Path) -> ComparisonFolder:
         uri, key = str(content.get("tracking_uri", "")), uuid.UUID(content["tracking_key"]).hex
         return ComparisonFolder(folder.resolve(), plan, uri, key)
     except GridSimError as error:
-        raise ExperimentError(f"{path}: {error}") from error
+        raise GridSimError(f"{path}: {error}") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise ExperimentError(f"{path}: not a {COMPARISON} of this GridSim ({type(error).__name__})") from error
+        raise GridSimError(f"{path}: not a {COMPARISON} of this GridSim ({type(error).__name__})") from error
 
 
 def read_runs(folders: Iterable[Path]) -> list[Run]:
@@ -253,7 +253,7 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
             comparison = open_comparison(folder)
             runs = [read_run(cell.folder) for cell in comparison.plan.cells(comparison.path) if cell.finished()]
             if not runs:
-                raise ExperimentError(f"{folder}: none of its runs is finished; continue it with --resume {folder}")
+                raise GridSimError(f"{folder}: none of its runs is finished; continue it with --resume {folder}")
             found += runs
         else:
             found.append(read_run(folder))
@@ -263,6 +263,6 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
         other = first.setdefault(same, run)
         if other is not run:
             if other.folder.resolve() == run.folder.resolve():
-                raise ExperimentError(f"{run.folder.resolve()} is named twice")
-            raise ExperimentError(f"{other.folder} and {run.folder} are the same run, made twice; leave one out")
+                raise GridSimError(f"{run.folder.resolve()} is named twice")
+            raise GridSimError(f"{other.folder} and {run.folder} are the same run, made twice; leave one out")
     return found

@@ -46,10 +46,6 @@ RUN_FIGURES = (
 champion), and what training had cost when the final champion was bred."""
 
 
-class ExperimentError(GridSimError):
-    """A comparison that cannot be made, read or resumed; the message is one line for the user."""
-
-
 @dataclass(frozen=True)
 class Run:
     """A finished training run, of a comparison or any other."""
@@ -61,14 +57,14 @@ class Run:
 
 
 def read_run(folder: Path) -> Run:
-    """A finished run from its folder. Raises ExperimentError, RunError, CheckpointError."""
+    """A finished run from its folder. Raises GridSimError."""
     path = folder / SUMMARY
     if not folder.is_dir():
-        raise ExperimentError(f"{folder}: no such folder" if not folder.exists() else f"{folder} is not a folder")
+        raise GridSimError(f"{folder}: no such folder" if not folder.exists() else f"{folder} is not a folder")
     if not (folder / CONFIG).is_file():
-        raise ExperimentError(f"{folder} is not a run's folder: it has no {CONFIG}")
+        raise GridSimError(f"{folder} is not a run's folder: it has no {CONFIG}")
     if not path.is_file():
-        raise ExperimentError(f"{folder} is not finished: it has no {SUMMARY}; finish it with --resume {folder}")
+        raise GridSimError(f"{folder} is not finished: it has no {SUMMARY}; finish it with --resume {folder}")
     settings, _ = read_config(folder / CONFIG)
     champion = load_champion(folder / CHAMPION)
     try:
@@ -77,14 +73,14 @@ def read_run(folder: Path) -> Run:
         found = summary["scenario"], summary["seed"], summary["champion_sha256"]
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         reason = f"{path} is damaged, or of an earlier version ({type(error).__name__})"
-        raise ExperimentError(f"{reason}; delete it, and make it again with --resume {folder}") from error
+        raise GridSimError(f"{reason}; delete it, and make it again with --resume {folder}") from error
     if found != (settings.scenario, settings.seed, champion.sha256):
-        raise ExperimentError(f"{folder}: {CONFIG}, {CHAMPION} and {SUMMARY} do not belong together; one was edited")
+        raise GridSimError(f"{folder}: {CONFIG}, {CHAMPION} and {SUMMARY} do not belong together; one was edited")
     return Run(folder, settings, champion.sha256, figures)
 
 
 def measured(run: Run) -> Run:
-    """A run with its errors. Raises ExperimentError."""
+    """A run with its errors. Raises GridSimError."""
     return dataclasses.replace(run, figures={**run.figures, **errors_of(run)})
 
 
@@ -114,17 +110,17 @@ def series(
 
 
 def errors_of(run: Run) -> dict[str, float]:
-    """ERROR_FIGURES of a run's champion, nan if it never drives a metre forward. Raises ExperimentError."""
+    """ERROR_FIGURES of a run's champion, nan if it never drives a metre forward. Raises GridSimError."""
     settings = run.settings
     try:
         champion = load_champion(run.folder / CHAMPION)
         found = series(champion, settings.scenario, HELD_OUT_EPISODES, traffic=settings.traffic)
     except ValueError as error:
-        raise ExperimentError(f"{run.folder}: no errors can be measured: {error}") from error
+        raise GridSimError(f"{run.folder}: no errors can be measured: {error}") from error
     figures = errors(found, VehicleConfig()) if found else {}
     driven, expected = figures.get("metres", 0.0) / HELD_OUT_EPISODES + LEFT_OUT_M, run.figures["distance_m"]
     if driven < LEAST_SHARE * expected:
-        raise ExperimentError(
+        raise GridSimError(
             f"{run.folder}: its champion drives {driven:,.0f} m where {SUMMARY} says {expected:,.0f} m: another "
             "version of GridSim made it; make it again, or leave it out"
         )

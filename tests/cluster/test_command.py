@@ -14,11 +14,12 @@ from commands import call, start
 from cluster.commands import common as command
 from cluster.commands import entry, watch
 from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, evolve_main
-from cluster.commands.common import UsageError, command_path, main, parse, warn_of_many_workers
+from cluster.commands.common import command_path, main, parse, warn_of_many_workers
 from cluster.commands.compare import CompareFlags
 from cluster.commands.watch import DriveFlags, WatchFlags
 from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError
+from gridsim.errors import GridSimError
 from gridsim.view.render import NoDisplayError
 
 FLAGS = {
@@ -152,7 +153,7 @@ def test_a_command_is_entered_and_ctrl_c_is_quiet_while_its_libraries_load(monke
 @pytest.mark.parametrize(
     ("error", "code", "lines"),
     [
-        (UsageError("no such\nroad"), 2, ["p: error: no such road"]),
+        (GridSimError("no such\nroad"), 2, ["p: error: no such road"]),
         (NoDisplayError("no display"), 2, ["p: error: no display", "film it"]),
     ],
 )

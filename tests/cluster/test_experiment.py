@@ -9,7 +9,7 @@ import pytest
 from finished_runs import make_run
 
 from cluster.comparison.plan import ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import LEARNERS, ExperimentError
+from cluster.comparison.results import LEARNERS
 from cluster.comparison.tables import group
 from cluster.runs.settings import DqnSettings
 from evolution.networks.policy import PolicySpec
@@ -32,7 +32,7 @@ def test_budget_is_read(text, steps, seconds):
 
 @pytest.mark.parametrize("text", ["", "20m", "-5", "0", "0s", "1e9", "60 parsecs", "99999h", "inf", "nan", "9" * 40])
 def test_budget_that_makes_no_sense(text):
-    with pytest.raises(ExperimentError, match="--budget"):
+    with pytest.raises(GridSimError, match="--budget"):
         limits(text)
 
 
@@ -115,9 +115,9 @@ def test_budget_is_looked_at_often_enough(budget, every):
 def test_same_run_twice_is_refused(tmp_path):
     make_run(tmp_path / "a")
     shutil.copytree(tmp_path / "a", tmp_path / "b")
-    with pytest.raises(ExperimentError, match="named twice"):
+    with pytest.raises(GridSimError, match="named twice"):
         read_runs([tmp_path / "a", tmp_path / "../" / tmp_path.name / "a"])
-    with pytest.raises(ExperimentError, match="the same run"):
+    with pytest.raises(GridSimError, match="the same run"):
         read_runs([tmp_path / "a", tmp_path / "b"])
 
 
@@ -125,7 +125,7 @@ def test_a_comparison_stands_for_its_finished_runs(tmp_path):
     folder = ComparisonFolder(tmp_path, PLAN)
     folder.write()
     assert open_comparison(tmp_path) == folder
-    with pytest.raises(ExperimentError, match="none of its runs"):
+    with pytest.raises(GridSimError, match="none of its runs"):
         read_runs([tmp_path])
     make_run(PLAN.cells(tmp_path)[0].folder)
     assert [found.folder.name for found in read_runs([tmp_path])] == ["curved-evolution-s0"]
@@ -150,7 +150,7 @@ def test_edited_comparison_is_refused(tmp_path, change):
     ComparisonFolder(tmp_path, PLAN).write()
     path = tmp_path / "comparison.json"
     path.write_text(change if isinstance(change, str) else json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(ExperimentError, match=r"comparison\.json") as refused:
+    with pytest.raises(GridSimError, match=r"comparison\.json") as refused:
         open_comparison(tmp_path)
     assert len(str(refused.value).splitlines()) == 1
 
@@ -159,16 +159,16 @@ def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
     first, second, third = PLAN.cells(tmp_path)[:3]
     make_run(first.folder, settings=first.settings)
     first.check()
-    with pytest.raises(ExperimentError, match="one of them was edited, or another version of GridSim wrote it"):
+    with pytest.raises(GridSimError, match="one of them was edited, or another version of GridSim wrote it"):
         dataclasses.replace(PLAN, traffic=4).cells(tmp_path)[0].check()
-    with pytest.raises(ExperimentError, match="one of them was edited"):
+    with pytest.raises(GridSimError, match="one of them was edited"):
         dataclasses.replace(PLAN, population=64).cells(tmp_path)[0].check()
     shutil.move(first.folder, second.folder)
-    with pytest.raises(ExperimentError, match="one of them was edited"):
+    with pytest.raises(GridSimError, match="one of them was edited"):
         second.check()
     third.folder.mkdir()
     (third.folder / ".config.json.123.tmp").write_text("{")  # left by a run that was killed as it began
     third.check()
     (third.folder / "mine.txt").write_text("dear diary")
-    with pytest.raises(ExperimentError, match="in the way"):
+    with pytest.raises(GridSimError, match="in the way"):
         third.check()

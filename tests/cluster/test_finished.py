@@ -7,7 +7,7 @@ import pytest
 from finished_runs import HELD_OUT, make_run
 
 import gridsim
-from cluster.comparison.results import ERROR_FIGURES, ExperimentError, errors_of, read_run
+from cluster.comparison.results import ERROR_FIGURES, errors_of, read_run
 from gridsim.errors import GridSimError
 
 
@@ -16,7 +16,7 @@ def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path)
     made = read_run(tmp_path / "r")
     assert set(errors_of(made)) == set(ERROR_FIGURES)  # however short: it is no other version's
     other = dataclasses.replace(made, figures={**made.figures, "distance_m": 2000.0})
-    with pytest.raises(ExperimentError, match="another version of GridSim made it"):
+    with pytest.raises(GridSimError, match="another version of GridSim made it"):
         errors_of(other)
 
 
@@ -70,5 +70,5 @@ def test_damaged_run_is_refused(tmp_path, file, text, said):
 def test_edited_summary_is_refused(tmp_path, change, said):
     summary = make_run(tmp_path / "a")
     (tmp_path / "a/summary.json").write_text(json.dumps({**summary, **change}))
-    with pytest.raises(ExperimentError, match=said):
+    with pytest.raises(GridSimError, match=said):
         read_run(tmp_path / "a")
