@@ -110,23 +110,15 @@ class Identity:
 
 @dataclass(frozen=True)
 class Model:
-    """The champion as a torch model, and the registered version that it becomes.
+    """The champion as a torch model, and the registered version that it becomes."""
 
-    Attributes:
-        name: of the registered model.
-        champion_sha256: digest of the champion's genome; a run registers one champion once.
-        about: what all versions of the registered model have in common, Markdown.
-        note: what this version is, Markdown.
-        tags: the version's; the saved model has them as its metadata.
-        build: makes the module and an input for it, float32 [n, inputs] with n of 2 or more, so that what is written
-            takes any n; called in the tracker's thread, as torch takes seconds to import.
-    """
-
-    name: str
-    champion_sha256: str
-    about: str
-    note: str
-    tags: Mapping[str, str]
+    name: str  # of the registered model
+    champion_sha256: str  # digest of the champion's genome; a run registers one champion once
+    about: str  # what all versions of the registered model have in common, Markdown
+    note: str  # what this version is, Markdown
+    tags: Mapping[str, str]  # the version's; the saved model has them as its metadata
+    # Makes the module and an input for it, float32 [n, inputs] with n of 2 or more, so that what is written takes any
+    # n. It is called in the tracker's thread, as torch takes seconds to import.
     build: Callable[[], tuple[torch.nn.Module, np.ndarray]]
 
 
