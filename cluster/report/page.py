@@ -11,11 +11,11 @@ import base64
 import io
 import json
 import math
-import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 
@@ -85,7 +85,7 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
     return [x / size[0] * TURN, y / size[1] * TURN, np.arctan2(sine, cosine) / math.tau * TURN]
 
 
-def write_page(path: str | os.PathLike[str], title: str, shown: Sequence[Shown], config: SimConfig) -> None:
+def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig) -> None:
     """Write a page of drives on one map, which shows the last of them first. Raises: CheckpointError."""
     road_map, constant = shown[-1].drive.scenario, constants(config)
     x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)

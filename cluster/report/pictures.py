@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,15 +23,13 @@ _LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00",
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
     """A figure that needs no display and no global state, and the axes of its columns."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
-def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str], step_name: str) -> None:
+def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -> None:
     """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
     figure, axes = _figure(15, 3.8, 4)
     step = np.arange(len(history))
@@ -66,10 +63,10 @@ def curves(history: Sequence[Mapping[str, float]], path: str | os.PathLike[str],
         axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
         axis.legend(loc="lower right", frameon=False, fontsize=8)
-    figure.savefig(Path(path), dpi=100)
+    figure.savefig(path, dpi=100)
 
 
-def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], title: str) -> None:
+def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> None:
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
 
@@ -98,10 +95,10 @@ def trajectory(scenario: Map, states: np.ndarray, path: str | os.PathLike[str], 
     axis.legend(loc="upper right")
     axis.set_title(title)
     figure.colorbar(lines, ax=axis, shrink=0.8, label="speed, m/s")
-    figure.savefig(Path(path), dpi=100)
+    figure.savefig(path, dpi=100)
 
 
-def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
+def comparison(groups: Sequence[Group], path: Path) -> None:
     """Draw velocity error and training time of each road and learner to a PNG.
 
     Bars are medians over seeds, whiskers quartiles, dots the seeds.
@@ -143,7 +140,7 @@ def comparison(groups: Sequence[Group], path: str | os.PathLike[str]) -> None:
         bars.values(), bars, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
         title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
     )  # fmt: skip
-    figure.savefig(Path(path), dpi=100)
+    figure.savefig(path, dpi=100)
 
 
 def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
