@@ -28,18 +28,13 @@ class Tracker:
     """One MLflow run, found or created, and filled by a background thread, which starts with the first row.
 
     A resumed run hands over its whole history, and what MLflow has is skipped. A store without this run gets a new one.
-
-    Attributes:
-        run_id: MLflow's id of the run, or None until there is one.
-        error: why the last attempt to send something failed, in one line; None once a sync has succeeded.
-        sent: how many rows, files and models reached MLflow that were not there before.
     """
 
     def __init__(self, identity: Identity):
         self.uri = identity.uri
-        self.run_id: str | None = None
-        self.error: str | None = None
-        self.sent = Counter(row=0, file=0, model=0)
+        self.run_id: str | None = None  # MLflow's id of the run, once there is one
+        self.error: str | None = None  # why the last attempt to send something failed, in one line; None if none did
+        self.sent = Counter(row=0, file=0, model=0)  # what reached MLflow that was not there before
         self._identity = identity
         self._run: LoggedRun | None = None
         # What MLflow lacks: the run adds to it, and the thread removes what it has sent.
