@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
@@ -188,13 +187,13 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
     return partial(elite, source, None)
 
 
-def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]]:
-    """Yield drives and their titles: a recorded drive's episodes, else without end. Raises GridSimError."""
+def _drives(flags: WatchFlags, seconds: float, most: int | None = 1) -> Iterator[tuple[Recording, str]]:
+    """Yield drives and their titles: a recorded drive's episodes, else so many of a champion. Raises GridSimError."""
     if _is_recording(flags):
         yield from _recorded(flags)
         return
     driver = _driver(flags)
-    for seed in itertools.count(flags.seed):
+    for seed in itertools.islice(itertools.count(flags.seed), most):
         champion, name = driver()
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, seed, champion.sim)
@@ -205,11 +204,6 @@ def _drives(flags: WatchFlags, seconds: float) -> Iterator[tuple[Recording, str]
 
 def _is_recording(flags: WatchFlags) -> bool:
     return flags.source.lower().endswith(".csv")
-
-
-def _drives_once(flags: WatchFlags, seconds: float) -> list[tuple[Recording, str]]:
-    """Like `_drives`, but only one drive of a champion."""
-    return list(_recorded(flags)) if _is_recording(flags) else [next(_drives(flags, seconds))]
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
@@ -246,7 +240,7 @@ def _page(flags: WatchFlags, limit: float) -> None:
     for source in (flags.source, *flags.beside):
         one = dataclasses.replace(flags, source=source)
         recorded = _is_recording(one)
-        for found, title in _drives_once(one, limit):
+        for found, title in _drives(one, limit):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
             shown.append(Shown(label, str(len(shown)), found))
             if not recorded:  # the others drive on the same road, among as many cars
@@ -267,7 +261,7 @@ def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
         raise GridSimError(f"--fps {fps}: a GIF counts in hundredths of a second; use 5, 10, 20, 25 or 50")
     if not (flags.seconds or _is_recording(flags)):
         limit = FILM_S
-    drives = _drives_once(flags, limit)
+    drives = list(_drives(flags, limit))
     seconds = min(limit, sum(drive.seconds for drive, _ in drives))
     total = max(1, round(seconds * fps))
     renderer = Renderer(drives[0][0].scenario, size)
@@ -290,7 +284,7 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     """Show drives in a window until it is closed."""
     fps = flags.fps or 30
     run = Path(flags.source)
-    drives = _drives(flags, SimConfig().episode.time_limit)
+    drives = _drives(flags, SimConfig().episode.time_limit, most=None)  # without end
     first = next(drives)  # raises errors before the window opens
     shown = 0.0
     with contextlib.closing(Window(size, f"GridSim: {flags.source}")) as window:
@@ -319,17 +313,14 @@ def _drive() -> int:
     config = SimConfig()
     scenario, start = _map(flags.scenario, flags.seed, config)
     traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic
-    recorder: Recorder | None = None
-    with contextlib.ExitStack() as stack:
-        window = stack.enter_context(contextlib.closing(Window(size, f"GridSim: {flags.scenario}")))
-        if flags.record:
-            period = config.episode.control_period
-            recorder = stack.enter_context(contextlib.closing(Recorder(flags.record, scenario, period, traffic)))
-            stack.callback(_print_recorded, recorder)  # also if the drive is interrupted
-        done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
-        print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
+    with contextlib.closing(Window(size, f"GridSim: {flags.scenario}")) as window:
+        period = config.episode.control_period
+        recorder = Recorder(flags.record, scenario, period, traffic) if flags.record else None
+        try:
+            done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
+            print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
+        finally:  # also if the drive is interrupted
+            if recorder is not None:
+                recorder.close()
+                print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {recorder.path}")
     return 0
-
-
-def _print_recorded(recorder: Recorder) -> None:
-    print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {recorder.path}")

@@ -33,7 +33,7 @@ class Tracker:
     def __init__(self, identity: Identity):
         self.uri = identity.uri
         self.run_id: str | None = None  # MLflow's id of the run, once there is one
-        self.error: str | None = None  # why the last attempt to send something failed, in one line; None if none did
+        self.error: str | None = None  # why the last sync failed, in one line
         self.sent = Counter(row=0, file=0, model=0)  # what reached MLflow that was not there before
         self._identity = identity
         self._run: LoggedRun | None = None
