@@ -16,7 +16,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, Literal
@@ -93,13 +92,18 @@ class _Teller(Reporter):
         self.note(f"{progress_of(self._learning, bound=False)}  {success}", self._learning.describe(row))
 
 
-@dataclass
 class _Job:
     """A process that trains runs, and the one that it is training."""
 
-    process: Any
-    pipe: Connection
-    cell: Cell | None = None
+    def __init__(self, workers: Workers, learn: Learn):
+        self.cell: Cell | None = None
+        context = multiprocessing.get_context("spawn")
+        self.pipe, there = context.Pipe()
+        self.process = context.Process(target=_main, args=(there, workers, learn))
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it
+        self.process.start()
+        signal.signal(signal.SIGINT, before)
+        there.close()
 
     def give(self, cells: deque[Cell]) -> None:
         """Have it train the next run, or end."""
@@ -114,7 +118,7 @@ def _at_once(cells: deque[Cell], workers: Workers, learn: Learn, number: int, te
     try:
         while cells or jobs:
             while cells and len(jobs) < number:  # at first, and in place of one that has died
-                jobs.append(_start(workers, learn))
+                jobs.append(_Job(workers, learn))
                 jobs[-1].give(cells)
             ready = wait([job.pipe for job in jobs])
             for job in [job for job in jobs if job.pipe in ready]:
@@ -150,17 +154,6 @@ def _compile(cells: Iterable[Cell], tell: Tell) -> None:
                 warming.wait()
         finally:
             warming.stop()
-
-
-def _start(workers: Workers, learn: Learn) -> _Job:
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    process = context.Process(target=_main, args=(there, workers, learn))
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it
-    process.start()
-    signal.signal(signal.SIGINT, before)
-    there.close()
-    return _Job(process, here)
 
 
 def _main(pipe: Connection, workers: Workers, learn: Learn) -> None:

@@ -6,17 +6,14 @@ import sys
 import time
 from collections import deque
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from cluster.runs.train import Reporter
-
-if TYPE_CHECKING:
-    from cluster.runs.train import Session
-    from cluster.training.trainer import Learning
+from cluster.runs.train import Reporter, Session
+from cluster.training.trainer import Learning
 
 LINE_S = 5.0  # between lines without a terminal
 WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time
