@@ -91,11 +91,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Identity:
-    """Which run is meant, and what a new one begins with.
-
-    What differs in a resumed run (more generations, another commit) is added as tag `resumed/<name>`, as MLflow does
-    not let parameters change.
-    """
+    """Which run is meant, and what a new one begins with."""
 
     uri: str  # what `address.check_uri` returned
     experiment: str
@@ -166,7 +162,7 @@ class LoggedRun:
             self._client.update_run(run_id, status="RUNNING")
         for name in data.metrics:
             self._logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
-        # MLflow does not let parameters change; what differs in a run that goes on is added as a tag.
+        # MLflow does not let parameters change; what differs in a run that goes on (another commit) is added as a tag.
         resumed: dict[str, str] = {}
         for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
             changed = {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
