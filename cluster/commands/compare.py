@@ -162,7 +162,8 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
             with console.status("writing tables and the picture"):
                 results.write()
         tracker.log_row(len(results.runs), {"runs_done": len(results.runs)})
-        tracker.log_files(results.files())
+        files = [folder.path / name for name in (COMPARISON, REPORT, TABLE, ROWS, PICTURE)]
+        tracker.log_files(path for path in files if path.is_file())
     again = f"{command_path(PROG)} --resume {short_path(folder.path)}"
     if unsent := tracker.close(status):
         print(f"{PROG}: warning: {unsent}; send it later with: {again}", file=sys.stderr)
@@ -200,11 +201,6 @@ class Results:
         groups = self.groups
         pictures.comparison(groups, self.path / PICTURE)
         checkpoint.write_atomic(self.path / REPORT, page(self.path, groups, self.plan, self.path / PICTURE))
-
-    def files(self) -> list[Path]:
-        """The files that exist."""
-        names = (COMPARISON, REPORT, TABLE, ROWS, PICTURE)
-        return [self.path / name for name in names if (self.path / name).is_file()]
 
     def show(self, console: Console) -> None:
         """Print the tables without their quartiles, and where the complete ones are."""

@@ -54,7 +54,15 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 
     Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited, hostile or not GridSim's.
     """
-    content = _read(Path(path))
+    path = Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise CheckpointError(f"{path}: not a file")
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such file") from None
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
     if not content.startswith(b"PK\x03\x04"):
         raise CheckpointError(f"{path}: {'not a GridSim file' if content else 'the file is empty'}")
     if content[-_DIGEST - len(_MARK) : -_DIGEST] != _MARK:
@@ -103,18 +111,6 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
-
-
-def _read(path: Path) -> bytes:
-    """The whole content of a file. Raises CheckpointError."""
-    try:
-        if path.exists() and not path.is_file():
-            raise CheckpointError(f"{path}: not a file")
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise CheckpointError(f"{path}: no such file") from None
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
 
 
 def one_line(error: BaseException) -> str:
