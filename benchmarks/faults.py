@@ -18,6 +18,7 @@ import csv
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import socket
@@ -213,7 +214,8 @@ class Campaign:
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
             if "Traceback" in self.said() or not (refused or process.returncode in (-signal.SIGKILL, 130, 1)):
                 raise Wrong(f"{name} ends with {process.returncode}: {self.last_words()}")
-        if "not logged to MLflow" in self.said() and self.start("--resume", f"runs/{name}").wait(LONG_S):
+        unsent = re.search("not logged to MLflow|what MLflow lacks is not sent", self.said())
+        if unsent and self.start("--resume", f"runs/{name}").wait(LONG_S):
             raise Wrong(f"{name} cannot be sent later: {self.last_words()}")
         self._check(name)
         shutil.rmtree(self.disk / "runs" / name)
