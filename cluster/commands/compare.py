@@ -102,6 +102,9 @@ def _compare(arguments: Sequence[str]) -> int:
         cell.check()
     folder.tracking_uri = check_uri(flags.tracking_uri, folder.tracking_uri)
     lock(folder.path)
+    if flags.jobs > 1 and limits(flags.budget)[1]:
+        text = "runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps"
+        print(f"{PROG}: warning: {text}", file=sys.stderr)
     warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), flags.address)
     return _train_and_compare(console, folder, cells, flags)
 
@@ -148,11 +151,11 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
                 except TrackingError as error:
                     print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
             workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
-            learn = partial(
+            train_cell = partial(
                 train, workers=workers, uri=uri, experiment=flags.experiment, parent_id=parent,
                 wall_limit_s=limits(folder.plan.budget)[1] or math.inf,
             )  # fmt: skip
-            train_all([cell for cell in cells if not cell.finished()], workers, learn, flags.jobs, shown.tell)
+            train_all([cell for cell in cells if not cell.finished()], workers, train_cell, flags.jobs, shown.show)
     except KeyboardInterrupt:
         code, status = INTERRUPTED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
@@ -261,8 +264,8 @@ class Progress(Line):
         except GridSimError as error:
             self._fail(cell, str(error))
 
-    def tell(self, cell: Cell, kind: Kind, content: Any) -> None:
-        """Show what happens to a run."""
+    def show(self, cell: Cell, kind: Kind, content: Any) -> None:
+        """Show an event of a run."""
         name, now = cell.name, time.perf_counter()
         if kind == "begin":
             self._begun[name], self._lines[name] = now, f"{name}  starting"
@@ -273,11 +276,12 @@ class Progress(Line):
             print(f"{name}: warning: {content}", file=sys.stderr, flush=True)
         else:
             self.left -= 1
-            self._run_s = now - self._begun.pop(name, now)
+            begun = self._begun.pop(name, now)
             self._lines.pop(name, None)
             if kind == "failed":
                 self._fail(cell, content)
             else:
+                self._run_s = now - begun
                 self._done(content)
         self.head, self.facts, self.rest = self._counter(), f"ETA {self._eta()}", "\n".join(self._lines.values())
 

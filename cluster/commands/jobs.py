@@ -1,8 +1,8 @@
 """A comparison's runs: one after another in this process, or several at once, each in a process of its own.
 
-Such a process trains one run after another, so that its imports and its workers serve all of them. It is told a run and
-tells what happens through a pipe; files, locks and resuming are those of any run. When this process dies, the others
-notice at their next message, save their runs and end.
+Such a process, a job, trains one run after another, so that its imports and its workers serve all of them. Through a
+pipe it receives its runs and sends their events; files, locks and resuming are those of any run. If this process dies,
+a job cannot send its next event: it saves its run and ends.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import os
 import signal
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from multiprocessing.connection import Connection, wait
@@ -31,53 +31,53 @@ from gridsim.errors import GridSimError
 
 CLOSING_S = 90.0  # for a run to be saved and closed after a signal; Ray takes most of it
 Kind = Literal["begin", "note", "warning", "done", "failed"]
-Tell = Callable[[Cell, Kind, Any], None]
-"""Receives what happens to a run: "begin"; "note" with two texts; "warning" or "failed" with a text; "done" with its
+OnEvent = Callable[[Cell, Kind, Any], None]
+"""Receives the events of a run: "begin"; "note" with two texts; "warning" or "failed" with a text; "done" with its
 `Run`."""
-Learn = Callable[..., Session]
-"""`train` with all that it needs but the run and the reporter; it is sent to the jobs with its workers."""
+Train = Callable[..., Session]
+"""`train` with all arguments but the run and the reporter."""
 
 
-def train_all(cells: Iterable[Cell], workers: Workers, learn: Learn, jobs: int, tell: Tell) -> None:
+def train_all(cells: Iterable[Cell], workers: Workers, train: Train, jobs: int, on_event: OnEvent) -> None:
     """Train runs, as many at once as `jobs` says, each with such workers. A run that fails does not stop the others.
 
     Raises: KeyboardInterrupt, once all are saved; for what stops all of them, such as a full disk, MemoryError and
     OSError, or with several `jobs` GridSimError.
     """
     if jobs > 1:
-        _at_once(deque(cells), workers, learn, jobs, tell)
+        _at_once(deque(cells), workers, train, jobs, on_event)
         return
     try:
         for cell in cells:
-            _train(cell, workers, learn, tell)
+            _train(cell, workers, train, on_event)
     finally:
         workers.close()
 
 
-def _train(cell: Cell, workers: Workers, learn: Learn, tell: Tell) -> None:
-    tell(cell, "begin", None)
+def _train(cell: Cell, workers: Workers, train: Train, on_event: OnEvent) -> None:
+    on_event(cell, "begin", None)
     try:
-        reporter = _Teller(cell, tell)
-        learn(cell.open(), reporter=reporter)
+        reporter = _CellReporter(cell, on_event)
+        train(cell.open(), reporter=reporter)
         reporter.note("measuring errors")
-        tell(cell, "done", measured(read_run(cell.folder)))
+        on_event(cell, "done", measured(read_run(cell.folder)))
     except (GridSimError, FloatingPointError) as error:  # the other runs go on
-        tell(cell, "failed", str(error))
+        on_event(cell, "failed", str(error))
         workers.close()  # the next run starts new ones
 
 
-class _Teller(Reporter):
-    """Tells how one run goes, in words."""
+class _CellReporter(Reporter):
+    """Turns how one run goes into events."""
 
-    def __init__(self, cell: Cell, tell: Tell):
-        self._tell = partial(tell, cell)
+    def __init__(self, cell: Cell, on_event: OnEvent):
+        self._send = partial(on_event, cell)
         self.resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
 
     def note(self, text: str, more: str = "") -> None:
-        self._tell("note", (text, more))
+        self._send("note", (text, more))
 
     def warn(self, text: str) -> None:
-        self._tell("warning", text)
+        self._send("warning", text)
 
     def compiling(self) -> AbstractContextManager[object]:
         self.note("compiling the simulator for this machine, once")
@@ -95,31 +95,31 @@ class _Teller(Reporter):
 class _Job:
     """A process that trains runs, and the one that it is training."""
 
-    def __init__(self, workers: Workers, learn: Learn):
+    def __init__(self, workers: Workers, train: Train):
         self.cell: Cell | None = None
         context = multiprocessing.get_context("spawn")
         self.pipe, there = context.Pipe()
-        self.process = context.Process(target=_main, args=(there, workers, learn))
+        self.process = context.Process(target=_main, args=(there, workers, train))
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it
         self.process.start()
         signal.signal(signal.SIGINT, before)
         there.close()
 
-    def give(self, cells: deque[Cell]) -> None:
-        """Have it train the next run, or end."""
+    def assign(self, cells: deque[Cell]) -> None:
+        """Send it the next run, or the order to end."""
         self.cell = cells.popleft() if cells else None
-        with contextlib.suppress(OSError):  # it has died, which the pipe's end tells
+        with contextlib.suppress(OSError):  # it has died, which shows at the pipe's end
             self.pipe.send(self.cell)
 
 
-def _at_once(cells: deque[Cell], workers: Workers, learn: Learn, number: int, tell: Tell) -> None:
-    _compile(cells, tell)
+def _at_once(cells: deque[Cell], workers: Workers, train: Train, number: int, on_event: OnEvent) -> None:
+    _compile(cells, on_event)
     jobs: list[_Job] = []
     try:
         while cells or jobs:
             while cells and len(jobs) < number:  # at first, and in place of one that has died
-                jobs.append(_Job(workers, learn))
-                jobs[-1].give(cells)
+                jobs.append(_Job(workers, train))
+                jobs[-1].assign(cells)
             ready = wait([job.pipe for job in jobs])
             for job in [job for job in jobs if job.pipe in ready]:
                 try:
@@ -128,14 +128,14 @@ def _at_once(cells: deque[Cell], workers: Workers, learn: Learn, number: int, te
                     jobs.remove(job)
                     job.process.join()
                     if job.cell is not None:
-                        tell(job.cell, "failed", f"its process ended with exit code {job.process.exitcode}")
+                        on_event(job.cell, "failed", f"its process ended with exit code {job.process.exitcode}")
                     continue
                 if kind == "stopped":
                     raise GridSimError(content)
                 assert job.cell is not None
-                tell(job.cell, kind, content)
+                on_event(job.cell, kind, content)
                 if kind in ("done", "failed"):
-                    job.give(cells)
+                    job.assign(cells)
     finally:
         for job in jobs:
             job.process.terminate()
@@ -144,24 +144,24 @@ def _at_once(cells: deque[Cell], workers: Workers, learn: Learn, number: int, te
             job.process.kill()
 
 
-def _compile(cells: Iterable[Cell], tell: Tell) -> None:
+def _compile(cells: Sequence[Cell], on_event: OnEvent) -> None:
     """Compile the runs' kernels, once for all processes."""
     for cell in cells:
         warming = kernels.Warming(cell.settings)
         try:
             if warming.processes:
-                tell(cell, "note", ("compiling the simulator for this machine, once", ""))
+                on_event(cells[0], "note", ("compiling the simulator for this machine, once", ""))
                 warming.wait()
         finally:
             warming.stop()
 
 
-def _main(pipe: Connection, workers: Workers, learn: Learn) -> None:
+def _main(pipe: Connection, workers: Workers, train: Train) -> None:
     """A job's process: train the runs that come through the pipe. SIGTERM stops it."""
     gc.set_threshold(*GC_THRESHOLDS)
     signal.signal(signal.SIGTERM, interrupt)
 
-    def tell(cell: Cell, kind: Kind, content: Any) -> None:
+    def on_event(cell: Cell, kind: Kind, content: Any) -> None:
         try:
             pipe.send((kind, content))
         except OSError:
@@ -169,8 +169,8 @@ def _main(pipe: Connection, workers: Workers, learn: Learn) -> None:
 
     try:
         while (cell := pipe.recv()) is not None:
-            warnings.showwarning = lambda message, *_, cell=cell, **__: tell(cell, "warning", str(message))
-            _train(cell, workers, learn, tell)
+            warnings.showwarning = lambda message, *_, cell=cell, **__: on_event(cell, "warning", str(message))
+            _train(cell, workers, train, on_event)
     except (KeyboardInterrupt, EOFError):
         pass
     except (MemoryError, OSError) as error:

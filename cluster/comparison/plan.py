@@ -34,7 +34,7 @@ FORMAT = 2
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
 UNBOUND = MAX_STEPS  # generations or car-steps, if a budget ends the run
 EVALUATIONS = 10  # of the DQN, at least
-# Settings that the other flags decide, so that --grid cannot vary them.
+# Settings that other flags or the comparison itself decide, so that --grid cannot vary them.
 PLANNED = (
     "scenario", "traffic", "seed", "observation", "until", "search", "recombination", "car_steps", "generations",
     "evaluate_every",
@@ -139,11 +139,12 @@ class Plan:
         for text in self.grid:
             flag, _, values = text.partition("=")
             name = flag.replace("-", "_")
-            if name in PLANNED or name not in vars(plain):
-                what = "the comparison sets it" if name in PLANNED else f"{learner} has no such setting"
+            planned = name in PLANNED or (name == "population" and self.population)
+            if planned or name not in vars(plain):
+                what = "the comparison sets it" if planned else f"{learner} has no such setting"
                 raise GridSimError(f"--grid {text:.80}: {what}; vary another one, as in sigma=0.3,0.5")
             kind = type(getattr(plain, name))
-            try:  # a name may have commas, and begins with a letter
+            try:  # a word, such as mlp:6,7, may have commas, and begins with a letter
                 words = re.split(",(?=[a-z])" if kind is str else ",", values)
                 choices.append([(name, kind(float(word)) if kind is int else kind(word)) for word in words])
             except ValueError:

@@ -119,10 +119,11 @@ def comparison(groups: Sequence[Group], path: Path) -> None:
             if not found.n:
                 axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
                 continue
+            color = f"C{names.index(group.name) % 10}" if group.variant else _LEARNERS[group.learner]
             whiskers = [[found.median - found.lower], [found.upper - found.median]] if found.n > 1 else None
             hatch = "//" if group.observation == "grid" and several_observations else None
             axis.bar(
-                place, found.median, 0.92 * width, color=_LEARNERS[group.learner], alpha=0.75, yerr=whiskers, capsize=3,
+                place, found.median, 0.92 * width, color=color, alpha=0.75, yerr=whiskers, capsize=3,
                 hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2, label=group.name,
             )  # fmt: skip
             seeds = [value for value in group.values(name) if np.isfinite(value)]

@@ -299,7 +299,7 @@ class Session:
 
         self.reporter.note("measuring the champion on held-out drives")
         learning, path, settings = self.learning, self.run.path, self.run.settings
-        learning.choose_last()
+        learning.choose_champion()
         assert learning.champion is not None
         champion = Champion(
             learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic

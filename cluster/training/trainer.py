@@ -174,7 +174,7 @@ class Learning(ABC):
     def candidate(self) -> np.ndarray | None:
         """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
-    def choose_last(self) -> None:
+    def choose_champion(self) -> None:
         """Choose between the champion and the last candidate when an unsolved run ends, on maps of their own.
 
         A champion is the best of many on the same maps, so that its score there is too high, in traffic by some

@@ -177,7 +177,7 @@ def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_wha
 def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_each_alone(tmp_path):
     folder = tmp_path / "runs" / "c"
     asked = ["--scenarios", "curved", "seamless", "--learners", "evolution", "--seeds", "2", "--population", "64"]
-    plan = Plan(("curved", "seamless"), ("evolution",), 2, budget="1h", population=64, generations=12)
+    plan = Plan(("curved", "seamless"), ("evolution",), 2, budget="1G", population=64, generations=12)
     cells = plan.cells(folder)
     at_once = ["--workers", "0", "--jobs", "2"]
 
@@ -187,7 +187,7 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     def both_saved():
         return all((cell.folder / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
 
-    process = start("gridsim-compare", *asked, "--budget", "1h", "--generations", "12", *at_once, "--name", "c",
+    process = start("gridsim-compare", *asked, "--budget", "1G", "--generations", "12", *at_once, "--name", "c",
                     cwd=tmp_path)  # fmt: skip
     try:
         wait_until(both_saved, 240)

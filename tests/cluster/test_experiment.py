@@ -52,6 +52,7 @@ def test_budget_that_makes_no_sense(text):
         ({"grid": ("sigma=-1",)}, "sigma"),
         ({"grid": ("sigma=1,1.0",)}, "same name"),
         ({"grid": ("seed=1,2",)}, "the comparison sets it"),
+        ({"grid": ("population=64",), "population": 32}, "the comparison sets it"),
         ({"grid": ("check=1",)}, "evolution has no such setting"),
         ({"grid": ("sigma=1",), "learners": ("evolution", "dqn")}, "dqn has no such setting"),
     ],

@@ -346,6 +346,7 @@ def test_the_store_keeps_one_scenarios_maps_and_a_worker_gets_each_once() -> Non
         ("seamless", [0, 1, 2], [0, 1, 2], []),
         ("seamless", [3, 1], [3], []),
         ("city", [3], [3], [0, 1, 2, 3]),
+        ("seamless", [0], [0], [3]),  # it was forgotten
     ):
         task = make_task(tuple((scenario, seed) for seed in seeds))
         before = len(built)

@@ -102,8 +102,8 @@ def test_a_comparison_shows_the_same(width):
     learner = learning((12, 10**15, "generations"))
     note = f"{progress.progress_of(learner, bound=False)}  success 37%", learner.describe(ROW)
     for cell in cells[:2]:
-        shown.tell(cell, "begin", None)
-        shown.tell(cell, "note", note)
+        shown.show(cell, "begin", None)
+        shown.show(cell, "note", note)
     line = drawn(shown, width)
     assert line.startswith("run 0/3  ETA 1:3")
     assert "\nroundabout-two-parents-s0  12 generations  success 37%" in line

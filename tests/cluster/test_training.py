@@ -102,7 +102,7 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
         for step, elite in resumed.elites.items():
             assert elite.tobytes() == straight.elites[step].tobytes()
     for run in (straight, resumed):
-        run.choose_last()
+        run.choose_champion()
     assert resumed.champion.genome.tobytes() == straight.champion.genome.tobytes()
     assert resumed.champion.score == straight.champion.score
 
@@ -240,7 +240,7 @@ def test_a_run_that_ends_chooses_between_champion_and_last_candidate_on_other_ma
     for champion, candidate in (two, two[::-1]):
         evolution.champion = Champion(champion, 0.9, 0.9, 1000.0, 0)
         evolution.candidate = lambda candidate=candidate: candidate
-        evolution.choose_last()
+        evolution.choose_champion()
         assert evolution.champion.genome.tobytes() == two[metres.argmax()].tobytes()
         assert (evolution.champion.score, evolution.champion.distance_m) == (0.0, metres.max())
 
@@ -364,5 +364,5 @@ def test_a_candidate_lost_in_validation_is_no_champion(maps):
     evolution = losing(maps, validate=slice(0, None))
     go_on(evolution)
     with pytest.raises(PoolError, match="there is no champion: each network that was to be validated killed"):
-        evolution.choose_last()
+        evolution.choose_champion()
     assert evolution.champion is None

@@ -48,8 +48,9 @@ def test_only_who_crashed_or_stood_still_on_the_way_is_remembered():
     seeds = [curriculum.map_seeds[m] for m in curriculum.crashes["map"]]
     assert seeds == [episodes.maps[m] for m in episodes.rows["map"][kept]]
     assert (curriculum.crashes["rewind"] == 0).all()
-    led(curriculum, 1, End.COLLISION)
-    assert len(curriculum.crashes) == CONFIG.crash_memory  # the latest
+    latest, _ = led(curriculum, 1, End.COLLISION)
+    assert len(curriculum.crashes) == len(curriculum.crash_worlds) == CONFIG.crash_memory  # the latest
+    assert curriculum.crash_worlds[-8:].tobytes() == latest.worlds.tobytes()
     assert curriculum.crashes["start"][-1, 0] == 107.0
     assert curriculum.crashes["start"][0, 0] == 3.0
 

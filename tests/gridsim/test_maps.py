@@ -247,11 +247,14 @@ def test_one_map_for_all_seeds(track):
     assert not Map.from_arrays({k: v.copy() for k, v in track.arrays().items()}).torus
 
 
-def test_a_changed_file_is_read_again(tmp_path):
-    name = save(tmp_path / "a.png", picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0))
+@pytest.mark.parametrize("by_yaml", [False, True])
+def test_a_changed_picture_is_read_again(tmp_path, by_yaml):
+    name = image = save(tmp_path / "map.png", picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0))
+    if by_yaml:
+        name = write_yaml(tmp_path)
     first, digest = load_map(name), map_digest(name)
-    save(tmp_path / "a.png", picture(strip(50, 20, 0.0, 7.0), 100.0, 40.0))
-    os.utime(name, ns=(1, 1))
+    save(tmp_path / "map.png", picture(strip(50, 20, 0.0, 7.0), 100.0, 40.0))
+    os.utime(image, ns=(1, 1))
     assert load_map(name) is not first
     assert map_digest(name) != digest
 

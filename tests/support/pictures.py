@@ -87,6 +87,7 @@ def record_drive(path, scenario, start, episodes):
             for step, action in enumerate(actions):
                 states.append(start if step == 0 else poses_of(simulator.state.cars[0]))
                 recorder.write(step, states[-1], action, episode)
+                assert path.read_text().count("\n") == recorder.rows + 1  # whatever happens next, it is kept
                 _, _, _, ends = simulator.step(np.array([action]))
                 if ends[0] != End.RUNNING:
                     break
