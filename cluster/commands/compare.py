@@ -80,7 +80,7 @@ class CompareFlags(WorkFlags, Plan):
 QUICK = CompareFlags(seeds=1, budget="10s")
 # Flags that may differ in a resumed comparison.
 MAY_DIFFER = ("resume", "jobs", "workers", "address", "patience", "tracking_uri", "experiment")
-MAX_JOBS = 256  # each takes some 300 MB here
+MAX_JOBS = 256  # each takes some 500 MB here
 WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
 
 
