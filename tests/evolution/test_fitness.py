@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evolution.episodes.rollout import RESULT
-from evolution.search.fitness import scalar
+from evolution.search.fitness import ENOUGH, scalar
 
 TARGET = 500.0
 
@@ -37,8 +37,10 @@ def test_further_and_better_paced_is_never_worse(drives, which, more):
     paced["paced"][0, k] += more
     for better in (further, paced):
         assert scalar(better, TARGET)[0] >= scalar(row, TARGET)[0]
-        if further["distance"][0, k] < TARGET:
-            assert scalar(better, TARGET)[0] > scalar(row, TARGET)[0]
+    if further["distance"][0, k] < TARGET:
+        assert scalar(further, TARGET)[0] > scalar(row, TARGET)[0]
+        if paced["paced"][0, k] < ENOUGH * row["distance"][0, k]:
+            assert scalar(paced, TARGET)[0] > scalar(row, TARGET)[0]
 
 
 def test_the_first_bend_is_worth_as_much_as_a_long_way_later():
@@ -50,6 +52,11 @@ def test_a_metre_at_a_speed_within_the_interval_counts_for_more():
     """0.7 of the score is for paced metres, 0.3 for all: 400 m without pace are as good as 120 m with it."""
     value = scalar(results([[400.0], [120.0]], [[0.0], [120.0]]), TARGET)
     assert value[0] == pytest.approx(value[1])
+
+
+def test_a_fifth_of_the_way_may_be_slower():
+    value = scalar(results([[400.0], [400.0], [400.0]], [[400.0], [320.0], [310.0]]), TARGET)
+    assert value[0] == value[1] > value[2]
 
 
 def test_each_episode_may_have_its_own_target():
