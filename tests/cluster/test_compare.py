@@ -199,11 +199,13 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
         assert not any(child.is_running() for child in children)
         process = start("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path)
         wait_until(lambda: len(processes()) == 2, 60)
-        processes()[0].kill()
+        for child in processes():
+            child.kill()
         errors = process.communicate(timeout=240)[1]
         assert process.returncode == 1, errors
         assert "failed: its process ended with exit code -9" in errors
-        assert "gridsim-compare: error: 1 of 4 runs failed" in errors
+        assert "gridsim-compare: error: 2 of 4 runs failed" in errors
+        assert [(cell.folder / "summary.json").exists() for cell in cells] == [False, False, True, True]
     finally:
         process.kill()
         process.communicate()

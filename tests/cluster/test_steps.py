@@ -150,6 +150,17 @@ def test_an_ended_run_has_its_elites_once_and_can_be_extended(maps, straight, tm
     assert not is_finished(open_run(path)), "what is made at the end is of the shorter run"
 
 
+def test_a_champion_s_cost_is_what_had_been_spent_at_its_own_step(straight, monkeypatch):
+    learning = straight.learning
+    learning.solved = True  # so that the last candidate does not take its place
+    monkeypatch.setattr(straight.tracker, "log_model", lambda *_: None)
+    monkeypatch.setattr(train, "log_end", lambda *_: None)
+    straight.finish(0)
+    own, last = learning.history[learning.champion.step], learning.history[-1]
+    for name in ("car_steps", "wall_s"):
+        assert straight.summary[f"best_{name}"] == own[name] < last[name]
+
+
 def test_elites_that_are_not_those_of_an_ended_run_are_refused(maps, straight):
     path = straight.run.path
     save(path / ELITES, {"genomes": read_elites(path, SETTINGS.policy) + np.float32(1.0)}, {})

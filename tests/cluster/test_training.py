@@ -99,6 +99,7 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
         while resumed.steps < 3:
             go_on(resumed)
         assert state_of(resumed) == state_of(straight)
+        assert resumed.validation_steps == straight.validation_steps > 0
         for step, elite in resumed.elites.items():
             assert elite.tobytes() == straight.elites[step].tobytes()
     for run in (straight, resumed):

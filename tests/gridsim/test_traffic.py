@@ -391,6 +391,17 @@ def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
     assert world[1, LANE] == 0
 
 
+@pytest.mark.parametrize(("behind", "changes"), [(36.0, False), (44.0, True)])
+def test_no_car_cuts_in_where_its_new_follower_would_have_to_brake_hard(abreast, behind, changes):
+    """MOBIL's safety criterion, for a car that is held up and does not care what others lose."""
+    world = cars_on(abreast, (1, 214.8, 8.0, 0.4), (1, 200.0, 8.0, 1.0), (0, 200.0 - behind, 16.0, 1.2))
+    world[[0, 2], LANE_TIMER] = 9.0
+    brakes = -oracle.idm(CONFIG, 16.0, 24.0, behind - LENGTH, 8.0)
+    assert (brakes <= CONFIG.traffic.safe_braking) == changes
+    flow(abreast, D._replace(politeness=F(0.0)), world, NOBODY)
+    assert (world[1, LANE] == 0) == changes
+
+
 def test_a_change_that_is_refused_leaves_no_trace(abreast):
     """Moving over, it would touch the car ahead: it is as if its turn to decide had not come."""
     world = cars_on(abreast, (1, 212.0, 0.0, 0.4), (1, 200.0, 15.0, 1.0))
