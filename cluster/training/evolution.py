@@ -83,12 +83,7 @@ class Evolution(Learning):
             leading = call.add(leader, followed)
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
-
-        def meanwhile() -> None:
-            curriculum.draw_ahead(self.steps + 1)
-            self.meanwhile()
-
-        driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, meanwhile)
+        driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self.meanwhile)
         check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))

@@ -85,7 +85,6 @@ class Curriculum:
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
         self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
         self._validation: dict[range, Episodes] = {}
-        self._drawn: dict[tuple[int, int], Episodes] = {}  # new starts that were drawn ahead
         rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
         self.map_seeds = [
             int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
@@ -119,37 +118,24 @@ class Curriculum:
         n = self.maps_in_use(generation)
         return rng.choice(n, count, replace=count > n)
 
-    def _new_starts(self, generation: int, purpose: int, counts: Sequence[int]) -> Episodes:
-        """Episodes with new starts on training maps, of which each of `counts` takes so many."""
-        if (generation, purpose) in self._drawn:
-            return self._drawn.pop((generation, purpose))
-        rng = self._rng(generation, purpose)
-        maps = np.concatenate([self._some_maps(generation, count, rng) for count in counts])
+    def _new_starts(self, maps: np.ndarray, rng: np.random.Generator) -> Episodes:
+        """Episodes with new starts on training maps [e]."""
         used, local = np.unique(maps, return_inverse=True)
         seeds = [self.map_seeds[m] for m in used]
         return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
-
-    def _group_starts(self, generation: int) -> Episodes:
-        return self._new_starts(generation, 0, [self.config.starts] * self.config.groups)
-
-    def _leader_starts(self, generation: int) -> Episodes:
-        return self._new_starts(generation, 2, [self.config.leader_episodes])
-
-    def draw_ahead(self, generation: int) -> None:
-        """Draw a generation's new starts, while the workers are busy with the one before."""
-        groups, leader = self._group_starts(generation), self._leader_starts(generation)
-        self._drawn = {(generation, 0): groups, (generation, 2): leader}
 
     def episodes(self, generation: int) -> Episodes:
         """A generation's episodes, group by group: first new starts, then crash starts.
 
         All groups have the same number of each.
         """
-        fresh = self._group_starts(generation)
-        if not len(self.crashes) or not self.config.crash_starts:
+        config, rng = self.config, self._rng(generation, 0)
+        maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
+        fresh = self._new_starts(np.concatenate(maps), rng)
+        if not len(self.crashes) or not config.crash_starts:
             return fresh
         chosen = self._choose_crashes(generation)
-        crashes = with_limits(self.crashes[chosen], self._limits(min(self.config.crash_target, self.target)))
+        crashes = with_limits(self.crashes[chosen], self._limits(min(config.crash_target, self.target)))
         seeds = [self.map_seeds[m] for m in crashes["map"]]
         used = sorted({*fresh.maps, *seeds})
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
@@ -181,13 +167,14 @@ class Curriculum:
         parts = [kind.reshape(n, len(kind) // n, *kind.shape[1:]) for kind in kinds]
         return np.concatenate(np.concatenate(parts, axis=1))
 
-    def starts(self, batch: int, count: int) -> Episodes:
-        """`count` new episodes on the training maps, for a batch of the DQN's."""
-        return self._new_starts(batch, 3, [count])
+    def starts(self, batch: int, count: int, purpose: int = 3) -> Episodes:
+        """`count` new episodes on the training maps, by default for the DQN's batches."""
+        rng = self._rng(batch, purpose)
+        return self._new_starts(self._some_maps(batch, count, rng), rng)
 
     def leader_episodes(self, generation: int) -> Episodes:
         """The leader's episodes alongside a generation, with `rewind` set for crash starts."""
-        episodes = self._leader_starts(generation).with_limits(self.leader_limits())
+        episodes = self.starts(generation, self.config.leader_episodes, purpose=2).with_limits(self.leader_limits())
         episodes.rows["rewind"] = self.config.rewind
         return episodes
 
