@@ -1,9 +1,9 @@
 """The fitness by which members are ranked.
 
-It has two elements: the distance travelled, and the distance travelled at a forward speed within the scenario's
-interval, for which most of the way is enough: a car that never brakes for others is not a better driver. Their weighted
-mean is relative to the episode's target, on a scale that is mostly logarithmic (the first bend is worth as much as the
-last kilometre) and partly linear (so that the last kilometre still counts).
+It has two elements: the distance travelled, and the paced distance, travelled at a forward speed within the scenario's
+interval. If 80 % of the distance is paced, all of it counts as paced, so that braking for other cars costs nothing. The
+weighted mean of both is relative to the episode's target, on a scale that is mostly logarithmic (the first bend is
+worth as much as the last kilometre) and partly linear (so that the last kilometre still counts).
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import numpy as np
 
 LINEAR_SHARE = 0.4  # of the value; without it, a slow last kilometre would cost almost nothing
 PACED_SHARE = 0.7  # weight of the paced distance in the scalar; the rest is for the distance
-ENOUGH = 0.8  # share of the distance that has to be paced; with all of it, crashes in traffic count for too little
+PACED_ENOUGH = 0.8  # share of the distance that has to be paced for all of it to count as paced
 
 
 def scalar(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
     """Scalar fitness float64 [n] in [0, 1] of results [n, episodes]."""
     distance = results["distance"].astype(np.float64)
-    paced = np.minimum(results["paced"] / ENOUGH, distance)
+    paced = np.minimum(results["paced"] / PACED_ENOUGH, distance)
     bounded = np.clip((1.0 - PACED_SHARE) * distance + PACED_SHARE * paced, 0.0, target)
     shares = (1.0 - LINEAR_SHARE) * np.log1p(bounded) / np.log1p(target) + LINEAR_SHARE * bounded / target
     return shares.mean(axis=1)

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from commands import all_in_mlflow, finish, ray_workers, rows, running, summary, wait_until
+from commands import BIN, all_in_mlflow, finish, ray_workers, rows, running, summary, wait_until
 from tracked import client
 
 from cluster.runs.checkpoint import load
@@ -35,7 +35,7 @@ def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, t
         os.kill(process.pid, signal.SIGINT)
         _, err = process.communicate(timeout=120)
         assert process.returncode == 130
-        assert "gridsim-dqn --resume runs/k\n" in err
+        assert f"continue with: {BIN}/gridsim-dqn --resume runs/k" in err
         assert "replay_actions" in load(run / "checkpoint.npz")[0]
     saved = len(rows(run))
     with running("gridsim-dqn", "--resume", "runs/k", "--workers", "1", cwd=tmp_path) as process:

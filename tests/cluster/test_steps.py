@@ -150,7 +150,7 @@ def test_an_ended_run_has_its_elites_once_and_can_be_extended(maps, straight, tm
     assert not is_finished(open_run(path)), "what is made at the end is of the shorter run"
 
 
-def test_a_champion_s_cost_is_what_had_been_spent_at_its_own_step(straight, monkeypatch):
+def test_a_champion_has_cost_what_was_spent_up_to_its_step(straight, monkeypatch):
     learning = straight.learning
     learning.solved = True  # so that the last candidate does not take its place
     monkeypatch.setattr(straight.tracker, "log_model", lambda *_: None)

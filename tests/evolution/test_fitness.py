@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evolution.episodes.rollout import RESULT
-from evolution.search.fitness import ENOUGH, scalar
+from evolution.search.fitness import PACED_ENOUGH, scalar
 
 TARGET = 500.0
 
@@ -39,7 +39,7 @@ def test_further_and_better_paced_is_never_worse(drives, which, more):
         assert scalar(better, TARGET)[0] >= scalar(row, TARGET)[0]
     if further["distance"][0, k] < TARGET:
         assert scalar(further, TARGET)[0] > scalar(row, TARGET)[0]
-        if paced["paced"][0, k] < ENOUGH * row["distance"][0, k]:
+        if paced["paced"][0, k] < PACED_ENOUGH * row["distance"][0, k]:
             assert scalar(paced, TARGET)[0] > scalar(row, TARGET)[0]
 
 
@@ -54,7 +54,7 @@ def test_a_metre_at_a_speed_within_the_interval_counts_for_more():
     assert value[0] == pytest.approx(value[1])
 
 
-def test_a_fifth_of_the_way_may_be_slower():
+def test_a_fifth_of_the_distance_may_be_outside_the_interval():
     value = scalar(results([[400.0], [400.0], [400.0]], [[400.0], [320.0], [310.0]]), TARGET)
     assert value[0] == value[1] > value[2]
 

@@ -14,6 +14,8 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 
 BIN = Path(sys.executable).parent
+# Of a user who has not activated .venv, so that commands print their whole path.
+PATH = os.pathsep.join(name for name in os.get_exec_path() if Path(name).resolve() != BIN.resolve())
 
 
 def start(*arguments, cwd, **env):
@@ -24,7 +26,7 @@ def start(*arguments, cwd, **env):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, **env},
+        env={**os.environ, "PATH": PATH, **env},
         start_new_session=True,
     )
 
