@@ -32,7 +32,7 @@ from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
-from gridsim.maps.scenarios import build, check_name, default_traffic, label
+from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
 from gridsim.traffic.world import spawn
 from gridsim.view.drive import Recorder, drive, read_drive, replay
 from gridsim.view.render import NoDisplayError, Renderer, Window
@@ -200,7 +200,12 @@ def _drives(flags: WatchFlags, seconds: float, most: int | None = 1) -> Iterator
         scenario, start = _map(road, seed, champion.sim)
         traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
         world = spawn(scenario.network, start[None], traffic, np.array([scenario.seed]), champion.sim)[0]
-        yield record(champion, scenario, start, seconds, world), f"{name}    {label(road)}, map {scenario.seed:,}"
+        yield record(champion, scenario, start, seconds, world), f"{name}    {_name(scenario)}"
+
+
+def _name(road: Map) -> str:
+    """A road in words; a map file has only one."""
+    return label(road.name) + ("" if is_map_file(road.name) else f", map {road.seed:,}")
 
 
 def _is_recording(flags: WatchFlags) -> bool:
@@ -216,7 +221,7 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
     recorded, config = read_drive(flags.source), SimConfig()
     scenario, _ = _map(recorded.scenario, recorded.map_seed, config)
     _, cars, ranges, worlds = replay(recorded, scenario)
-    title = f"{Path(flags.source).name}    {label(scenario.name)}, map {scenario.seed:,}"
+    title = f"{Path(flags.source).name}    {_name(scenario)}"
     episodes = int(recorded.episodes[-1]) + 1
     for episode in range(episodes):
         own, period = recorded.episodes == episode, config.episode.control_period

@@ -1,4 +1,4 @@
-"""A comparison's page: its tables and picture in one HTML file, with a link to each run's drive."""
+"""A comparison's page: its tables, its picture and a row for each run, with a link to its drive, in one HTML file."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from urllib.parse import quote
 
 from cluster.comparison.plan import Plan
 from cluster.comparison.results import Run
-from cluster.comparison.tables import DRIVING, ERRORS, Group, introduction, notes, table
+from cluster.comparison.tables import DRIVING, ERRORS, Group, introduction, notes, runs_table, table
 from cluster.runs.run import PAGE
 
 STYLE = """\
 body { font: 16px system-ui, sans-serif; margin: 2em auto; max-width: 75em; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; margin: 1.5em 0 }
-th, td { border-bottom: 1px solid #ddd; padding: 0.3em 0.8em; text-align: right }
-th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
+th, td { border-bottom: 1px solid #ddd; padding: 0.3em 0.8em; text-align: right; white-space: nowrap }
+th:nth-child(-n+2), td:nth-child(-n+2), td:has(a) { text-align: left }
 img { max-width: 100% }"""
 
 
@@ -30,13 +30,14 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path
         head, *rows = [[escape(cell) for cell in row] for row in table(groups, columns)]
         parts.append(_table(head, rows))
     parts.append("<ul>" + "".join(f"<li>{escape(note)}" for note in notes(groups)) + "</ul>")
-    drives = [
-        [escape(group.road), escape(group.name), ", ".join(_link(folder, run) for run in group.runs)]
-        for group in groups
-    ]
-    parts += ["<h2>Drives of the champions</h2>", _table(["road", "learner", "runs"], drives)]
     data = base64.b64encode(picture.read_bytes()).decode()
-    parts.append(f'<p><img alt="errors and training times" src="data:image/png;base64,{data}"></p>')
+    parts.append(f'<p><img alt="success, errors and training times" src="data:image/png;base64,{data}"></p>')
+    head, *rows = runs_table(groups)
+    runs = [run for group in groups for run in group.runs]
+    linked = [
+        [*map(escape, row[:2]), _link(folder, run, row[2]), *row[3:]] for run, row in zip(runs, rows, strict=True)
+    ]
+    parts += ["<h2>Runs, with their champions' drives</h2>", _table(head, linked)]
     top = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
     return "\n".join([top, *parts, ""]).encode()
 
@@ -47,10 +48,9 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "<table>\n" + "\n".join(f"<tr>{line}" for line in lines) + "\n</table>"
 
 
-def _link(folder: Path, run: Run) -> str:
-    """A run's seed and success, linked to its drive if there is one."""
-    text = f"seed {run.settings.seed}: {run.figures['success_rate']:.0%}"
+def _link(folder: Path, run: Run, text: str) -> str:
+    """A run's name, linked to its drive if there is one."""
     drive = run.folder / PAGE
     if not drive.is_file():
-        return text
-    return f'<a href="{escape(quote(os.path.relpath(drive, folder)))}">{text}</a>'
+        return escape(text)
+    return f'<a href="{escape(quote(os.path.relpath(drive, folder)))}">{escape(text)}</a>'

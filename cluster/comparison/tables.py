@@ -148,7 +148,9 @@ def notes(groups: Sequence[Group]) -> list[str]:
     few = " Fewer than 3 seeds are too few for a verdict." if min(len(group.runs) for group in groups) < 3 else ""
     return [
         f"Medians over seeds, quartiles in brackets.{few}",
-        "Errors are means over the metres that were driven: those of a driver that crashes soon say little.",
+        "Errors compare champions with a reference driver, which takes the bends of their paths as fast as is "
+        "comfortable within the road's interval. They are means over the metres that were driven: those of a driver "
+        "that crashes soon say little.",
     ]
 
 
@@ -203,6 +205,23 @@ def table(groups: Sequence[Group], columns: Columns) -> list[list[str]]:
     """Header and rows of a table: road, learner and the columns."""
     rows = [[group.road, group.name, *(cell(group) for cell in columns.values())] for group in groups]
     return [["road", "learner", *columns], *rows]
+
+
+def runs_table(groups: Sequence[Group]) -> list[list[str]]:
+    """Header and rows of a table of runs: road, learner, name, seed, and the driving columns."""
+    single = [dataclasses.replace(group, runs=(run,), seeds=()) for group in groups for run in group.runs]
+    columns = list(DRIVING.items())[1:]
+    rows = [
+        [
+            one.road,
+            one.name,
+            one.runs[0].folder.name,
+            f"{one.runs[0].settings.seed}",
+            *(cell(one) for _, cell in columns),
+        ]
+        for one in single
+    ]
+    return [["road", "learner", "run", "seed", *(name for name, _ in columns)], *rows]
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:

@@ -99,7 +99,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
 
 
 def comparison(groups: Sequence[Group], path: Path) -> None:
-    """Draw velocity error and training time of each road and learner to a PNG.
+    """Draw success, velocity error and training time of each road and learner to a PNG.
 
     Bars are medians over seeds, whiskers quartiles, dots the seeds.
     """
@@ -107,26 +107,28 @@ def comparison(groups: Sequence[Group], path: Path) -> None:
     names = list(dict.fromkeys(group.name for group in groups))
     several_observations = len({group.observation for group in groups}) > 1
     width = 0.8 / len(names)
-    figure, axes = _figure(max(9.0, 3.0 + 2.2 * len(roads)), 4.6, 2)
+    figure, axes = _figure(max(12.0, 4.0 + 3.0 * len(roads)), 4.6, 3)
     panels = (
-        ("velocity_error_percent", "velocity error, % of the reference's speed"),
-        ("best_wall_s", "time to the champion, s"),
+        ("success_rate", 100.0, "success on held-out roads, %"),
+        ("velocity_error_percent", 1.0, "velocity error, % of the reference's speed"),
+        ("best_wall_s", 1.0, "time to the champion, s"),
     )
-    for axis, (name, title) in zip(axes, panels, strict=True):
+    for axis, (name, scale, title) in zip(axes, panels, strict=True):
         for group in groups:
             place = roads.index(group.road) + (names.index(group.name) - (len(names) - 1) / 2) * width
-            found = group.spread(name)
-            if not found.n:
+            n, *found = group.spread(name)
+            if not n:
                 axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
                 continue
             color = f"C{names.index(group.name) % 10}" if group.variant else _LEARNERS[group.learner]
-            whiskers = [[found.median - found.lower], [found.upper - found.median]] if found.n > 1 else None
+            lower, median, upper = (scale * value for value in found)
+            whiskers = [[median - lower], [upper - median]] if n > 1 else None
             hatch = "//" if group.observation == "grid" and several_observations else None
             axis.bar(
-                place, found.median, 0.92 * width, color=color, alpha=0.75, yerr=whiskers, capsize=3,
+                place, median, 0.92 * width, color=color, alpha=0.75, yerr=whiskers, capsize=3,
                 hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2, label=group.name,
             )  # fmt: skip
-            seeds = [value for value in group.values(name) if np.isfinite(value)]
+            seeds = [scale * value for value in group.values(name) if np.isfinite(value)]
             beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
             axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
                       markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip

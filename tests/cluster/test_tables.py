@@ -67,7 +67,8 @@ def test_the_page_links_to_the_drives_of_its_runs(tmp_path):
     Image.new("RGB", (2, 2)).save(tmp_path / "shown.png")
     folder = tmp_path / "<c>"
     text = page(folder, tables.group([there, gone]), None, tmp_path / "shown.png").decode()
-    assert '<td><a href="../a%20b%3C0%3E/drive.html">seed 0: 90%</a>, seed 1: 90%' in text
+    assert '<td><a href="../a%20b%3C0%3E/drive.html">a b&lt;0&gt;</a><td>0<td>90<td>' in text
+    assert "<td>a b&lt;1&gt;<td>1<td>90<td>" in text
     assert "<td>10.0 (10.0 to 10.0)" in text
     assert 'src="data:image/png;base64,' in text
     assert "<title>GridSim: &lt;c&gt;</title>" in text

@@ -1,5 +1,6 @@
 """Films and windows on champions: frame counts and rates read back, runs that are over or still going, wrong use."""
 
+import dataclasses
 import re
 import subprocess
 import sys
@@ -177,6 +178,11 @@ def test_follow_takes_the_newest_elite_while_the_run_goes_on(going, dummy, monke
     monkeypatch.setattr(watch.time, "sleep", sleep)
     code, out, err = call(watch_main, monkeypatch, capsys, going, "--follow", "--seconds", 1, "--size", "64x64")
     assert (code, out, err) == (0, "waiting for the first generation ...\n", "")
+
+
+def test_a_road_is_named_with_its_seed_unless_it_is_a_file():
+    assert watch._name(build("curved", 7)) == "curved, map 7"
+    assert watch._name(dataclasses.replace(build("curved", 0), name="/tmp/track.yaml")) == "track"
 
 
 def test_newest_elite_is_read_anew(going):
