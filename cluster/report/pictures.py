@@ -59,10 +59,10 @@ def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -
     plot(axes[3], "validation/success_rate", _BEST, "champion, validation")
     plot(axes[3], success[0], _OTHER, success[1], alpha=0.5)
     axes[3].set(title="success rate", ylim=(-0.02, 1.05))
-    for axis in axes:
+    for axis, corner in zip(axes, ("lower right", "upper left", "lower right", "upper left"), strict=True):
         axis.set_xlabel(step_name)
         axis.grid(alpha=0.25)
-        axis.legend(loc="lower right", frameon=False, fontsize=8)
+        axis.legend(loc=corner, frameon=False, fontsize=8)
     figure.savefig(path, dpi=100)
 
 
