@@ -23,7 +23,7 @@ HERE = {
     "make compare ARGS=--quick": f"{COMPARISON} quick",
     "make compare": f"{COMPARISON} whole",
     ".venv/bin/gridsim-compare runs/<name> runs/<other>": "",
-    ".venv/bin/gridsim-watch runs/<name> --output drive.gif": "--size 160x90",
+    ".venv/bin/gridsim-watch runs/<name> --output drive.mp4": "--size 160x90",
     ".venv/bin/gridsim-watch runs/<name> runs/<other> --output drive.html": "",
     ".venv/bin/gridsim-watch runs/<name> --generation 12": "--generation 0 --output elite.html",
 }

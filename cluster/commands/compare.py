@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import tyro
-from rich.box import SIMPLE
+from rich.box import MINIMAL
 from rich.console import Console
 from rich.table import Table
 
@@ -210,7 +210,7 @@ class Results:
         console.print(tables.introduction(self.plan))
         for columns in (tables.DRIVING, tables.ERRORS):
             head, *rows = tables.table(self.groups, columns)
-            table = Table(box=SIMPLE, padding=0, pad_edge=False, show_edge=False)
+            table = Table(box=MINIMAL, padding=0, pad_edge=False, show_edge=False)
             for name in head:  # one word per line, to be narrow
                 table.add_column(
                     name.replace(",", "").replace(" ", "\n"), overflow="fold", no_wrap=name in ("road", "learner")

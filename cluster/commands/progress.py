@@ -67,7 +67,10 @@ class Progress(Line, Reporter):
         print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
 
     def compiling(self) -> AbstractContextManager[object]:
-        return self.console.status("compiling the simulator for this machine, once (some 20 s)")
+        text = "compiling the simulator for this machine, once (some 20 s)"
+        if not self.console.is_terminal:
+            self.console.print(text)
+        return self.console.status(text)
 
     def stopping(self) -> None:
         Console(stderr=True).print("stopping; a moment ...", style="dim")

@@ -248,13 +248,13 @@ def _page(flags: WatchFlags, limit: float) -> None:
         recorded = _is_recording(one)
         for found, title in _drives(one, limit):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
-            shown.append(Shown(label, str(len(shown)), found))
+            shown.append(Shown(label, Path(source).resolve().name, found))
             if not recorded:  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     title = f"GridSim: {', '.join((flags.source, *flags.beside))} on {shown[0].drive.scenario.name}"
-    write_page(output, title, shown, SimConfig())
+    write_page(output, title, shown, SimConfig(), together=len(shown) > 1)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 

@@ -157,7 +157,10 @@ def notes(groups: Sequence[Group]) -> list[str]:
 def introduction(plan: Plan | None) -> str:
     """The plan in a line."""
     if plan is None:
-        return "Finished runs. Their budgets may differ: compare training times and car-steps first."
+        return (
+            "Finished runs. Their budgets may differ: compare training times and car-steps first. The first run on a "
+            "machine takes some 20 s more, to compile the simulator."
+        )
     sensors = {"rays": "31 rays", "grid": "the occupancy grid"}
     traffic = "traffic as each road has it by default" if plan.traffic == -1 else f"{plan.traffic} other cars"
     return f"{count(plan.seeds, 'seed')}, at most {plan.budget} a run, {sensors[plan.observation]}, {traffic}."

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from cluster.report.film import Recording
+from cluster.report.pictures import bounds
 from cluster.runs.checkpoint import write_atomic
 from gridsim.car.ego import DISTANCE, SPEED
 from gridsim.car.vehicle import Action
@@ -30,7 +31,7 @@ from gridsim.view.marks import lane_marks
 
 TURN = 1 << 16
 PIXELS_PER_M, MOST_PIXELS = 4.0, 2048
-OFF_ROAD, ROAD = (223, 228, 220), (112, 120, 126)  # colours
+OFF_ROAD, ROAD = (224, 228, 220), (112, 120, 124)  # colours
 
 
 @dataclass(frozen=True)
@@ -85,8 +86,13 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
     return [x / size[0] * TURN, y / size[1] * TURN, np.arctan2(sine, cosine) / math.tau * TURN]
 
 
-def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig) -> None:
-    """Write a page of drives on one map, which shows the last of them first. Raises: CheckpointError."""
+def write_page(
+    path: Path, title: str, shown: Sequence[Shown], config: SimConfig, together: bool = False
+) -> None:  # fmt: skip
+    """Write a page of drives on one map. It begins with the last of them, or with all `together`.
+
+    Raises: CheckpointError.
+    """
     road_map, constant = shown[-1].drive.scenario, constants(config)
     x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
     data = {
@@ -94,6 +100,7 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig
         "width": float(road_map.road.width),
         "height": float(road_map.road.height),
         "torus": road_map.torus,
+        "view": bounds(road_map),
         "interval": [float(road_map.road.speed_low), float(road_map.road.speed_high)],
         "fastest": 1.2 * float(road_map.road.speed_high),
         "car": [config.vehicle.length, config.vehicle.width],
@@ -103,7 +110,8 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig
         # Centre x, y (m) and half of the dash dx, dy (m).
         "marks": np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist(),
         "picture": base64.b64encode(_picture(road_map)).decode(),
-        "first": len(shown) - 1,
+        "first": 0 if together else len(shown) - 1,
+        "together": together,
         "drives": [each.packed() for each in shown],
     }
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")

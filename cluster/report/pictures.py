@@ -40,7 +40,11 @@ def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -
         return values
 
     if history and "fitness/best" in history[0]:
-        best, mean_of, success = "leader", "members, mean", ("leader/success_rate", "leader")
+        best, mean_of, success = (
+            "leader, on longer drives",
+            "members, mean",
+            ("leader/success_rate", "leader, on longer drives"),
+        )
         plot(axes[0], "fitness/best", _BEST, best)
         mean, std = plot(axes[0], "fitness/mean", _MEAN, mean_of), np.array([row["fitness/std"] for row in history])
         band = {"color": _MEAN, "alpha": 0.2, "linewidth": 0, "label": "members, standard deviation"}
@@ -66,6 +70,19 @@ def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -
     figure.savefig(path, dpi=100)
 
 
+def bounds(road_map: Map) -> list[float]:
+    """What is to be seen of a map, m: left, right, low, high.
+
+    Of one from a file that is its road: the map's sides are rounded up to powers of two, with wall.
+    """
+    width, height = float(road_map.road.width), float(road_map.road.height)
+    if road_map.torus:
+        return [0.0, width, 0.0, height]
+    nodes = node_clearance(road_map.road)
+    y, x = np.nonzero(nodes > 0.0)
+    return (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width + [-5.0, 5.0, -5.0, 5.0]).tolist()
+
+
 def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> None:
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
@@ -78,11 +95,9 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     axis.set_facecolor(_WALL)
     axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
     axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
-    axis.set(xlim=(0, width), ylim=(0, height), aspect="equal", xlabel="x, m", ylabel="y, m")
-    if not scenario.torus:  # show the road alone: the map's sides are rounded up to powers of two, with wall
-        y, x = np.nonzero(nodes > 0.0)
-        left, right, low, high = (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width).tolist()
-        axis.set(xlim=(left - 5.0, right + 5.0), ylim=(low - 5.0, high + 5.0))
+    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    left, right, low, high = bounds(scenario)
+    axis.set(xlim=(left, right), ylim=(low, high))
     points = states[:, [X, Y]].astype(np.float64)
     steps = np.stack([points[:-1], points[1:]], axis=1)
     near = np.abs(points[1:] - points[:-1]).max(axis=1) < min(width, height) / 2

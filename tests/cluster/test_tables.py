@@ -113,8 +113,8 @@ def test_curves_call_each_figure_by_one_name(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "_figure", lambda *shape: (figure, axes))
     pictures.curves([dict.fromkeys(COLUMNS, 0.5)] * 2, tmp_path / "curves.png", "generation")
     assert [[text.get_text() for text in axis.get_legend().get_texts()] for axis in axes] == [
-        ["leader", "members, mean", "members, standard deviation"],
-        ["members, episode length", "leader", "members, mean"],
-        ["leader", "members, mean"],
-        ["champion, validation", "leader"],
+        ["leader, on longer drives", "members, mean", "members, standard deviation"],
+        ["members, episode length", "leader, on longer drives", "members, mean"],
+        ["leader, on longer drives", "members, mean"],
+        ["champion, validation", "leader, on longer drives"],
     ]
