@@ -248,7 +248,8 @@ def _page(flags: WatchFlags, limit: float) -> None:
         recorded = _is_recording(one)
         for found, title in _drives(one, limit):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
-            shown.append(Shown(label, Path(source).resolve().name, found))
+            short = Path(source).resolve().name if flags.beside else str(len(shown))
+            shown.append(Shown(label, short, found))
             if not recorded:  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:

@@ -18,7 +18,7 @@ STYLE = """\
 body { font: 16px system-ui, sans-serif; margin: 2em auto; max-width: 90em; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; margin: 1.5em 0 }
 th, td { border-bottom: 1px solid #ddd; padding: 0.3em 0.8em; text-align: right; white-space: nowrap }
-th:nth-child(-n+2), td:nth-child(-n+2), th.run, td:has(a) { text-align: left }
+th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
 td:has(a) { white-space: normal; overflow-wrap: anywhere }
 img { max-width: 100% }"""
 
@@ -45,10 +45,7 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table as HTML, from cells that are HTML."""
-    lines = [
-        "".join(f"<th{' class=run' * (cell == 'run')}>{cell}" for cell in head),
-        *("".join(f"<td>{cell}" for cell in row) for row in rows),
-    ]
+    lines = ["".join(f"<th>{cell}" for cell in head), *("".join(f"<td>{cell}" for cell in row) for row in rows)]
     return "<table>\n" + "\n".join(f"<tr>{line}" for line in lines) + "\n</table>"
 
 

@@ -40,11 +40,8 @@ def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -
         return values
 
     if history and "fitness/best" in history[0]:
-        best, mean_of, success = (
-            "leader, on longer drives",
-            "members, mean",
-            ("leader/success_rate", "leader, on longer drives"),
-        )
+        best, mean_of = "leader, on longer drives", "members, mean"
+        success = "leader/success_rate", best
         plot(axes[0], "fitness/best", _BEST, best)
         mean, std = plot(axes[0], "fitness/mean", _MEAN, mean_of), np.array([row["fitness/std"] for row in history])
         band = {"color": _MEAN, "alpha": 0.2, "linewidth": 0, "label": "members, standard deviation"}

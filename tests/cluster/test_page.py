@@ -9,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, needs_chromium
+from PIL import Image
 
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
+from cluster.report.pictures import bounds
 from cluster.runs.champion import load_champion
 from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, X, Y
 from gridsim.car.vehicle import act
 from gridsim.config import constants
+from gridsim.maps.files import MapWarning, load_map
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import spawn
@@ -40,6 +43,7 @@ def test_a_page_holds_the_drives_to_the_centimetre(tmp_path):
     (found,) = re.findall(r'<script id="data" type="application/json">(.*)</script>', page)
     data = json.loads(found)
     assert data["title"] == title
+    assert data["view"] == [0.0, data["width"], 0.0, data["height"]]
     for each, stride in zip(data["drives"], (2, 1), strict=True):
         found, cars, boxes = channels(each), drive.cars[::stride], drive.boxes[::stride]
         for first, states in ((0, cars), *((5 + 3 * k, boxes[:, k]) for k in range(boxes.shape[1]))):
@@ -71,6 +75,16 @@ def shown_drives():
     return champion, drive, Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive)
 
 
+def test_a_map_file_is_shown_from_side_to_side_of_its_road(tmp_path):
+    free = np.zeros((400, 400), bool)
+    free[40:120, 60:300] = True  # rows from above
+    Image.fromarray((255 * free).astype(np.uint8)).save(tmp_path / "hall.png")
+    (tmp_path / "hall.yaml").write_text("image: hall.png\nresolution: 0.25\norigin: [0, 0, 0]\nnegate: 0\n")
+    with pytest.warns(MapWarning):
+        road_map = load_map(str(tmp_path / "hall.yaml"))
+    assert bounds(road_map) == pytest.approx([15.0 - 5, 75.0 + 5, 70.0 - 5, 90.0 + 5], abs=0.6)
+
+
 def text(name):
     """A script for what an element says."""
     return f"document.getElementById('{name}').textContent"
@@ -85,6 +99,13 @@ def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
     with Browser(path.as_uri(), tmp_path / "profile") as browser:
         browser.wait_for("at > 1")
         assert browser.faults == []
+    write_page(path, "two drives", shown, champion.sim, together=True)
+    with Browser(path.as_uri(), tmp_path / "profile") as browser:
+        browser.wait_for(f"{text('label')} === 'elite'")
+        assert browser.run("$('all').checked")
+        assert float(browser.run("$('time').max")) == pytest.approx(
+            max(each.drive.period * (len(each.drive.cars) - 1) for each in shown), abs=0.2
+        )
     write_page(path, "two drives", shown, champion.sim)
     with Browser(f"{path.as_uri()}#t=3.2&paused", tmp_path / "profile") as browser:
         browser.wait_for(f"{text('clock')} === '0:03.2'")

@@ -68,6 +68,14 @@ def test_counter_success_and_eta_are_always_there(done, counter, width, monkeypa
     assert "\nvalidate   3/128  240 generations" in line
 
 
+@pytest.mark.parametrize("terminal", [True, False])
+def test_compiling_is_told_with_and_without_a_terminal(terminal):
+    shown, console = begun(learning(), 80, terminal)
+    with shown.compiling():
+        pass
+    assert console.file.getvalue().count("compiling the simulator for this machine, once (some 20 s)") >= 1
+
+
 def test_there_is_no_eta_before_it_means_something(monkeypatch):
     """The first step takes as long as all that is started for it."""
     learner = learning()
