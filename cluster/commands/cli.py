@@ -38,7 +38,7 @@ from cluster.report.pictures import errors_table, held_out_table
 from cluster.runs.champion import evaluate, load_champion
 from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
 from cluster.runs.run import RunFolder, is_finished, lock, new_run, open_run, read_config
-from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, RunSettings, check_workers
+from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
 from cluster.tracking.address import check_uri
 from cluster.tracking.tracker import count
@@ -192,8 +192,8 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     if run.saved and is_finished(run):
         sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
         sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
-        bounds = _bounds(run.settings)
-        more = f" To go on beyond its end, resume it with a greater {bounds}." if bounds else ""
+        bounds = [as_flag(name) for name in run.settings.unbound if getattr(run.settings, name)]
+        more = f" To go on beyond its end, resume it with a greater {' or '.join(bounds)}." if bounds else ""
         if run.saved[1]["solved"]:
             more = f" It is solved; to go on from its champion, start a run with --init {short_path(run.path)}."
         steps = count(run.saved[1][step], step)
@@ -245,19 +245,15 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
     return code
 
 
-def _bounds(settings: RunSettings) -> str:
-    """The flags that end a run, in words."""
-    return " or ".join(as_flag(name) for name in settings.unbound if getattr(settings, name))
-
-
 def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
     summary, name, path = session.summary, session.learning.step_name, session.run.path
     settings = session.run.settings
-    where = "starts of this map that training had not" if is_map_file(settings.scenario) else "held-out drives"
+    where = "starts all over this map" if is_map_file(settings.scenario) else "held-out drives"
     console.print(held_out_table(f"The champion on {where}", summary["held_out"]))
-    steps, solved, bounds = count(summary[name + "s"], name), summary["solved"], _bounds(settings)
-    more = "" if solved or not bounds else f"; to go on: {resume}, with a greater {bounds}"
+    steps, solved = count(summary[name + "s"], name), summary["solved"]
+    longer = [f"{as_flag(each)} {2 * bound}" for each in settings.unbound if (bound := getattr(settings, each))]
+    more = "" if solved or not longer else f"\nto go on: {resume} {' '.join(longer)}"
     console.print(
         f"{'solved' if solved else 'not solved yet'} after {steps}, {summary['car_steps']:,} car-steps, "
         f"{summary['wall_s']:.0f} s{more}\n"

@@ -103,7 +103,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     lines.set_clim(0.0, float(road.speed_high))
     axis.add_collection(lines)
     axis.plot(*points[0], marker="o", color="#2f9e44", markersize=9, markeredgecolor="white", label="start")
-    axis.plot(*points[-1], marker="X", color="#e03131", markersize=10, markeredgecolor="white", label="end")
+    axis.plot(*points[-1], marker="s", color="#e03131", markersize=8, markeredgecolor="white", label="end")
     axis.legend(loc="upper right")
     axis.set_title(title)
     figure.colorbar(lines, ax=axis, shrink=0.8, label="speed, m/s")

@@ -59,8 +59,8 @@ class RunSettings:
     policy: Annotated[str, IN_WORDS] = ""
     """Network; by default one that suits the observation."""
     car_steps: Annotated[int, IN_WORDS] = 0
-    """Car-steps at most; the last generation and the choice of an unsolved run's champion after it may exceed it, by up
-    to 2 million. By default 30 million, in traffic 60, and any number with --generations."""
+    """Car-steps at most; the last generation may exceed it. By default 30 million, in traffic 60, and any number with
+    --generations."""
     until: float = 0.99
     """Stop when the champion succeeds in this share of validation episodes, at --pace or faster; above 1: never."""
 

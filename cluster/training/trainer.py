@@ -179,9 +179,10 @@ class Learning(ABC):
 
         A champion is the best of many on the same maps, so that its score there is too high, in traffic by some
         percent, and later candidates that drive better do not reach it.
-        This is not in the checkpoint: a run that is extended goes on as if it had never ended.
+        This is not in the checkpoint: a run that is extended goes on as if it had never ended. Its car-steps do not
+        count, as those of the held-out drives do not.
         """
-        candidate, before = self.candidate(), self.champion
+        candidate, before, car_steps = self.candidate(), self.champion, self.car_steps
         if candidate is not None and not self.solved and not (before and np.array_equal(candidate, before.genome)):
             finalists = [(before.genome, before.step)] if before else []
             finalists.append((candidate, self.steps - 1))
@@ -193,6 +194,7 @@ class Learning(ABC):
                 if not driven.lost[k]:
                     self._judge(genome, driven.results[k : k + 1], step)
             self.champion = self.champion or before
+            self.car_steps = car_steps
         if self.champion is None:
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
 

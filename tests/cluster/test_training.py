@@ -241,7 +241,9 @@ def test_a_run_that_ends_chooses_between_champion_and_last_candidate_on_other_ma
     for champion, candidate in (two, two[::-1]):
         evolution.champion = Champion(champion, 0.9, 0.9, 1000.0, 0)
         evolution.candidate = lambda candidate=candidate: candidate
+        before = evolution.car_steps
         evolution.choose_champion()
+        assert evolution.car_steps == before
         assert evolution.champion.genome.tobytes() == two[metres.argmax()].tobytes()
         assert (evolution.champion.score, evolution.champion.distance_m) == (0.0, metres.max())
 
