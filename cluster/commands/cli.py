@@ -252,12 +252,13 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     where = "starts all over this map" if is_map_file(settings.scenario) else "held-out drives"
     console.print(held_out_table(f"The champion on {where}", summary["held_out"]))
     steps, solved = count(summary[name + "s"], name), summary["solved"]
-    longer = [f"{as_flag(each)} {2 * bound}" for each in settings.unbound if (bound := getattr(settings, each))]
-    more = "" if solved or not longer else f"\nto go on: {resume} {' '.join(longer)}"
+    reached = [each for each in settings.unbound if 0 < getattr(settings, each) <= summary[each]]
+    longer = " ".join(f"{as_flag(each)} {2 * summary[each]}" for each in reached)
+    more = "" if solved or not longer else f"\nto go on: {resume} {longer}"
     console.print(
         f"{'solved' if solved else 'not solved yet'} after {steps}, {summary['car_steps']:,} car-steps, "
         f"{summary['wall_s']:.0f} s{more}\n"
-        f"success in validation, {'on which' if solved else 'on further maps, on which'} the champion was chosen: "
+        f"success in validation{', on which the champion was chosen' if solved else ' at the end'}: "
         f"{summary['validation_success_rate']:.1%} "
         "(in MLflow validation/success_rate; the table's is held_out/success_rate)\n"
         f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"

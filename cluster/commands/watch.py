@@ -24,7 +24,7 @@ from cluster.commands.common import FAILED, RoadFlags, command_path, fail, main,
 from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
-from cluster.runs.checkpoint import CheckpointError
+from cluster.runs.checkpoint import CHAMPION, CheckpointError
 from cluster.runs.run import CHECKPOINT, CONFIG, RunError, read_config
 from cluster.runs.settings import IN_WORDS, MAX_TRAFFIC
 from cluster.runs.steps import read_elites
@@ -246,16 +246,18 @@ def _page(flags: WatchFlags, limit: float) -> None:
     for source in (flags.source, *flags.beside):
         one = dataclasses.replace(flags, source=source)
         recorded = _is_recording(one)
-        for found, title in _drives(one, limit):
+        path = Path(source).resolve()
+        name = path.parent.name if path.name == CHAMPION else path.name
+        for k, (found, title) in enumerate(_drives(one, limit), 1):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
-            short = Path(source).resolve().name if flags.beside else str(len(shown))
-            shown.append(Shown(label, short, found))
+            own = name if k == 1 else f"{name} {k}"
+            shown.append(Shown(label, own if flags.beside else str(k), found))
             if not recorded:  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:
         raise GridSimError("a page shows drives on one road; give --scenario and --seed, or one recorded drive")
     title = f"GridSim: {', '.join((flags.source, *flags.beside))} on {shown[0].drive.scenario.name}"
-    write_page(output, title, shown, SimConfig(), together=len(shown) > 1)
+    write_page(output, title, shown, SimConfig(), together=bool(flags.beside))
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 

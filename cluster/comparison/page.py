@@ -19,7 +19,7 @@ body { font: 16px system-ui, sans-serif; margin: 2em auto; max-width: 90em; padd
 table { border-collapse: collapse; margin: 1.5em 0 }
 th, td { border-bottom: 1px solid #ddd; padding: 0.3em 0.8em; text-align: right; white-space: nowrap }
 th:nth-child(-n+2), td:nth-child(-n+2) { text-align: left }
-td:has(a) { white-space: normal; overflow-wrap: anywhere }
+td:has(a) { white-space: normal; overflow-wrap: anywhere; min-width: 12em }
 img { max-width: 100% }"""
 
 

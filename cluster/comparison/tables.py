@@ -218,7 +218,7 @@ def runs_table(groups: Sequence[Group]) -> list[list[str]]:
         [
             one.road,
             one.name,
-            one.runs[0].folder.name,
+            one.runs[0].folder.resolve().name,
             f"{one.runs[0].settings.seed}",
             *(cell(one) for _, cell in columns),
         ]

@@ -194,7 +194,7 @@ class Learning(ABC):
                 if not driven.lost[k]:
                     self._judge(genome, driven.results[k : k + 1], step)
             self.champion = self.champion or before
-            self.car_steps = car_steps
+            self.car_steps, self.solved = car_steps, False
         if self.champion is None:
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
 

@@ -143,7 +143,8 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
     assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
     assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "compare: make ui, or" in done.stdout
-    assert "chosen: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout
+    assert "at the end: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout
+    assert "--resume runs/s --generations 12\n" in done.stdout
     assert "http://127.0.0.1:5000/#/experiments/2/runs?workflowType=machine_learning&" in done.stdout
     assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
 

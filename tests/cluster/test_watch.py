@@ -1,6 +1,7 @@
 """Films and windows on champions: frame counts and rates read back, runs that are over or still going, wrong use."""
 
 import dataclasses
+import json
 import re
 import subprocess
 import sys
@@ -123,6 +124,19 @@ def test_watch_writes_films(tmp_path, monkeypatch, capsys):
     code, _, err = call(watch_main, monkeypatch, capsys, *film)
     assert (code, err.count("\n")) == (1, 1)
     assert "ffmpeg cannot be started" in err
+
+
+def test_a_page_of_several_champions_begins_with_all_of_them(tmp_path, monkeypatch, capsys):
+    files = [str(CHAMPION.with_name(name)) for name in ("champion.npz", "champion_traffic.npz")]
+    for page, sources, marks in (
+        ("two.html", files, ["benchmarks", "champion_traffic.npz"]),
+        ("one.html", files[:1], ["1"]),
+    ):
+        call(watch_main, monkeypatch, capsys, *sources, "--seconds", "5", "--output", str(tmp_path / page))
+        (found,) = re.findall(r'type="application/json">(.*)</script>', (tmp_path / page).read_text())
+        data = json.loads(found)
+        assert [each["short"] for each in data["drives"]] == marks
+        assert (data["together"], data["first"]) == (len(sources) > 1, 0)
 
 
 def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
