@@ -1,6 +1,6 @@
 """The README's pictures of a run's page, drive.png and learning.gif, and its curves: python docs/screenshots.py RUN
 
-They are Chromium's of `RUN/drive.html`. README.md shows those of the default run with --seed 0.
+Chromium draws them from `RUN/drive.html`. README.md shows those of the default run with --seed 0.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def shot(browser: Browser) -> Image.Image:
 
 
 def main() -> int:
-    """Make them."""
+    """Write the pictures."""
     if len(sys.argv) != 2 or not (run := Path(sys.argv[1]).resolve()).joinpath("drive.html").is_file():
         print(f"{__doc__.splitlines()[0]}\nRUN is a finished run's folder", file=sys.stderr)
         return 2

@@ -249,7 +249,7 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
     summary, name, path = session.summary, session.learning.step_name, session.run.path
     settings = session.run.settings
-    where = "starts all over this map" if is_map_file(settings.scenario) else "held-out drives"
+    where = "this map, from many starts" if is_map_file(settings.scenario) else "held-out drives"
     console.print(held_out_table(f"The champion on {where}", summary["held_out"]))
     steps, solved = count(summary[name + "s"], name), summary["solved"]
     reached = [each for each in settings.unbound if 0 < getattr(settings, each) <= summary[each]]

@@ -250,8 +250,8 @@ def _page(flags: WatchFlags, limit: float) -> None:
         name = path.parent.name if path.name == CHAMPION else path.name
         for k, (found, title) in enumerate(_drives(one, limit), 1):
             label = title if recorded else f"{title.partition('    ')[0]} of {source}"
-            own = name if k == 1 else f"{name} {k}"
-            shown.append(Shown(label, own if flags.beside else str(k), found))
+            mark = str(k) if not flags.beside else name if k == 1 else f"{name} {k}"
+            shown.append(Shown(label, mark, found))
             if not recorded:  # the others drive on the same road, among as many cars
                 flags = dataclasses.replace(flags, scenario=found.scenario.name, traffic=found.boxes.shape[1])
     if len({(each.drive.scenario.name, each.drive.scenario.seed) for each in shown}) > 1:

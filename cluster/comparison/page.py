@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import os
 from collections.abc import Sequence
 from html import escape
@@ -11,7 +12,7 @@ from urllib.parse import quote
 
 from cluster.comparison.plan import Plan
 from cluster.comparison.results import Run
-from cluster.comparison.tables import DRIVING, ERRORS, Group, introduction, notes, runs_table, table
+from cluster.comparison.tables import DRIVING, ERRORS, Group, introduction, notes, table
 from cluster.runs.run import PAGE
 
 STYLE = """\
@@ -33,12 +34,13 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path
     parts.append("<ul>" + "".join(f"<li>{escape(note)}" for note in notes(groups)) + "</ul>")
     data = base64.b64encode(picture.read_bytes()).decode()
     parts.append(f'<p><img alt="success, errors and training times" src="data:image/png;base64,{data}"></p>')
-    head, *rows = runs_table(groups)
-    runs = [run for group in groups for run in group.runs]
-    linked = [
-        [*map(escape, row[:2]), _link(folder, run, row[2]), *row[3:]] for run, row in zip(runs, rows, strict=True)
-    ]
-    parts += ["<h2>Runs, with their champions' drives</h2>", _table(head, linked)]
+    columns = {name: cell for name, cell in DRIVING.items() if name != "seeds"}
+    runs = []
+    for group in groups:
+        for run in group.runs:
+            figures = [cell(dataclasses.replace(group, runs=(run,))) for cell in columns.values()]
+            runs.append([escape(group.road), escape(group.name), _link(folder, run), f"{run.settings.seed}", *figures])
+    parts += ["<h2>Runs, with their champions' drives</h2>", _table(["road", "learner", "run", "seed", *columns], runs)]
     top = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
     return "\n".join([top, *parts, ""]).encode()
 
@@ -49,9 +51,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "<table>\n" + "\n".join(f"<tr>{line}" for line in lines) + "\n</table>"
 
 
-def _link(folder: Path, run: Run, text: str) -> str:
+def _link(folder: Path, run: Run) -> str:
     """A run's name, linked to its drive if there is one."""
-    drive = run.folder / PAGE
-    if not drive.is_file():
-        return escape(text)
-    return f'<a href="{escape(quote(os.path.relpath(drive, folder)))}">{escape(text)}</a>'
+    name, drive = escape(run.folder.resolve().name), run.folder / PAGE
+    return f'<a href="{escape(quote(os.path.relpath(drive, folder)))}">{name}</a>' if drive.is_file() else name

@@ -210,23 +210,6 @@ def table(groups: Sequence[Group], columns: Columns) -> list[list[str]]:
     return [["road", "learner", *columns], *rows]
 
 
-def runs_table(groups: Sequence[Group]) -> list[list[str]]:
-    """Header and rows of a table of runs: road, learner, name, seed, and the driving columns."""
-    single = [dataclasses.replace(group, runs=(run,), seeds=()) for group in groups for run in group.runs]
-    columns = list(DRIVING.items())[1:]
-    rows = [
-        [
-            one.road,
-            one.name,
-            one.runs[0].folder.resolve().name,
-            f"{one.runs[0].settings.seed}",
-            *(cell(one) for _, cell in columns),
-        ]
-        for one in single
-    ]
-    return [["road", "learner", "run", "seed", *(name for name, _ in columns)], *rows]
-
-
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table, words aligned left and numbers right; the first row is its header."""
     rule = ["---", "---", *["---:"] * (len(rows[0]) - 2)]

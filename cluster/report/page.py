@@ -86,10 +86,8 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
     return [x / size[0] * TURN, y / size[1] * TURN, np.arctan2(sine, cosine) / math.tau * TURN]
 
 
-def write_page(
-    path: Path, title: str, shown: Sequence[Shown], config: SimConfig, together: bool = False
-) -> None:  # fmt: skip
-    """Write a page of drives on one map. It begins with the last of them, or with all `together`.
+def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig, together: bool = False) -> None:
+    """Write a page of drives on one map. It begins with the last of them, or shows all of them `together`.
 
     Raises: CheckpointError.
     """

@@ -68,9 +68,9 @@ def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -
 
 
 def bounds(road_map: Map) -> list[float]:
-    """What is to be seen of a map, m: left, right, low, high.
+    """The part of a map that is shown, in m: left, right, low, high.
 
-    Of one from a file that is its road: the map's sides are rounded up to powers of two, with wall.
+    A map from a file is shown around its road, since its sides are rounded up to powers of two, with wall.
     """
     width, height = float(road_map.road.width), float(road_map.road.height)
     if road_map.torus:
