@@ -6,7 +6,7 @@ one JSON file per command; they are measured again only after a change of gridsi
 interrupted measurement goes on where it stopped. --write puts all complete tables into docs/results.md, with the
 commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, other, speed, learners, comparison; all by default, in two hours on two cores.
+Tables: seeds, roads, other, speed, learners, comparison, pace; all by default, in two hours on two cores.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ import json
 import math
 import re
 import shlex
+import shutil
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +39,7 @@ ROADS = (
     ("highway", 0), ("curved", 0), ("roundabout", 0), ("city", 0),
     ("highway", 8), ("curved", 6), ("seamless", 6), ("roundabout", 4), ("city", 6),
 )  # fmt: skip
+PACES = {"highway": 20, "curved": 10, "seamless": 9, "roundabout": 7, "city": 6}  # m/s, nearer to the reference driver
 
 
 def over_seeds(command: str, seeds: int) -> dict[str, list[str]]:
@@ -65,7 +68,13 @@ TABLES: dict[str, dict[str, list[str]]] = {
     },
     "speed": alone("benchmarks/throughput.py --json", "benchmarks/scaling.py --json"),
     "learners": alone("benchmarks/learners.py --json"),
-    "comparison": alone("gridsim-compare --learners evolution dqn --seeds 5"),
+    "comparison": alone("gridsim-compare --seeds 5"),
+    "pace": {
+        "gridsim-compare": [
+            f"gridsim-compare --scenarios {road} --learners evolution --grid pace={pace} --seeds 5"
+            for road, pace in PACES.items()
+        ]
+    },
 }
 HEAD = (
     "| command | seeds | car-steps, million | to 95 % of validation | total time, s | success, % | collisions, % "
@@ -149,18 +158,27 @@ def measure(command: str, store: Store) -> dict[str, Any]:
     if command.startswith("benchmarks"):
         return {"figures": json.loads(call(command))}
     if command.startswith("gridsim-compare"):
-        return {"table": compare(command, store)}
+        return {"comparison": str(compare(command, store))}
     return measure_run(command, store)
 
 
-def compare(command: str, store: Store) -> str:
-    """Run the comparison, or resume this commit's; returns its table."""
-    folder = store.folder / f"comparison-{store.commit}"
+def compare(command: str, store: Store) -> Path:
+    """Run a comparison, or resume this commit's; returns its folder."""
+    folder = store.folder / f"{name_of(command)}-{store.commit}"
     if folder.exists():
         call("gridsim-compare", "--resume", str(folder))
     else:
         call(command, "--output", str(store.folder), "--name", folder.name)
-    return (folder / "table.md").read_text()
+    return folder
+
+
+def table_of(comparisons: Sequence[str]) -> str:
+    """The table of a comparison, or of several together."""
+    if len(comparisons) == 1:
+        return (Path(comparisons[0]) / "table.md").read_text().strip()
+    with tempfile.TemporaryDirectory() as folder:
+        call("gridsim-compare", *comparisons, "--output", folder, "--name", "all")
+        return (Path(folder) / "all" / "table.md").read_text().strip()
 
 
 def render(rows: Mapping[str, Sequence[str]], store: Store) -> str | None:
@@ -170,8 +188,8 @@ def render(rows: Mapping[str, Sequence[str]], store: Store) -> str | None:
     if any(len(whole[label]) < len(measured[label]) for label in rows):
         return None
     firsts = [runs[0] for runs in whole.values()]
-    if "table" in firsts[0]:
-        return str(firsts[0]["table"]).strip()
+    if "comparison" in firsts[0]:
+        return table_of([row["comparison"] for runs in whole.values() for row in runs])
     if "figures" in firsts[0]:
         figures = {name: value for row in firsts for name, value in row["figures"].items()}
         return "\n".join(
@@ -209,6 +227,9 @@ def write(store: Store) -> None:
             text = f"{text}\n\nMeasured at commit {store.commit}."
             page = re.sub(f"(?s){marks[0]}.*{marks[1]}", lambda _: f"{marks[0]}\n{text}\n{marks[1]}", page)  # noqa: B023
     PAGE.write_text(page)
+    for command in TABLES["comparison"]:
+        if kept := store.kept(command):
+            shutil.copy(Path(kept["comparison"]) / "comparison.png", PAGE.parent)
 
 
 def commit() -> str:
