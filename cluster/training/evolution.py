@@ -83,7 +83,7 @@ class Evolution(Learning):
             leading = call.add(leader, followed)
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
-        driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self.meanwhile)
+        driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self._meanwhile)
         check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
@@ -120,6 +120,10 @@ class Evolution(Learning):
         }
         self.history.append(row)
         return row
+
+    def _meanwhile(self) -> None:
+        self.pool.expect(self._names(self.curriculum.map_seeds[: self.curriculum.maps_in_use(self.steps + 1)]))
+        self.meanwhile()
 
     def candidate(self) -> np.ndarray | None:
         return self.search.leader()

@@ -226,9 +226,13 @@ class Learning(ABC):
 
     def _task(self, kind: Callable[..., T], episodes: Episodes, limits: Limits, **own: Any) -> T:
         """A task of a kind, with what only this kind has."""
+        names = self._names(episodes.maps)
+        return kind(self.settings.policy, episodes.rows, episodes.worlds, names, limits, self.sim, **own)
+
+    def _names(self, seeds: Sequence[int]) -> tuple[tuple[str, int], ...]:
+        """Maps as pools know them."""
         scenario = self.settings.scenario
-        maps = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
-        return kind(self.settings.policy, episodes.rows, episodes.worlds, maps, limits, self.sim, **own)
+        return tuple((scenario, seed_of_map(scenario, seed)) for seed in seeds)
 
     def _report(self, stage: str, call: Call) -> None:
         self.lost_chunks += int(call.lost.sum())

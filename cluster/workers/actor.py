@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from cluster.workers.pool import BuildMap
+from cluster.workers.tickets import Tickets
 from cluster.workers.worker import AnyTask, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
@@ -40,6 +41,7 @@ class Actor:
         self._worker = factory()
         self._task: AnyTask
         self._maps: dict[Name, Map] = {}
+        self._tickets: Tickets | None = None
 
     def hello(self) -> int:
         """The process's id. It then ignores Ctrl-C, which a terminal sends to all: the coordinator ends its workers."""
@@ -51,25 +53,37 @@ class Actor:
         self.run([(b"", 0, 0)], *update)
         return os.getpid()
 
-    def run(
-        self, work: Sequence[Work],
-        names: Sequence[Name] = (), gone: Sequence[Name] = (), shared: bytes | None = None, *maps: Any,
-    ) -> bytes:  # fmt: skip
+    def run(self, work: Sequence[Work], *update: Any) -> bytes:
         """What `Worker.answer` returns for each piece of work, pickled: Ray is slower with arrays than with bytes.
 
-        `names` and all after it come from `Shared.update`, for an actor that does not have the task yet.
+        `update` comes from `Shared.update`, for an actor that does not have the task yet.
         """
+        self._update(*update)
+        return pickle.dumps(self._answer(work), protocol=5)
+
+    def take(self, path: str, serial: int, parcels: bytes, *update: Any) -> bytes:
+        """Do those of a task's parcels that this actor gets from the queue at `path`: what `run` does, by index."""
+        self._update(*update)
+        self._tickets = self._tickets or Tickets(path)
+        works: list[Sequence[Work]] = pickle.loads(parcels)
+        answers = {index: self._answer(works[index]) for index in self._tickets.take(serial)}
+        return pickle.dumps(answers, protocol=5)
+
+    def _answer(self, work: Sequence[Work]) -> list[tuple[Any, ...]]:
+        mine = [self._maps[name] for name in self._task.maps]
+        return [
+            self._worker.answer(self._task, mine, np.frombuffer(recipes, RECIPE), first, stop)
+            for recipes, first, stop in work
+        ]
+
+    def _update(
+        self, names: Sequence[Name] = (), gone: Sequence[Name] = (), shared: bytes | None = None, *maps: Any
+    ) -> None:
         if shared is not None:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:
                 self._maps.pop(name, None)
             self._task = replace(pickle.loads(shared))  # `replace` makes its arrays read-only
-        mine = [self._maps[name] for name in self._task.maps]
-        answers = [
-            self._worker.answer(self._task, mine, np.frombuffer(recipes, RECIPE), first, stop)
-            for recipes, first, stop in work
-        ]
-        return pickle.dumps(answers, protocol=5)
 
 
 class Shared:
@@ -83,22 +97,27 @@ class Shared:
     def __init__(self, put: Callable[[Any], Any], build_map: BuildMap):
         self._put, self._build_map = put, build_map
         self._maps: dict[Name, Any] = {}  # references
+        self._sent = 0  # bytes of maps since the last task
         self._names: tuple[Name, ...] = ()  # of the latest task's maps
         self._task: Any = None  # the latest one, pickled, or a reference to that
 
     def put(self, task: AnyTask) -> int:
-        """Put a task, unless it is small, and those of its maps that are new. Returns: the bytes of all arrays."""
-        sent = sum(value.nbytes for value in vars(task).values() if isinstance(value, np.ndarray))
+        """Put a task, unless it is small, and its maps. Returns: the bytes of all arrays put since the last task."""
         scenarios = {scenario for scenario, _ in task.maps}
         self._maps = {name: ref for name, ref in self._maps.items() if name[0] in scenarios}
-        for name in task.maps:
+        self.put_maps(task.maps)
+        sent, self._sent = self._sent, 0
+        data = pickle.dumps(task, protocol=5)
+        self._names, self._task = task.maps, data if len(data) <= INLINE else self._put(data)
+        return sent + sum(value.nbytes for value in vars(task).values() if isinstance(value, np.ndarray))
+
+    def put_maps(self, names: Sequence[Name]) -> None:
+        """Put those of these maps that are new."""
+        for name in names:
             if name not in self._maps:
                 arrays = self._build_map(*name).arrays()
                 self._maps[name] = self._put(arrays)
-                sent += sum(array.nbytes for array in arrays.values())
-        data = pickle.dumps(task, protocol=5)
-        self._names, self._task = task.maps, data if len(data) <= INLINE else self._put(data)
-        return sent
+                self._sent += sum(array.nbytes for array in arrays.values())
 
     def update(self, known: set[Name]) -> list[Any]:
         """What an actor with the maps `known` needs to take up the task; `known` is updated to what it then has.

@@ -219,6 +219,9 @@ class WorkerPool(ABC):
         self._work(collected, on_progress, meanwhile)
         return collected
 
+    def expect(self, maps: Sequence[tuple[str, int]]) -> None:  # noqa: B027 - there may be nothing to do
+        """Prepare for maps (scenario, seed) that the next calls may need; to be called while the workers are busy."""
+
     @abstractmethod
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         """Have all that is asked for done, and fill `call`."""
@@ -270,7 +273,10 @@ def metres(task: AnyTask, chunk: Chunk) -> float:
     return float(_goals(task)[chunk.columns].sum()) * (chunk.rows.stop - chunk.rows.start)
 
 
-def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None) -> list[Parcel]:
+def cut(
+    task: AnyTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None,
+    worth_s: float | None = None,
+) -> list[Parcel]:  # fmt: skip
     """Cut what is asked for into parcels, by the seconds that it may take: large ones first, small ones last.
 
     Each takes most of a worker's share of the rest, so that no worker waits long for the slowest, and little is sent
@@ -280,11 +286,13 @@ def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[f
 
     Args:
         metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
+        worth_s: seconds of evaluation that are worth a parcel; None where each is sent by the coordinator.
     """
     rates = [METRE_S] * len(asked) if metre_s is None else metre_s
     parcels: list[Parcel] = []
     left = sum(rate * metres(task, block) for rate, block in zip(rates, asked, strict=True))
-    worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one worker computes, all others get their parcels
+    if worth_s is None:
+        worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one worker computes, all others get their parcels
     least = min(worth_s, left / (2 * workers))  # every worker gets some, however little it costs
     largest = max(LARGEST_S, LARGER * worth_s)
     goals = _goals(task)
@@ -307,8 +315,8 @@ def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[f
                 parcel = ()
             else:
                 rest = seconds[-1] - seconds[column]
-                share = rest / math.ceil(rest / room)  # pieces as even as possible: a small one costs as much to send
-                stop = int(np.searchsorted(seconds, seconds[column] + share * (1.0 + 1e-9), side="right")) - 1
+                piece = rest / math.ceil(rest / room)  # all as even as possible: a small one costs as much to send
+                stop = int(np.searchsorted(seconds, seconds[column] + piece * (1.0 + 1e-9), side="right")) - 1
                 stop = min(max(stop, column + 1), len(seconds) - 1)
                 parcels.append((Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)),))
                 left -= seconds[stop] - seconds[column]

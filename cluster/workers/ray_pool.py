@@ -8,6 +8,9 @@ What differs from Ray's defaults, and why:
   kills Ray's processes when their parent *thread* dies, and so they die with us, whatever kills us.
 * Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
   `dispatch` has to know which chunk killed which worker.
+* Where a call takes little time, the workers of this machine take its parcels from a queue (`tickets`): each gets one
+  call of Ray's and gives one answer, in place of one for each parcel, which would cost it a millisecond. What a worker
+  took that died, or failed, is then sent as everywhere else.
 * For half a minute, or forever, Ray does not report a worker that is stopped, or whose host is cut off. A worker that
   has not answered for `patience_s` is replaced, and what it held is sent to another one.
 """
@@ -20,7 +23,7 @@ import shutil
 import threading
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +36,7 @@ from cluster.workers.pool import (
     Call,
     Chunk,
     Meanwhile,
+    Parcel,
     PoolError,
     Progress,
     WorkerPool,
@@ -41,12 +45,16 @@ from cluster.workers.pool import (
     last_line,
     metres,
 )
+from cluster.workers.tickets import Tickets
 from cluster.workers.worker import AnyTask, CollectTask, Worker
 from evolution.episodes.rollout import Limits
 
 CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
+QUEUED_S = 0.5  # of evaluation for each worker, up to which parcels are queued: what a worker did comes in one answer
+WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
+QUEUE: Parcel = ()  # what a worker is sent that is to take its parcels from the queue
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
 
@@ -108,6 +116,7 @@ class RayPool(WorkerPool):
         self._metre_s: dict[_Kind, float] = {}  # what a metre of such a part took the last time
         self._logs = ""  # where they are, in words
         self._session: str | None = None  # folder of our own Ray's logs
+        self._tickets: Tickets | None = None  # only workers of this machine can read them
         self._failure: BaseException | None = None
         self._leaving = self._connected = self._troubled = False
         self._booted, self._closed = threading.Event(), threading.Event()
@@ -117,6 +126,9 @@ class RayPool(WorkerPool):
     def pids(self) -> list[int]:
         """Process ids of the workers that are up, on whichever machine they are."""
         return [slot.pid for slot in self._slots if slot.pid]
+
+    def expect(self, maps: Sequence[Name]) -> None:
+        self._shared.put_maps(maps)
 
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         started = time.perf_counter()
@@ -134,13 +146,30 @@ class RayPool(WorkerPool):
         """Have the workers do all that is asked for."""
         task = call.task
         metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in call.asked]
-        shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
-        self._call, self._dispatch = call, Dispatch(cut(task, call.asked, shares, metre_s))
+        seconds = sum(rate * metres(task, part) for rate, part in zip(metre_s, call.asked, strict=True))
+        self._call = call
         self._serial += 1
         call.broadcast_bytes = self._shared.put(task)
-        alone_since = time.monotonic()
+        if self._tickets and self.pids() and seconds < QUEUED_S * self._asked:
+            self._parcels = dict(enumerate(cut(task, call.asked, self._asked, metre_s, WORTH_QUEUING_S)))
+            self._packed = pickle.dumps([self._pack(parcel) for parcel in self._parcels.values()], protocol=5)
+            self._tickets.put(self._serial, len(self._parcels))
+            meanwhile = self._work_off([QUEUE] * len(self.pids()), on_progress, meanwhile)
+            parcels = list(self._parcels.values())  # that a worker took which died
+            call.retries = len(parcels)
+        else:
+            shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
+            parcels = cut(task, call.asked, shares, metre_s)
+        finish(self._work_off(parcels, on_progress, meanwhile))
 
-        while not self._dispatch.finished():
+    def _work_off(
+        self, parcels: Sequence[Parcel], on_progress: Progress | None, meanwhile: Meanwhile | None
+    ) -> Meanwhile | None:
+        """Have parcels done. Returns what is still to be done meanwhile."""
+        self._dispatch = dispatch = Dispatch(parcels)
+        call, retries = self._call, self._call.retries
+        alone_since = time.monotonic()
+        while not dispatch.finished():
             now = time.monotonic()
             for slot in self._slots:
                 silent_s = now - slot.heard if slot.pid and slot.due else 0.0
@@ -149,7 +178,7 @@ class RayPool(WorkerPool):
                     call.warnings.append(f"a worker {silence} (--patience) and is replaced")
                     self._bury(slot, f"it {silence}")
             idle = [slot.number for slot in self._slots if slot.pid and not slot.due]
-            for number, parcel in self._dispatch.give(idle):
+            for number, parcel in dispatch.give(idle):
                 self._send(self._slots[number], parcel)
             if meanwhile and self.pids() and not meanwhile():
                 meanwhile = None
@@ -159,12 +188,13 @@ class RayPool(WorkerPool):
                     self._greet(waiting[ref])
                 elif self._receive(waiting[ref]) and on_progress:
                     on_progress(*call.progress())
+            call.retries = retries + dispatch.retries
             if self.pids():
                 alone_since = time.monotonic()
             elif time.monotonic() - alone_since > self._patience_s:
                 why = ray_session.capacity() + self._last_failure
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
-        finish(meanwhile)
+        return meanwhile
 
     def _measure(self, call: Call) -> None:
         """Remember how long a metre took."""
@@ -188,16 +218,22 @@ class RayPool(WorkerPool):
             ready, _ = ray.wait(refs, num_returns=1, timeout=timeout_s)
         return ready
 
-    def _send(self, slot: _Slot, parcel: int) -> None:
-        work: list[Work] = []
-        for chunk in self._dispatch.parcels[parcel]:
-            recipes, first, stop = self._call.work(chunk)
-            work.append((recipes.tobytes(), first, stop))
-            self._call.bytes_down += recipes.nbytes
+    def _send(self, slot: _Slot, index: int) -> None:
+        parcel = self._dispatch.parcels[index]
         if not slot.sent:
             slot.heard = time.monotonic()
-        answer = slot.actor.run.remote(work, *self._update(slot))
+        if parcel == QUEUE:
+            assert self._tickets
+            self._call.bytes_down += self._call.recipes.nbytes
+            answer = slot.actor.take.remote(self._tickets.path, self._serial, self._packed, *self._update(slot))
+        else:
+            work = self._pack(parcel)
+            self._call.bytes_down += sum(len(recipes) for recipes, _, _ in work)
+            answer = slot.actor.run.remote(work, *self._update(slot))
         slot.sent.append((self._serial, answer))
+
+    def _pack(self, parcel: Parcel) -> list[Work]:
+        return [(recipes.tobytes(), first, stop) for recipes, first, stop in map(self._call.work, parcel)]
 
     def _update(self, slot: _Slot) -> list[Any]:
         """What a worker still has to be sent of the task."""
@@ -219,24 +255,29 @@ class RayPool(WorkerPool):
                 return self._bury(slot, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = self._dispatch.at(slot.number)
-                what = self._call.describe(at, self._dispatch.parcels[at])
-                raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
+                if self._dispatch.parcels[at] != QUEUE:  # its parcels will be sent again, and one of them fail again
+                    what = self._call.describe(at, self._dispatch.parcels[at])
+                    raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
+            answer = pickle.dumps({})
         except ray.exceptions.RayError as error:
             return self._bury(slot, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
         parcel = self._dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
-        if parcel is not None:
-            for chunk, found in zip(self._dispatch.parcels[parcel], pickle.loads(answer), strict=True):
-                self._call.add(slot.number, chunk, *found)
-            self._call.bytes_up += len(answer)
-        return parcel is not None
+        if parcel is None:
+            return False
+        found, chunks = pickle.loads(answer), self._dispatch.parcels[parcel]
+        done = [(self._parcels.pop(k), found[k]) for k in found] if chunks == QUEUE else [(chunks, found)]
+        for chunks, results in done:
+            for chunk, result in zip(chunks, results, strict=True):
+                self._call.add(slot.number, chunk, *result)
+        self._call.bytes_up += len(answer)
+        return bool(done)
 
     def _bury(self, slot: _Slot, reason: str, blamed: bool = True) -> bool:
         """Replace a worker, and have what it held sent again. Returns whether anything is lost."""
         dispatch, call = self._dispatch, self._call
         lost = [chunk for parcel in dispatch.died(slot.number, blamed) for chunk in dispatch.parcels[parcel]]
-        call.retries = dispatch.retries
         for part in lost:
             call.lose(part)
         if lost:
@@ -262,6 +303,8 @@ class RayPool(WorkerPool):
             for slot in self._slots:
                 ray.kill(slot.actor)
             ray_session.leave()
+            if self._tickets:
+                self._tickets.close()
             if self._session and not self._troubled:
                 shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
         self._slots = []
@@ -280,6 +323,7 @@ class RayPool(WorkerPool):
             if self.address is None:
                 self._session = ray_session.start_own(self._asked)
                 self._logs = f" (logs: {self._session}/logs)"
+                self._tickets = Tickets(f"{self._session}/tickets")
             else:
                 ray_session.join(self.address)
             self._connected = True
