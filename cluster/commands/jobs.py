@@ -26,6 +26,7 @@ from cluster.commands.progress import progress_of
 from cluster.comparison.plan import Cell
 from cluster.comparison.results import measured, read_run
 from cluster.runs.train import Reporter, Session, Workers
+from cluster.tracking.mlflow_run import SLOW_IMPORTS
 from cluster.workers import kernels
 from gridsim.errors import GridSimError
 
@@ -97,7 +98,9 @@ class _Job:
 
     def __init__(self, workers: Workers, train: Train):
         self.cell: Cell | None = None
-        context = multiprocessing.get_context("spawn")
+        # Forked from a process that has all imports: with eight runs at once on two cores, a fifth of the time.
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([__name__, *SLOW_IMPORTS])
         self.pipe, there = context.Pipe()
         self.process = context.Process(target=_main, args=(there, workers, train))
         before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it

@@ -182,7 +182,8 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     at_once = ["--workers", "0", "--jobs", "2"]
 
     def processes():
-        return [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        servers = [child for child in psutil.Process(process.pid).children() if "forkserver" in str(child.cmdline())]
+        return [job for server in servers for job in server.children()]
 
     def both_saved():
         return all((cell.folder / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
