@@ -21,14 +21,23 @@ GC_THRESHOLDS = (200_000, 20, 20)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Signal handler: raise KeyboardInterrupt, but never inside the import system.
+    """Signal handler: raise KeyboardInterrupt, but never inside the import system or below LLVM.
 
-    Raised there, it can be lost, or leave the import lock held, so that other threads wait for it forever.
+    Raised in the former, it can be lost, or leave the import lock held, so that other threads wait for it forever.
+    Raised in a function that LLVM calls while it loads a kernel, it ends the process with a segmentation fault.
     """
-    if frame and frame.f_code.co_filename.startswith("<frozen importlib"):
+    if frame and (frame.f_code.co_filename.startswith("<frozen importlib") or _below_llvm(frame)):
         threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
     else:
         raise KeyboardInterrupt
+
+
+def _below_llvm(frame: FrameType | None) -> bool:
+    while frame:
+        if "llvmlite" in frame.f_code.co_filename:
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _enter(module: str, name: str) -> None:

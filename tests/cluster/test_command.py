@@ -8,6 +8,7 @@ import sys
 import time
 from importlib.metadata import entry_points, version
 
+import llvmlite.binding as llvm
 import pytest
 from commands import call, start
 
@@ -186,11 +187,18 @@ def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monke
     assert capsys.readouterr().err == ""
 
 
-def test_an_interrupt_within_the_import_system_comes_after_it():
+def test_an_interrupt_within_the_import_system_or_llvm_comes_after_it():
     before = signal.signal(signal.SIGINT, entry.interrupt)
     try:
         # The innermost frame is one of importlib's; an exception here could leave its lock held for good.
         importlib._bootstrap._call_with_frames_removed(signal.raise_signal, signal.SIGINT)  # type: ignore
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(10.0)
+        # An exception in what LLVM calls is lost, or ends the process.
+        target = llvm.Target.from_default_triple().create_target_machine(jit=True)
+        compiler = llvm.create_mcjit_compiler(llvm.parse_assembly("define void @f() { ret void }"), target)
+        compiler.set_object_cache(None, lambda _: signal.raise_signal(signal.SIGINT))
+        compiler.finalize_object()
         with pytest.raises(KeyboardInterrupt):
             time.sleep(10.0)
     finally:
