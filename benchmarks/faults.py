@@ -1,10 +1,10 @@
-"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--json]
+"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--jobs N] [--json]
 
-A small evolution with two workers runs again and again, beside an MLflow server of its own. At random moments one of
-FAULTS happens; a run that ended before its time is resumed. A run that came to its end must have the champion, the
-elites and the history of the undisturbed run, and MLflow each of its rows once. When all runs are over, no process of
-theirs may be left, and no file that is no result. 20 faults take about three minutes. The same seed draws the same
-faults, but not at the same steps of a run.
+A small evolution with two workers runs again and again, several of them at once, beside an MLflow server of their own.
+At random moments one of FAULTS happens; a run that ended before its time is resumed. A run that came to its end must
+have the champion, the elites and the history of the undisturbed run, and MLflow each of its rows once. When all runs
+are over, no process of theirs may be left, and no file that is no result. 20 faults take about three minutes, one run
+after another. The same seed draws the same faults, but not at the same steps of a run.
 
 To fill a disk, a small one is mounted for the runs; where that is not allowed, that fault is left out. Hosts and their
 links fail in tests/cluster/test_cluster.py and test_faults.py.
@@ -29,7 +29,9 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
@@ -109,7 +111,9 @@ class Campaign:
     """The runs, their server, and what happens to them. `folder` is a new one, of a short path."""
 
     def __init__(self, folder: Path, seed: int):
-        self.rng, self.counts, self.finished, self.champions = random.Random(seed), Counter[str](), 0, set[str]()
+        self.seed, self.counts, self.finished, self.champions = seed, Counter[str](), 0, set[str]()
+        self.shared = threading.Lock()  # held while the server or the disk, which all runs share, is disturbed
+        self._numbers, self._stopped = count(), False
         self.disk = folder / "disk"
         self.disk.mkdir()
         mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "none", str(self.disk)]
@@ -117,8 +121,8 @@ class Campaign:
             shutil.which("mount") is not None and not subprocess.run(mount, stderr=subprocess.DEVNULL).returncode
         )
         self.faults = [name for name in FAULTS if self.mounted or name != "disk full"]
-        self._folder = folder
-        self._environment = {**os.environ, MARK: str(folder), "RAY_TMPDIR": str(folder / "ray")}
+        self.folder = folder
+        self.environment = {**os.environ, MARK: str(folder), "RAY_TMPDIR": str(folder / "ray")}
         (folder / "ray").mkdir()
         self._shared_memory = set(os.listdir("/dev/shm"))
         with socket.create_server(("127.0.0.1", 0)) as free:
@@ -139,19 +143,19 @@ class Campaign:
             "--port",
             str(port),
         ]
-        command += ["--backend-store-uri", f"sqlite:///{self._folder}/served.db"]
-        command += ["--artifacts-destination", f"{self._folder}/served"]
+        command += ["--backend-store-uri", f"sqlite:///{self.folder}/served.db"]
+        command += ["--artifacts-destination", f"{self.folder}/served"]
         environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
-        with open(self._folder / "server.log", "w") as log:
+        with open(self.folder / "server.log", "w") as log:
             server = subprocess.Popen(
-                command, cwd=self._folder, env=environment, stdout=log, stderr=log, start_new_session=True
+                command, cwd=self.folder, env=environment, stdout=log, stderr=log, start_new_session=True
             )
         ends = time.monotonic() + LONG_S
         while time.monotonic() < ends:
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port)):
                 return server
             time.sleep(0.2)
-        raise Wrong(f"the MLflow server does not come up: see {self._folder}/server.log")
+        raise Wrong(f"the MLflow server does not come up: see {self.folder}/server.log")
 
     def close(self) -> None:
         """End the server and unmount the disk."""
@@ -163,74 +167,37 @@ class Campaign:
 
     # --------------------------------------------------------------------------------------------------------- runs
 
-    def start(self, *flags: str) -> subprocess.Popen:
-        """`gridsim-evolve` with these flags, in a process group of its own."""
-        command = [str(BIN / "gridsim-evolve"), *flags]
-        with open(self._folder / "said.log", "a") as said:
-            return subprocess.Popen(
-                command, cwd=self.disk, env=self._environment, stdout=subprocess.DEVNULL, stderr=said, process_group=0
-            )
-
     def undisturbed(self) -> None:
         """The run that all others are compared with."""
-        uri = f"http://127.0.0.1:{self.gate.port}"
-        process = self.start("--workers", "2", "--name", "undisturbed", "--tracking-uri", uri, *SMALL)
-        if process.wait(LONG_S):
-            raise Wrong(f"the undisturbed run fails: {self.last_words()}")
-        self._check("undisturbed")
+        run = Run(self, "undisturbed")
+        if run.start("--workers", "2", "--name", run.name, "--tracking-uri", self.uri, *SMALL).wait(LONG_S):
+            raise Wrong(f"the undisturbed run fails: {run.last_words()}")
+        self.check(run.name)
 
     @property
     def happened(self) -> int:
         """Faults so far."""
         return sum(self.counts.values())
 
-    def run(self, number: int, faults: int) -> None:
-        """One run to its end, with faults until there were so many in all."""
-        name, begun = f"run-{number}", 0
-        uri = f"http://127.0.0.1:{self.gate.port}"
-        resumable = self.disk / "runs" / name / "checkpoint.npz"
-        while True:
-            if resumable.exists():
-                process = self.start("--workers", "2", "--patience", str(PATIENCE_S), "--resume", f"runs/{name}")
-            else:
-                begun += 1
-                name = f"run-{number}-{begun}"  # a run killed before its first checkpoint keeps the name
-                resumable = self.disk / "runs" / name / "checkpoint.npz"
-                flags = ("--patience", str(PATIENCE_S), "--name", name, "--tracking-uri", uri)
-                process = self.start("--workers", "2", *flags, *SMALL)
-            ends = time.monotonic() + LONG_S
-            while process.poll() is None:
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(self.rng.uniform(0.2, 5.0))
-                if time.monotonic() > ends:
-                    os.killpg(process.pid, signal.SIGKILL)
-                    raise Wrong(f"{name} hangs; it last said: {self.last_words()}")
-                if process.poll() is None and self.happened < faults:
-                    fault = self.rng.choice(self.faults)
-                    self.counts[fault] += 1
-                    FAULTS[fault](self, process)
-            if process.returncode == 0:
-                break
-            refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
-            if "Traceback" in self.said() or not (refused or process.returncode in (-signal.SIGKILL, 130, 1)):
-                raise Wrong(f"{name} ends with {process.returncode}: {self.last_words()}")
-        unsent = re.search("not logged to MLflow|what MLflow lacks is not sent", self.said())
-        if unsent and self.start("--resume", f"runs/{name}").wait(LONG_S):
-            raise Wrong(f"{name} cannot be sent later: {self.last_words()}")
-        self._check(name)
-        shutil.rmtree(self.disk / "runs" / name)
-        (self._folder / "said.log").write_text("")
-        self.finished += 1
+    @property
+    def uri(self) -> str:
+        """The server's, by way of the gate."""
+        return f"http://127.0.0.1:{self.gate.port}"
 
-    def said(self) -> str:
-        """What the commands of this run wrote to the terminal's error stream."""
-        return (self._folder / "said.log").read_text()
+    def disturb(self, faults: int, tell: Callable[[], None]) -> None:
+        """One run after another, until there were so many faults in all."""
+        try:
+            while self.happened < faults and not self._stopped:
+                run = Run(self, f"run-{next(self._numbers)}")
+                run.drive(faults)
+                shutil.rmtree(self.disk / "runs" / run.name)
+                self.finished += 1
+                tell()
+        finally:
+            self._stopped = True  # the others end with their runs
 
-    def last_words(self) -> str:
-        """The end of it."""
-        return self.said()[-500:].strip().replace("\n", " | ")
-
-    def _check(self, name: str) -> None:
+    def check(self, name: str) -> None:
+        """Whether a run is as the undisturbed one."""
         run, wanted = self.disk / "runs" / name, self.disk / "runs" / "undisturbed"
         summary, reference = (json.loads((folder / "summary.json").read_text()) for folder in (run, wanted))
         self.champions.add(summary["champion_sha256"])
@@ -245,7 +212,7 @@ class Campaign:
         if left:
             raise Wrong(f"{name} leaves {left[0]}")
         steps = range(int(summary["generations"]))
-        with contextlib.closing(sqlite3.connect(f"file:{self._folder}/served.db?mode=ro", uri=True)) as database:
+        with contextlib.closing(sqlite3.connect(f"file:{self.folder}/served.db?mode=ro", uri=True)) as database:
             found = database.execute("SELECT run_uuid, status FROM runs WHERE name = ?", (name,)).fetchall()
             if [status for _, status in found] != ["FINISHED"]:
                 raise Wrong(f"{name}: MLflow has it as {found}")
@@ -263,7 +230,7 @@ class Campaign:
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error, OSError):
-                if process.environ().get(MARK) == str(self._folder) and process.status() != psutil.STATUS_ZOMBIE:
+                if process.environ().get(MARK) == str(self.folder) and process.status() != psutil.STATUS_ZOMBIE:
                     found.append(process)
         return found
 
@@ -275,7 +242,7 @@ class Campaign:
         return {
             "processes_left": len(self.processes()),
             "shared_memory_left": len(set(os.listdir("/dev/shm")) - self._shared_memory),
-            "ray_sessions_left": len(list((self._folder / "ray").glob("**/session_2*"))),
+            "ray_sessions_left": len(list((self.folder / "ray").glob("**/session_2*"))),
         }
 
 
@@ -283,6 +250,65 @@ def history(run: Path) -> list[list[str]]:
     """What a run's history has that depends on no clock."""
     with (run / "history.csv").open(newline="") as file:
         return [[row[name] for name in SAME] for row in csv.DictReader(file)]
+
+
+class Run:
+    """One run, from its start to its end, resumed as often as that takes."""
+
+    def __init__(self, campaign: Campaign, name: str):
+        self.campaign, self.name, self._first = campaign, name, name
+        self.rng = random.Random(f"{campaign.seed} {name}")
+        self.ballast = campaign.disk / f"ballast-{name}"
+        self._said = campaign.folder / f"said-{name}.log"
+
+    def start(self, *flags: str) -> subprocess.Popen:
+        """`gridsim-evolve` with these flags, in a process group of its own."""
+        command, campaign = [str(BIN / "gridsim-evolve"), *flags], self.campaign
+        with open(self._said, "a") as said:
+            return subprocess.Popen(
+                command, cwd=campaign.disk, env=campaign.environment, stdout=subprocess.DEVNULL, stderr=said,
+                process_group=0,
+            )  # fmt: skip
+
+    def drive(self, faults: int) -> None:
+        """To its end, with faults until there were so many in all."""
+        campaign, begun = self.campaign, 0
+        while True:
+            flags: tuple[str, ...] = ("--resume", f"runs/{self.name}")
+            if not (campaign.disk / "runs" / self.name / "checkpoint.npz").exists():
+                begun += 1
+                self.name = f"{self._first}-{begun}"  # a run killed before its first checkpoint keeps the name
+                flags = ("--name", self.name, "--tracking-uri", campaign.uri, *SMALL)
+            process = self.start("--workers", "2", "--patience", str(PATIENCE_S), *flags)
+            ends = time.monotonic() + LONG_S
+            while process.poll() is None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(self.rng.uniform(0.2, 5.0))
+                if time.monotonic() > ends:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    raise Wrong(f"{self.name} hangs; it last said: {self.last_words()}")
+                if process.poll() is None and campaign.happened < faults:
+                    fault = self.rng.choice(campaign.faults)
+                    campaign.counts[fault] += 1
+                    FAULTS[fault](self, process)
+            if process.returncode == 0:
+                break
+            refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
+            if "Traceback" in self.said() or not (refused or process.returncode in (-signal.SIGKILL, 130, 1)):
+                raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
+        with campaign.shared:
+            unsent = re.search("not logged to MLflow|what MLflow lacks is not sent", self.said())
+            if unsent and self.start("--resume", f"runs/{self.name}").wait(LONG_S):
+                raise Wrong(f"{self.name} cannot be sent later: {self.last_words()}")
+            campaign.check(self.name)
+
+    def said(self) -> str:
+        """What its commands wrote to the terminal's error stream."""
+        return self._said.read_text()
+
+    def last_words(self) -> str:
+        """The end of it."""
+        return self.said()[-500:].strip().replace("\n", " | ")
 
 
 # ------------------------------------------------------------------------------------------------------------- faults
@@ -295,65 +321,44 @@ def _workers(process: subprocess.Popen) -> list[psutil.Process]:
     return []
 
 
-def _signal_a_worker(campaign: Campaign, process: subprocess.Popen, number: int) -> None:
+def _signal_a_worker(run: Run, process: subprocess.Popen, number: int) -> None:
     if workers := _workers(process):
         with contextlib.suppress(psutil.Error):
-            campaign.rng.choice(workers).send_signal(number)
+            run.rng.choice(workers).send_signal(number)
 
 
-def _kill_worker(campaign: Campaign, process: subprocess.Popen) -> None:
-    _signal_a_worker(campaign, process, signal.SIGKILL)
-
-
-def _stop_worker(campaign: Campaign, process: subprocess.Popen) -> None:
-    _signal_a_worker(campaign, process, signal.SIGSTOP)
-
-
-def _kill_coordinator(campaign: Campaign, process: subprocess.Popen) -> None:
-    process.kill()
-
-
-def _end_coordinator(campaign: Campaign, process: subprocess.Popen) -> None:
-    process.terminate()
-
-
-def _end_group(campaign: Campaign, process: subprocess.Popen) -> None:
+def _signal_group(process: subprocess.Popen, number: int) -> None:
     with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGTERM)
+        os.killpg(process.pid, number)
 
 
-def _interrupt_group(campaign: Campaign, process: subprocess.Popen) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGINT)
+def _mlflow(mode: str, run: Run) -> None:
+    with run.campaign.shared, run.campaign.gate.shut(mode):
+        time.sleep(run.rng.uniform(0.5, 8.0))
 
 
-def _mlflow(mode: str, campaign: Campaign) -> None:
-    with campaign.gate.shut(mode):
-        time.sleep(campaign.rng.uniform(0.5, 8.0))
+def _fill_disk(run: Run, process: subprocess.Popen) -> None:
+    with run.campaign.shared:
+        try:
+            with contextlib.suppress(OSError), run.ballast.open("wb") as file:
+                while True:
+                    file.write(bytes(1 << 20))
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(run.rng.uniform(0.5, 4.0))
+        finally:
+            run.ballast.unlink(missing_ok=True)
 
 
-def _fill_disk(campaign: Campaign, process: subprocess.Popen) -> None:
-    ballast = campaign.disk / "ballast"
-    try:
-        with contextlib.suppress(OSError), ballast.open("wb") as file:
-            while True:
-                file.write(bytes(1 << 20))
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(campaign.rng.uniform(0.5, 4.0))
-    finally:
-        ballast.unlink(missing_ok=True)
-
-
-FAULTS = {
-    "worker killed": _kill_worker,
-    "worker stopped": _stop_worker,
-    "coordinator killed": _kill_coordinator,
-    "coordinator terminated": _end_coordinator,
-    "group terminated": _end_group,
-    "group interrupted": _interrupt_group,
-    "MLflow gone": lambda campaign, _: _mlflow("gone", campaign),
-    "MLflow slow": lambda campaign, _: _mlflow("slow", campaign),
-    "MLflow full": lambda campaign, _: _mlflow("full", campaign),
+FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
+    "worker killed": lambda run, process: _signal_a_worker(run, process, signal.SIGKILL),
+    "worker stopped": lambda run, process: _signal_a_worker(run, process, signal.SIGSTOP),
+    "coordinator killed": lambda _, process: process.kill(),
+    "coordinator terminated": lambda _, process: process.terminate(),
+    "group terminated": lambda _, process: _signal_group(process, signal.SIGTERM),
+    "group interrupted": lambda _, process: _signal_group(process, signal.SIGINT),
+    "MLflow gone": lambda run, _: _mlflow("gone", run),
+    "MLflow slow": lambda run, _: _mlflow("slow", run),
+    "MLflow full": lambda run, _: _mlflow("full", run),
     "disk full": _fill_disk,
 }
 
@@ -363,6 +368,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=20, help="how many (20)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults and their moments (0)")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at once (1)")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # runs inherit it; jobs in a shell's background ignore it
@@ -371,14 +377,14 @@ def main() -> int:
     begun = time.monotonic()
     try:
         campaign.undisturbed()
-        while campaign.happened < options.faults:
-            campaign.run(campaign.finished, options.faults)
+
+        def tell() -> None:
             if not options.json:
-                seconds = time.monotonic() - begun
-                print(
-                    f"{campaign.happened} of {options.faults} faults, {campaign.finished} runs, {seconds:.0f} s",
-                    flush=True,
-                )
+                done = f"{campaign.happened} of {options.faults} faults, {campaign.finished} runs"
+                print(f"{done}, {time.monotonic() - begun:.0f} s", flush=True)
+
+        with ThreadPoolExecutor(options.jobs) as jobs:
+            list(jobs.map(lambda _: campaign.disturb(options.faults, tell), range(options.jobs)))
     except Wrong as error:
         wrong = str(error)
     finally:
