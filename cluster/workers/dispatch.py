@@ -4,6 +4,7 @@
 * A parcel that killed twice is split into its members (of a batch of experience: its episodes, of which all that is
   said of members is true). A member that kills three workers by itself is lost, with everything that it was asked for.
   So the same members are lost however many workers there are and however the work was cut.
+* A parcel without chunks, for which a worker takes others from a queue, is sent again once, and never lost.
 """
 
 from __future__ import annotations

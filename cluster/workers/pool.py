@@ -62,7 +62,7 @@ class Call(ABC):
         wall_s: seconds from call to return.
         busy_s: seconds that each worker (by its number) was at work. A replacement keeps the number.
         episode_s: seconds of these that each column took, for all rows together, float64 [columns].
-        retries: chunks that were sent again because their worker died.
+        retries: parcels that were sent again because their worker died or failed.
         bytes_down: payload sent to workers, recipes mostly; grows with the population.
         bytes_up: payload sent back.
         broadcast_bytes: put into the object store: the task and the maps that were new to it.

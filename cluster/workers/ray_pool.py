@@ -10,7 +10,7 @@ What differs from Ray's defaults, and why:
   `dispatch` has to know which chunk killed which worker.
 * Where a call takes little time, the workers of this machine take its parcels from a queue (`tickets`): each gets one
   call of Ray's and gives one answer, in place of one for each parcel, which would cost it a millisecond. What a worker
-  took that died, or failed, is then sent as everywhere else.
+  had taken when it died or failed is then sent in parcels, as on a cluster.
 * For half a minute, or forever, Ray does not report a worker that is stopped, or whose host is cut off. A worker that
   has not answered for `patience_s` is replaced, and what it held is sent to another one.
 """
@@ -54,7 +54,7 @@ PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation for each worker, up to which parcels are queued: what a worker did comes in one answer
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
-QUEUE: Parcel = ()  # what a worker is sent that is to take its parcels from the queue
+FROM_QUEUE: Parcel = ()  # what a worker is sent that is to take its parcels from the queue
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
 
@@ -150,12 +150,12 @@ class RayPool(WorkerPool):
         self._call = call
         self._serial += 1
         call.broadcast_bytes = self._shared.put(task)
-        if self._tickets and self.pids() and seconds < QUEUED_S * self._asked:
+        if self._tickets and seconds < QUEUED_S * len(self.pids()):
             self._parcels = dict(enumerate(cut(task, call.asked, self._asked, metre_s, WORTH_QUEUING_S)))
             self._packed = pickle.dumps([self._pack(parcel) for parcel in self._parcels.values()], protocol=5)
             self._tickets.put(self._serial, len(self._parcels))
-            meanwhile = self._work_off([QUEUE] * len(self.pids()), on_progress, meanwhile)
-            parcels = list(self._parcels.values())  # that a worker took which died
+            meanwhile = self._work_off([FROM_QUEUE] * len(self.pids()), on_progress, meanwhile)
+            parcels = list(self._parcels.values())  # those of workers that died or failed
             call.retries = len(parcels)
         else:
             shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
@@ -222,7 +222,7 @@ class RayPool(WorkerPool):
         parcel = self._dispatch.parcels[index]
         if not slot.sent:
             slot.heard = time.monotonic()
-        if parcel == QUEUE:
+        if parcel == FROM_QUEUE:
             assert self._tickets
             self._call.bytes_down += self._call.recipes.nbytes
             answer = slot.actor.take.remote(self._tickets.path, self._serial, self._packed, *self._update(slot))
@@ -255,9 +255,13 @@ class RayPool(WorkerPool):
                 return self._bury(slot, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = self._dispatch.at(slot.number)
-                if self._dispatch.parcels[at] != QUEUE:  # its parcels will be sent again, and one of them fail again
+                if (
+                    self._dispatch.parcels[at] != FROM_QUEUE
+                ):  # its parcels will be sent again, and one of them fail again
                     what = self._call.describe(at, self._dispatch.parcels[at])
                     raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
+            slot.serial = 0  # it may not have the task
+            slot.maps.clear()
             answer = pickle.dumps({})
         except ray.exceptions.RayError as error:
             return self._bury(slot, ray_session.reason(error), ray_session.is_to_blame(error))
@@ -267,7 +271,7 @@ class RayPool(WorkerPool):
         if parcel is None:
             return False
         found, chunks = pickle.loads(answer), self._dispatch.parcels[parcel]
-        done = [(self._parcels.pop(k), found[k]) for k in found] if chunks == QUEUE else [(chunks, found)]
+        done = [(self._parcels.pop(k), found[k]) for k in found] if chunks == FROM_QUEUE else [(chunks, found)]
         for chunks, results in done:
             for chunk, result in zip(chunks, results, strict=True):
                 self._call.add(slot.number, chunk, *result)
@@ -305,6 +309,7 @@ class RayPool(WorkerPool):
             ray_session.leave()
             if self._tickets:
                 self._tickets.close()
+                self._tickets = None
             if self._session and not self._troubled:
                 shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
         self._slots = []
@@ -323,10 +328,11 @@ class RayPool(WorkerPool):
             if self.address is None:
                 self._session = ray_session.start_own(self._asked)
                 self._logs = f" (logs: {self._session}/logs)"
-                self._tickets = Tickets(f"{self._session}/tickets")
             else:
                 ray_session.join(self.address)
             self._connected = True
+            if self._session:
+                self._tickets = Tickets(f"{self._session}/tickets")
             self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [self._start(number) for number in range(self._asked)]

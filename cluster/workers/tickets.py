@@ -7,7 +7,8 @@ import os
 import struct
 from collections.abc import Iterator
 
-TICKET = struct.Struct("<IH")  # a task's serial number and a parcel's index; a pipe gives each to one reader, whole
+TICKET = struct.Struct("<HH")  # a task's serial number and a parcel's index; a pipe gives each to one reader, whole
+EMPTY = 1 << 16  # more bytes than a pipe holds
 
 
 class Tickets:
@@ -24,18 +25,19 @@ class Tickets:
         self._pipe = os.open(path, os.O_RDWR | os.O_NONBLOCK)
 
     def put(self, serial: int, parcels: int) -> None:
-        """Put tickets for the parcels of a task, fewer than 10,000, in place of all that are left."""
-        for _ in self.take(serial):
-            pass
-        os.write(self._pipe, b"".join(TICKET.pack(serial, index) for index in range(parcels)))
+        """Put tickets for the parcels of a task in place of all that are left; as many as there is room for."""
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._pipe, EMPTY)
+        os.write(self._pipe, b"".join(TICKET.pack(serial & 0xFFFF, index) for index in range(parcels)))
 
     def take(self, serial: int) -> Iterator[int]:
         """Parcels of a task that nobody has taken, until there are none."""
         with contextlib.suppress(BlockingIOError):
             while True:
                 owner, index = TICKET.unpack(os.read(self._pipe, TICKET.size))
-                if owner == serial:  # else the call that it is of was interrupted
-                    yield index
+                if owner != serial & 0xFFFF:  # of a later task: this one was interrupted
+                    return
+                yield index
 
     def close(self) -> None:
         os.close(self._pipe)

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import http.server
 import os
+import pickle
 import re
 import signal
 import socket
@@ -11,7 +12,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
@@ -88,6 +91,23 @@ class Inspecting(Worker):
         assert os.environ.get("OMP_NUM_THREADS") == "1", "a worker has more than one thread"
         assert psutil.Process().memory_full_info().uss <= 220 << 20
         return super().evaluate(task, maps, recipes)
+
+
+def take_up(order: Path, task: bytes) -> Task:
+    """Unpickles a `Reluctant` task, but fails as often as a file says."""
+    if left := int(order.read_text()):
+        order.write_text(str(left - 1))
+        raise MemoryError("no room")
+    return pickle.loads(task)
+
+
+@dataclass(frozen=True)
+class Reluctant(Task):
+    order: Path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        own = {name: value for name, value in vars(self).items() if name != "order"}
+        return take_up, (self.order, pickle.dumps(Task(**own)))
 
 
 class Unfit(Answering):
@@ -234,6 +254,20 @@ def test_experience_keeps_its_order_where_workers_die(pool: RayPool, folder: Pat
     assert times <= collected.retries <= 2 * times
     sent = wanted.results.nbytes + len(to_bytes(wanted.experience))
     assert sent < collected.bytes_up < sent + 20_000 + 1000 * len(progress)
+
+
+def test_a_worker_that_could_not_take_up_a_queued_task_does_not_go_on_with_the_one_before(
+    pool: RayPool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_pool, "QUEUED_S", 1e9)
+    other = make_task()
+    task = Reluctant(**vars(replace(other, parents=other.parents + 1.0)), order=tmp_path / "order")
+    task.order.write_text("2")
+    pool.evaluate(other, make_recipes(512))
+    outcome = pool.evaluate(task, make_recipes(512))
+    assert task.order.read_text() < "2"
+    wanted = SerialPool(never_built, Answering).evaluate(task, make_recipes(512))
+    assert outcome.results.tobytes() == wanted.results.tobytes()
 
 
 @pytest.mark.usefixtures("way")
