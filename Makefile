@@ -49,7 +49,7 @@ bench: $(STAMP) ## Measure throughput on one core, then scaling over workers
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/scaling.py
 
-results: $(DEV) ## Measure the tables of docs/results.md again, in two hours; resumable
+results: $(DEV) ## Measure the tables of docs/results.md again, in two and a half hours; resumable
 	$(BIN)/python benchmarks/results.py --write $(ARGS)
 
 pictures: $(STAMP) ## Draw docs/'s pictures of the five scenarios again

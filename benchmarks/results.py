@@ -6,7 +6,7 @@ one JSON file per command; they are measured again only after a change of gridsi
 interrupted measurement goes on where it stopped. --write puts all complete tables into docs/results.md, with the
 commit. Nothing else should run on the machine.
 
-Tables: seeds, roads, other, speed, learners, comparison, pace; all by default, in two hours on two cores.
+Tables: seeds, roads, other, speed, learners, comparison, pace; all by default, in two and a half hours on two cores.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
 """A comparison's runs: one after another in this process, or several at once, each in a process of its own.
 
-Such a process, a job, trains one run after another, so that its imports and its workers serve all of them. Through a
-pipe it receives its runs and sends their events; files, locks and resuming are those of any run. If this process dies,
-a job cannot send its next event: it saves its run and ends.
+Such a process, a job, trains one run after another, so that its workers serve all of them; jobs are forked from a
+process that has all imports (`forked`). Through a pipe a job receives its runs and sends their events; files, locks and
+resuming are those of any run. If this process dies, a job cannot send its next event: it saves its run and ends.
 """
 
 from __future__ import annotations
 
 import contextlib
-import gc
 import multiprocessing
 import os
 import signal
@@ -21,12 +20,11 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Literal
 
 from cluster.commands.common import command_path, short_path
-from cluster.commands.entry import GC_THRESHOLDS, interrupt
+from cluster.commands.entry import interrupt
 from cluster.commands.progress import progress_of
 from cluster.comparison.plan import Cell
 from cluster.comparison.results import measured, read_run
 from cluster.runs.train import Reporter, Session, Workers
-from cluster.tracking.mlflow_run import SLOW_IMPORTS
 from cluster.workers import kernels
 from gridsim.errors import GridSimError
 
@@ -98,14 +96,11 @@ class _Job:
 
     def __init__(self, workers: Workers, train: Train):
         self.cell: Cell | None = None
-        # Forked from a process that has all imports: with eight runs at once on two cores, a fifth of the time.
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([__name__, *SLOW_IMPORTS])
+        context.set_forkserver_preload(["cluster.commands.forked"])
         self.pipe, there = context.Pipe()
         self.process = context.Process(target=_main, args=(there, workers, train))
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for this process; the new one inherits it
         self.process.start()
-        signal.signal(signal.SIGINT, before)
         there.close()
 
     def assign(self, cells: deque[Cell]) -> None:
@@ -161,7 +156,6 @@ def _compile(cells: Sequence[Cell], on_event: OnEvent) -> None:
 
 def _main(pipe: Connection, workers: Workers, train: Train) -> None:
     """A job's process: train the runs that come through the pipe. SIGTERM stops it."""
-    gc.set_threshold(*GC_THRESHOLDS)
     signal.signal(signal.SIGTERM, interrupt)
 
     def on_event(cell: Cell, kind: Kind, content: Any) -> None:

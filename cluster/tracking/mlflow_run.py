@@ -22,7 +22,6 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -53,7 +52,6 @@ _COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_
 """What the view's run table shows of each run, and the columns' widths in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
-SLOW_IMPORTS = ("mlflow.pytorch", "torch._dynamo")  # the second, as torch.export does when it is called
 MAX_BATCH = 1000  # metrics that MLflow takes in one request
 
 # Set unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
@@ -263,8 +261,8 @@ def _note_tags(text: str) -> dict[str, str]:
 def preload() -> None:
     """Import what `write_model` needs, which takes three seconds, so that a run's end need not wait for it."""
     with contextlib.suppress(Exception):  # `write_model` raises it again
-        for name in SLOW_IMPORTS:
-            import_module(name)
+        import mlflow.pytorch  # noqa: F401
+        import torch._dynamo  # noqa: F401  # as torch.export does when it is called
 
 
 def write_model(folder: Path, model: Model) -> None:

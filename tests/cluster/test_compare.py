@@ -188,16 +188,17 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     def both_saved():
         return all((cell.folder / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
 
+    (tmp_path / "tmp").mkdir()
     process = start("gridsim-compare", *asked, "--budget", "1G", "--generations", "12", *at_once, "--name", "c",
-                    cwd=tmp_path)  # fmt: skip
+                    cwd=tmp_path, TMPDIR=str(tmp_path / "tmp"))  # fmt: skip
     try:
         wait_until(both_saved, 240)
         children = processes()
-        process.send_signal(signal.SIGINT)
+        os.killpg(process.pid, signal.SIGTERM)
         errors = process.communicate(timeout=120)[1]
         assert process.returncode == 130, errors
         assert len(children) == 2
-        assert not any(child.is_running() for child in children)
+        assert not any(child.is_running() for child in children), "it has waited until they were saved"
         process = start("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path)
         wait_until(lambda: len(processes()) == 2, 60)
         for child in processes():
@@ -210,7 +211,8 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     finally:
         process.kill()
         process.communicate()
-    done = finish("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path)
+    done = finish("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path, TMPDIR=str(tmp_path / "tmp"))
     assert (done.returncode, done.stderr) == (0, "")
+    assert not list((tmp_path / "tmp").glob("pymp-*")), "the folder of a socket"
     for cell in cells:
         assert summary(cell.folder)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
