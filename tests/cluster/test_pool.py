@@ -357,6 +357,12 @@ def test_the_store_keeps_one_scenarios_maps_and_a_worker_gets_each_once() -> Non
         assert [seed for _, seed in lacking] == new
         assert sorted(seed for _, seed in forgotten) == gone
         assert len(refs) == 1 + len(new)
+    shared.put_maps([("seamless", 0), ("seamless", 7)])  # ahead of the task that needs them
+    assert built[-1] == 7
+    assert shared.put(make_task((("seamless", 7),))) >> 20 == 1
+    assert len(built) == before + 2
+    lacking, *_ = shared.update(known)
+    assert lacking == [("seamless", 7)]
 
 
 def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_are_gone() -> None:
