@@ -1,4 +1,4 @@
-"""Whether memory grows over generations: python benchmarks/soak.py [--generations 2000] [--workers 2] [--policy P]
+"""Whether memory or saving grows over generations: soak.py [--generations 2000] [--workers 2] [--policy P]
 
 Evolves a small population from a trained driver, so that everything a long run does happens from the start: crashes,
 validation, a checkpoint and an MLflow row in each generation; with --policy, from random networks of that kind, whose
@@ -6,7 +6,8 @@ leader is validated however it drives. After each generation, the memory of the 
 (Ray's processes and the workers) is added up as PSS, in which shared memory counts once.
 
 The memory after the first 100 generations (or half of a shorter run) is compared with that at the end, as medians of
-20. Exits with 1 if it grew by over 5 %, of the command alone or of all. Linux only.
+20. Exits with 1 if it grew by over 5 %, of the command alone or of all. Every generation is saved; what that took, and
+the checkpoint's size, are those of the first 20 and of the last 20. Linux only.
 """
 
 from __future__ import annotations
@@ -60,14 +61,17 @@ def memory(pid: int) -> int:
     return 0
 
 
-def soak(generations: int, workers: int, policy: str = "") -> dict[str, list[int]]:
-    """Bytes after each generation: of the command (`own`), and of all that it started (`started`)."""
+def soak(generations: int, workers: int, policy: str = "") -> dict[str, list[float]]:
+    """After each generation: bytes of the command (`own`), and of all that it started (`started`).
+
+    Also of each time that it saved: the seconds (`save`), and the checkpoint's bytes (`checkpoint`).
+    """
     champion = load_champion(Path(__file__).with_name("champion.npz"))
     # Small steps, so that the drivers keep driving well.
     settings = EvolveSettings(
         policy=policy or champion.policy, population=32, sigma=0.01, generations=generations, until=2.0
     )
-    seen: dict[str, list[int]] = {"own": [], "started": []}
+    seen: dict[str, list[float]] = {"own": [], "started": [], "save": [], "checkpoint": []}
     with tempfile.TemporaryDirectory() as folder:
         maps = Maps(settings.scenario, SimConfig())
         pool = RayPool(workers, maps.build)
@@ -87,6 +91,16 @@ def soak(generations: int, workers: int, policy: str = "") -> dict[str, list[int
             if sys.stderr.isatty():
                 print(f"\rgeneration {generation} ", end="", file=sys.stderr, flush=True)
 
+        save = this.save
+
+        def timed() -> None:
+            begun = time.perf_counter()
+            save()
+            seen["save"].append(time.perf_counter() - begun)
+            seen["checkpoint"].append((this.run.path / "checkpoint.npz").stat().st_size)
+
+        this.learning.save_every_s = 0.0  # type: ignore[misc]
+        this.save = timed  # type: ignore[method-assign]
         this.reporter.row = look
         learn(this)
         maps.close()
@@ -106,6 +120,7 @@ def main() -> int:
     begun = time.perf_counter()
     seen = soak(options.generations, options.workers, options.policy)
     seconds = time.perf_counter() - begun
+    save, checkpoint = seen.pop("save"), seen.pop("checkpoint")
     seen["all"] = [sum(both) for both in zip(*seen.values(), strict=True)]
     first = min(FIRST, len(seen["all"]) // 2)
     window = min(WINDOW, len(seen["all"]) - first)
@@ -123,12 +138,16 @@ def main() -> int:
         "own_mib_after": round(after["own"] / MIB, 1),
         "growth": round(growth["all"], 4),
         "own_growth": round(growth["own"], 4),
+        "save_ms_before": round(1e3 * statistics.median(save[:WINDOW]), 2),
+        "save_ms_after": round(1e3 * statistics.median(save[-WINDOW:]), 2),
+        "checkpoint_kib_before": round(statistics.median(checkpoint[:WINDOW]) / 1024, 1),
+        "checkpoint_kib_after": round(statistics.median(checkpoint[-WINDOW:]) / 1024, 1),
     }
     if options.json:
         print(json.dumps(figures))
     else:
         for name, value in figures.items():
-            print(f"{name:16} {value:12,}")
+            print(f"{name:21} {value:12,}")
     if max(growth.values()) > GROWTH:
         print(f"soak: memory has grown by {max(growth.values()):.1%}, more than {GROWTH:.0%}", file=sys.stderr)
         return 1
