@@ -25,6 +25,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from cluster.workers import ray_session
@@ -45,7 +46,7 @@ from cluster.workers.pool import (
     last_line,
     metres,
 )
-from cluster.workers.tickets import Tickets
+from cluster.workers.tickets import Tickets, abandoned
 from cluster.workers.worker import AnyTask, CollectTask, Worker
 from evolution.episodes.rollout import Limits
 
@@ -114,11 +115,10 @@ class RayPool(WorkerPool):
         self._serial = 0
         self._last_failure = ""  # of a worker's start
         self._metre_s: dict[_Kind, float] = {}  # what a metre of such a part took the last time
-        self._logs = ""  # where they are, in words
         self._session: str | None = None  # folder of our own Ray's logs
         self._tickets: Tickets | None = None  # only workers of this machine can read them
         self._failure: BaseException | None = None
-        self._leaving = self._connected = self._troubled = False
+        self._leaving = self._connected = self._named = False
         self._booted, self._closed = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
         self._thread.start()
@@ -126,6 +126,12 @@ class RayPool(WorkerPool):
     def pids(self) -> list[int]:
         """Process ids of the workers that are up, on whichever machine they are."""
         return [slot.pid for slot in self._slots if slot.pid]
+
+    @property
+    def _logs(self) -> str:
+        """Where the logs are, in words. They are kept, then."""
+        self._named = self._session is not None
+        return f" (logs: {self._session}/logs)" if self._named else ""
 
     def expect(self, maps: Sequence[Name]) -> None:
         self._shared.put_maps(maps)
@@ -255,9 +261,7 @@ class RayPool(WorkerPool):
                 return self._bury(slot, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = self._dispatch.at(slot.number)
-                if (
-                    self._dispatch.parcels[at] != FROM_QUEUE
-                ):  # its parcels will be sent again, and one of them fail again
+                if self._dispatch.parcels[at] != FROM_QUEUE:  # else its parcels are sent, and one fails again
                     what = self._call.describe(at, self._dispatch.parcels[at])
                     raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
             slot.serial = 0  # it may not have the task
@@ -310,7 +314,7 @@ class RayPool(WorkerPool):
             if self._tickets:
                 self._tickets.close()
                 self._tickets = None
-            if self._session and not self._troubled:
+            if self._session and not self._named:
                 shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
         self._slots = []
         self._closed.set()
@@ -327,12 +331,14 @@ class RayPool(WorkerPool):
                 return
             if self.address is None:
                 self._session = ray_session.start_own(self._asked)
-                self._logs = f" (logs: {self._session}/logs)"
             else:
                 ray_session.join(self.address)
             self._connected = True
             if self._session:
-                self._tickets = Tickets(f"{self._session}/tickets")
+                self._tickets = Tickets(f"{self._session}/tickets", new=True)
+                for tickets in Path(self._session).parent.glob("session_*/tickets"):
+                    if abandoned(tickets):  # a run of ours was killed
+                        shutil.rmtree(tickets.parent, ignore_errors=True)
             self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [self._start(number) for number in range(self._asked)]
@@ -360,7 +366,6 @@ class RayPool(WorkerPool):
     def _replace(self, slot: _Slot) -> None:
         import ray
 
-        self._troubled = True
         ray.kill(slot.actor)  # it may be alive and merely out of reach
         self._slots[slot.number] = self._start(slot.number)
 

@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 TICKET = struct.Struct("<HH")  # a task's serial number and a parcel's index; a pipe gives each to one reader, whole
 EMPTY = 1 << 16  # more bytes than a pipe holds
 
 
 class Tickets:
-    """One process's end of the queue. The first one creates it.
+    """One process's end of the queue.
 
     Args:
         path: of the pipe.
+        new: whether to create it.
     """
 
-    def __init__(self, path: str):
-        with contextlib.suppress(FileExistsError):
-            os.mkfifo(path)
-        self.path = path
-        self._pipe = os.open(path, os.O_RDWR | os.O_NONBLOCK)
+    def __init__(self, path: str, new: bool = False):
+        self.path, made = path, f"{path}.new" if new else path
+        if new:
+            os.mkfifo(made)
+        self._pipe = os.open(made, os.O_RDWR | os.O_NONBLOCK)
+        if new:
+            os.rename(made, path)  # only now, so that it is never taken for an abandoned one
 
     def put(self, serial: int, parcels: int) -> None:
         """Put tickets for the parcels of a task in place of all that are left; as many as there is room for."""
@@ -40,4 +45,15 @@ class Tickets:
                 yield index
 
     def close(self) -> None:
+        """Remove the queue."""
+        os.unlink(self.path)
         os.close(self._pipe)
+
+
+def abandoned(path: Path) -> bool:
+    """Whether all processes that had a queue open are gone, and none has closed it."""
+    try:
+        os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
+    except OSError as error:
+        return error.errno == errno.ENXIO
+    return False

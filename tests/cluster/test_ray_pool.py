@@ -9,6 +9,7 @@ import re
 import signal
 import socket
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -39,6 +40,7 @@ from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError, SerialPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.ray_session import check_address
+from cluster.workers.tickets import Tickets
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.search.breeding import RECIPE
 from gridsim.maps.map import Map
@@ -93,21 +95,22 @@ class Inspecting(Worker):
         return super().evaluate(task, maps, recipes)
 
 
-def take_up(order: Path, task: bytes) -> Task:
-    """Unpickles a `Reluctant` task, but fails as often as a file says."""
-    if left := int(order.read_text()):
-        order.write_text(str(left - 1))
+def take_up(seen: Path, task: bytes) -> Task:
+    """Unpickles a `Reluctant` task, but fails the first time in each process."""
+    mine = seen / str(os.getpid())
+    if not mine.exists():
+        mine.touch()
         raise MemoryError("no room")
     return pickle.loads(task)
 
 
 @dataclass(frozen=True)
 class Reluctant(Task):
-    order: Path
+    seen: Path
 
     def __reduce__(self) -> tuple[Any, ...]:
-        own = {name: value for name, value in vars(self).items() if name != "order"}
-        return take_up, (self.order, pickle.dumps(Task(**own)))
+        own = {name: value for name, value in vars(self).items() if name != "seen"}
+        return take_up, (self.seen, pickle.dumps(Task(**own)))
 
 
 class Unfit(Answering):
@@ -261,11 +264,10 @@ def test_a_worker_that_could_not_take_up_a_queued_task_does_not_go_on_with_the_o
 ) -> None:
     monkeypatch.setattr(ray_pool, "QUEUED_S", 1e9)
     other = make_task()
-    task = Reluctant(**vars(replace(other, parents=other.parents + 1.0)), order=tmp_path / "order")
-    task.order.write_text("2")
+    task = Reluctant(**vars(replace(other, parents=other.parents + 1.0)), seen=tmp_path)
     pool.evaluate(other, make_recipes(512))
     outcome = pool.evaluate(task, make_recipes(512))
-    assert task.order.read_text() < "2"
+    assert {path.name for path in tmp_path.iterdir()} == set(map(str, pool.pids()))
     wanted = SerialPool(never_built, Answering).evaluate(task, make_recipes(512))
     assert outcome.results.tobytes() == wanted.results.tobytes()
 
@@ -361,6 +363,24 @@ def test_any_number_of_workers_gives_the_serial_pools_bits(workers: int) -> None
         killer.join()
         processes = psutil.Process().children(recursive=True)
     assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
+
+
+@pytest.mark.usefixtures("no_pool")
+def test_what_a_killed_run_left_of_its_ray_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
+        monkeypatch.setenv("RAY_TMPDIR", short)
+        dead, living, others = (Path(short) / f"ray/session_{name}" for name in ("dead", "living", "others"))
+        for folder in (dead, living, others):
+            (folder / "logs").mkdir(parents=True)
+        os.mkfifo(dead / "tickets")  # which nobody has open
+        tickets = Tickets(str(living / "tickets"), new=True)
+        with contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool:
+            assert pool.evaluate(make_task(), make_recipes(9)).results.tobytes() == expected(9)
+            assert not dead.exists()
+        tickets.close()
+        assert {folder.name for folder in Path(short).glob("ray/session_2*")} == set(), "it leaves nothing either"
+        assert living.exists()
+        assert others.exists()
 
 
 @pytest.mark.usefixtures("no_pool")

@@ -1,13 +1,15 @@
 """The queue from which workers of one machine take their parcels."""
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
-from cluster.workers.tickets import Tickets
+from cluster.workers.tickets import Tickets, abandoned
 
 
 def test_each_parcel_is_taken_once_by_one_of_several_readers(tmp_path: Path) -> None:
-    tickets = Tickets(str(tmp_path / "tickets"))
+    tickets = Tickets(str(tmp_path / "tickets"), new=True)
     readers = [Tickets(tickets.path) for _ in range(4)]
     taken: list[list[int]] = [[] for _ in readers]
     tickets.put(7, 9_999)
@@ -24,7 +26,7 @@ def test_each_parcel_is_taken_once_by_one_of_several_readers(tmp_path: Path) -> 
 
 
 def test_tickets_that_an_interrupted_call_left_are_void(tmp_path: Path) -> None:
-    tickets = Tickets(str(tmp_path / "tickets"))
+    tickets = Tickets(str(tmp_path / "tickets"), new=True)
     reader = Tickets(tickets.path)
     tickets.put(1, 10)
     assert next(reader.take(1)) == 0
@@ -35,8 +37,27 @@ def test_tickets_that_an_interrupted_call_left_are_void(tmp_path: Path) -> None:
     assert list(reader.take(3)) == [1, 2], "all but the one that it read, which the coordinator will send"
 
 
+def test_a_queue_is_abandoned_once_all_that_had_it_open_are_gone(tmp_path: Path) -> None:
+    path = tmp_path / "tickets"
+    code = (
+        f"from cluster.workers.tickets import Tickets; t = Tickets({str(path)!r}, new=True); print(flush=True); input()"
+    )
+    owner = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert owner.stdout is not None
+    owner.stdout.readline()
+    assert not abandoned(path)
+    owner.kill()
+    owner.communicate()
+    assert abandoned(path)
+    assert not abandoned(tmp_path / "no queue")
+    reader = Tickets(str(path))
+    assert not abandoned(path)
+    reader.close()
+    assert not path.exists()
+
+
 def test_there_may_be_more_parcels_than_a_pipe_has_room_for(tmp_path: Path) -> None:
-    tickets = Tickets(str(tmp_path / "tickets"))
+    tickets = Tickets(str(tmp_path / "tickets"), new=True)
     for serial in (65_535, 65_536):
         tickets.put(serial, 40_000)
         taken = list(tickets.take(serial))
