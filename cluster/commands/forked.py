@@ -1,11 +1,11 @@
-"""What the process loads from which a comparison's runs at once are forked (`jobs`): all that is slow to import."""
+"""The imports of the process from which jobs are forked (`jobs`), so that each job does not repeat them."""
 
 import gc
 import os
 
 from cluster.commands.entry import GC_THRESHOLDS
 
-os.setpgid(0, 0)  # a terminal's Ctrl-C and a signal to the command's group are for the command, which has runs saved
+os.setpgid(0, 0)  # Ctrl-C and signals to the command's group reach the command alone, which stops its jobs
 gc.set_threshold(*GC_THRESHOLDS)
 
 import cluster.commands.jobs  # noqa: E402, F401

@@ -286,7 +286,7 @@ def cut(
 
     Args:
         metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
-        worth_s: seconds of evaluation that are worth a parcel; None where each is sent by the coordinator.
+        worth_s: the least seconds of evaluation in a parcel; None for what pays when the coordinator sends each.
     """
     rates = [METRE_S] * len(asked) if metre_s is None else metre_s
     parcels: list[Parcel] = []

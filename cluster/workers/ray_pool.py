@@ -53,9 +53,9 @@ from evolution.episodes.rollout import Limits
 CONNECT_S = 60.0
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
-QUEUED_S = 0.5  # of evaluation for each worker, up to which parcels are queued: what a worker did comes in one answer
+QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
-FROM_QUEUE: Parcel = ()  # what a worker is sent that is to take its parcels from the queue
+FROM_QUEUE: Parcel = ()  # tells a worker to take its parcels from the queue
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
 
@@ -129,7 +129,7 @@ class RayPool(WorkerPool):
 
     @property
     def _logs(self) -> str:
-        """Where the logs are, in words. They are kept, then."""
+        """Where the logs are, in words. Logs that a message names are kept."""
         self._named = self._session is not None
         return f" (logs: {self._session}/logs)" if self._named else ""
 

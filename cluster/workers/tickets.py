@@ -1,4 +1,4 @@
-"""A queue between processes of one machine: a named pipe with a ticket for each parcel. Who reads a ticket does it."""
+"""A queue between processes of one machine: a named pipe with a ticket for each parcel, which one process reads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 TICKET = struct.Struct("<HH")  # a task's serial number and a parcel's index; a pipe gives each to one reader, whole
-EMPTY = 1 << 16  # more bytes than a pipe holds
+EMPTY = 1 << 20  # more bytes than a pipe holds
 
 
 class Tickets:
@@ -36,7 +36,7 @@ class Tickets:
         os.write(self._pipe, b"".join(TICKET.pack(serial & 0xFFFF, index) for index in range(parcels)))
 
     def take(self, serial: int) -> Iterator[int]:
-        """Parcels of a task that nobody has taken, until there are none."""
+        """Parcels of a task that are not taken yet, until there are none."""
         with contextlib.suppress(BlockingIOError):
             while True:
                 owner, index = TICKET.unpack(os.read(self._pipe, TICKET.size))
@@ -46,7 +46,8 @@ class Tickets:
 
     def close(self) -> None:
         """Remove the queue."""
-        os.unlink(self.path)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(self.path)
         os.close(self._pipe)
 
 
