@@ -1,5 +1,6 @@
 """The command gridsim-compare: wrong use, what is never trained again, a kill and Ctrl-C."""
 
+import contextlib
 import csv
 import dataclasses
 import functools
@@ -184,8 +185,11 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     at_once = ["--workers", "0", "--jobs", "2"]
 
     def processes():
-        servers = [child for child in psutil.Process(process.pid).children() if "forkserver" in str(child.cmdline())]
-        return [job for server in servers for job in server.children()]
+        jobs = []
+        for child in psutil.Process(process.pid).children():
+            with contextlib.suppress(psutil.NoSuchProcess):  # another child, which has just ended
+                jobs += child.children() if "forkserver" in str(child.cmdline()) else []
+        return jobs
 
     def both_saved():
         return all((cell.folder / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
