@@ -6,8 +6,9 @@ have the champion, the elites and the history of the undisturbed run, and MLflow
 are over, no process of theirs may be left, and no file that is no result. 20 faults take about three minutes, one run
 after another. The same seed draws the same faults, but not at the same steps of a run.
 
-To fill a disk, a small one is mounted for the runs; where that is not allowed, that fault is left out. Hosts and their
-links fail in tests/cluster/test_cluster.py and test_faults.py.
+A disk, and the shared memory in which Ray keeps its objects, are mounted for the campaign alone, so that they can be
+filled; where that is not allowed, these two faults are left out. libfaketime sets the runs' clocks; where it is not
+installed, this fault is left out. Hosts and their links fail in tests/cluster/test_cluster.py and test_faults.py.
 """
 
 from __future__ import annotations
@@ -43,7 +44,10 @@ SMALL = (
 )  # fmt: skip
 PATIENCE_S = 10  # after which a silent worker is replaced
 MARK = "GRIDSIM_FAULTS"  # variable by which the processes of a campaign are found
-DISK_MIB = 256
+DISK_MIB, SHARED_MIB = 256, 6144  # each run's Ray looks for 768 MiB of shared memory
+SHARED_MEMORY = Path("/dev/shm")
+MOUNTS = "GRIDSIM_FAULTS_MOUNTS"  # variable that is set where mounts are this campaign's own
+CLOCK = next(iter(sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))), None)
 LONG_S = 300.0  # that anything may take
 SAME = ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate")  # columns of the history
 
@@ -116,15 +120,17 @@ class Campaign:
         self._numbers, self._stopped = count(), False
         self.disk = folder / "disk"
         self.disk.mkdir()
-        mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "none", str(self.disk)]
-        self.mounted = (
-            shutil.which("mount") is not None and not subprocess.run(mount, stderr=subprocess.DEVNULL).returncode
-        )
-        self.faults = [name for name in FAULTS if self.mounted or name != "disk full"]
+        missing = set() if CLOCK else {"clock set back"}
+        if MOUNTS in os.environ:
+            for place, mib in (self.disk, DISK_MIB), (SHARED_MEMORY, SHARED_MIB):
+                subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", str(place)], check=True)
+        else:
+            missing |= {"disk full", "shared memory full"}
+        self.faults = [name for name in FAULTS if name not in missing]
         self.folder = folder
         self.environment = {**os.environ, MARK: str(folder), "RAY_TMPDIR": str(folder / "ray")}
         (folder / "ray").mkdir()
-        self._shared_memory = set(os.listdir("/dev/shm"))
+        self._shared_memory = set(os.listdir(SHARED_MEMORY))
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
         self._server = self._start_server(port)
@@ -158,12 +164,10 @@ class Campaign:
         raise Wrong(f"the MLflow server does not come up: see {self.folder}/server.log")
 
     def close(self) -> None:
-        """End the server and unmount the disk."""
+        """End the server."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._server.pid, signal.SIGKILL)
         self._server.wait()
-        if self.mounted:
-            subprocess.run(["umount", "--lazy", str(self.disk)], check=False)
 
     # --------------------------------------------------------------------------------------------------------- runs
 
@@ -241,7 +245,7 @@ class Campaign:
             time.sleep(1.0)
         return {
             "processes_left": len(self.processes()),
-            "shared_memory_left": len(set(os.listdir("/dev/shm")) - self._shared_memory),
+            "shared_memory_left": len(set(os.listdir(SHARED_MEMORY)) - self._shared_memory),
             "ray_sessions_left": len(list((self.folder / "ray").glob("**/session_2*"))),
         }
 
@@ -258,15 +262,22 @@ class Run:
     def __init__(self, campaign: Campaign, name: str):
         self.campaign, self.name, self._first = campaign, name, name
         self.rng = random.Random(f"{campaign.seed} {name}")
-        self.ballast = campaign.disk / f"ballast-{name}"
+        self.clock = campaign.folder / f"clock-{name}"
+        self.clock.write_text("+0")
+        self._environment = dict(campaign.environment)
+        if CLOCK:
+            self._environment |= {
+                "LD_PRELOAD": str(CLOCK), "FAKETIME_TIMESTAMP_FILE": str(self.clock), "FAKETIME_CACHE_DURATION": "1",
+                "FAKETIME_DONT_FAKE_MONOTONIC": "1", "FAKETIME_DISABLE_SHM": "1",
+            }  # fmt: skip
         self._said = campaign.folder / f"said-{name}.log"
 
     def start(self, *flags: str) -> subprocess.Popen:
         """`gridsim-evolve` with these flags, in a process group of its own."""
-        command, campaign = [str(BIN / "gridsim-evolve"), *flags], self.campaign
+        command = [str(BIN / "gridsim-evolve"), *flags]
         with open(self._said, "a") as said:
             return subprocess.Popen(
-                command, cwd=campaign.disk, env=campaign.environment, stdout=subprocess.DEVNULL, stderr=said,
+                command, cwd=self.campaign.disk, env=self._environment, stdout=subprocess.DEVNULL, stderr=said,
                 process_group=0,
             )  # fmt: skip
 
@@ -337,16 +348,21 @@ def _mlflow(mode: str, run: Run) -> None:
         time.sleep(run.rng.uniform(0.5, 8.0))
 
 
-def _fill_disk(run: Run, process: subprocess.Popen) -> None:
+def _fill(folder: Path, run: Run, process: subprocess.Popen) -> None:
+    ballast = folder / "ballast"
     with run.campaign.shared:
         try:
-            with contextlib.suppress(OSError), run.ballast.open("wb") as file:
+            with contextlib.suppress(OSError), ballast.open("wb") as file:
                 while True:
                     file.write(bytes(1 << 20))
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(run.rng.uniform(0.5, 4.0))
         finally:
-            run.ballast.unlink(missing_ok=True)
+            ballast.unlink(missing_ok=True)
+
+
+def _set_clock_back(run: Run) -> None:
+    run.clock.write_text(f"-{run.rng.randint(1, 100)}m")
 
 
 FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
@@ -359,7 +375,9 @@ FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
     "MLflow gone": lambda run, _: _mlflow("gone", run),
     "MLflow slow": lambda run, _: _mlflow("slow", run),
     "MLflow full": lambda run, _: _mlflow("full", run),
-    "disk full": _fill_disk,
+    "disk full": lambda run, process: _fill(run.campaign.disk, run, process),
+    "shared memory full": lambda run, process: _fill(SHARED_MEMORY, run, process),
+    "clock set back": lambda run, _: _set_clock_back(run),
 }
 
 
@@ -371,6 +389,10 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="runs at once (1)")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
+    own = ["unshare", "--mount"]
+    can = shutil.which(own[0]) and not subprocess.run([*own, "true"], stderr=subprocess.DEVNULL).returncode
+    if can and MOUNTS not in os.environ:
+        os.execvpe(own[0], [*own, sys.executable, *sys.argv], {**os.environ, MOUNTS: "1"})
     signal.signal(signal.SIGINT, signal.default_int_handler)  # runs inherit it; jobs in a shell's background ignore it
     folder = Path(tempfile.mkdtemp(prefix="gsf", dir="/tmp"))  # Ray's sockets need a short path
     campaign, wrong = Campaign(folder, options.seed), ""

@@ -20,6 +20,7 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
+import sys
 import threading
 import time
 from collections import defaultdict, deque
@@ -55,6 +56,7 @@ PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
+CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1  # of this machine, for us
 FROM_QUEUE: Parcel = ()  # tells a worker to take its parcels from the queue
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
@@ -157,10 +159,11 @@ class RayPool(WorkerPool):
         self._serial += 1
         call.broadcast_bytes = self._shared.put(task)
         if self._tickets and seconds < QUEUED_S * len(self.pids()):
-            self._parcels = dict(enumerate(cut(task, call.asked, self._asked, metre_s, WORTH_QUEUING_S)))
+            readers = min(len(self.pids()), CORES)  # each costs a call, and more would only share the cores
+            self._parcels = dict(enumerate(cut(task, call.asked, readers, metre_s, WORTH_QUEUING_S)))
             self._packed = pickle.dumps([self._pack(parcel) for parcel in self._parcels.values()], protocol=5)
             self._tickets.put(self._serial, len(self._parcels))
-            meanwhile = self._work_off([FROM_QUEUE] * len(self.pids()), on_progress, meanwhile)
+            meanwhile = self._work_off([FROM_QUEUE] * readers, on_progress, meanwhile)
             parcels = list(self._parcels.values())  # those of workers that died or failed
             call.retries = len(parcels)
         else:
@@ -314,8 +317,10 @@ class RayPool(WorkerPool):
             if self._tickets:
                 self._tickets.close()
                 self._tickets = None
-            if self._session and not self._named:
-                shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
+            if self._session:
+                self._remove_abandoned()
+                if not self._named:
+                    shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
         self._slots = []
         self._closed.set()
         self._thread.join(1.0)
@@ -336,9 +341,7 @@ class RayPool(WorkerPool):
             self._connected = True
             if self._session:
                 self._tickets = Tickets(f"{self._session}/tickets", new=True)
-                for tickets in Path(self._session).parent.glob("session_*/tickets"):
-                    if abandoned(tickets):  # a run of ours was killed
-                        shutil.rmtree(tickets.parent, ignore_errors=True)
+                self._remove_abandoned()
             self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [self._start(number) for number in range(self._asked)]
@@ -347,6 +350,12 @@ class RayPool(WorkerPool):
         finally:
             self._booted.set()
         self._closed.wait()
+
+    def _remove_abandoned(self) -> None:
+        """Remove the logs of runs of ours that were killed."""
+        for tickets in Path(self._session or "").parent.glob("session_*/tickets"):
+            if abandoned(tickets):
+                shutil.rmtree(tickets.parent, ignore_errors=True)
 
     def _wait_for_ray(self) -> None:
         if self._closed.is_set():
