@@ -88,7 +88,7 @@ def without_lanes(
     """A map that is all one clearance field (m) [rows, columns], not a torus, with starts [n, 5] in place of lanes."""
     height, width = (side / CELLS_PER_M for side in nodes.shape)
     lanes, road = lay_lanes([], width, height), make_road(nodes, speed_interval, thinnest)
-    network = make_network(lanes, width, height, 0.0, config)
+    network = make_network(lanes, road, config)
     return Map(name, 0, road, lanes, Strips.of(), network, torus=False, starts=freeze(starts))
 
 

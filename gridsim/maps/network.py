@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import SimConfig
+from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import leaf, njit
-from gridsim.maps.roads import Lanes, freeze
+from gridsim.maps.roads import Lanes, Road, clearances, freeze
 
 _F, _N = np.float32, np.uint64
 _HALF, _NEXT = _F(0.5), _N(1)
@@ -86,7 +85,7 @@ def _ease(offsets, steps, successors, slope, room):
                     room[onward] = min(room[onward], room[last] + slope * steps[lane])
 
 
-def _room_on_right(lanes: Lanes, config: SimConfig, clearance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _room_on_right(lanes: Lanes, road: Road, config: SimConfig) -> np.ndarray:
     """How far (m) a car at each point can move to the right, limited by its right side; found by bisection."""
     vehicle, traffic = config.vehicle, config.traffic
     k, counts = np.arange(len(lanes.points)), np.diff(lanes.offsets)
@@ -100,10 +99,11 @@ def _room_on_right(lanes: Lanes, config: SimConfig, clearance: Callable[[np.ndar
     tried = high
     for _ in range(7):
         middle = lanes.points + tried[:, None] * right
-        gap = clearance(freeze(middle.astype(np.float32))) - vehicle.width / 2
+        gap = clearances(road, freeze(middle.astype(np.float32))) - vehicle.width / 2
         side = middle + vehicle.width / 2 * right
         for share in _ALONG_SIDE:
-            gap = np.minimum(gap, clearance(freeze((side + share * vehicle.length / 2 * forward).astype(np.float32))))
+            at = (side + share * vehicle.length / 2 * forward).astype(np.float32)
+            gap = np.minimum(gap, clearances(road, freeze(at)))
         fits = gap >= traffic.verge
         low, high = np.where(fits, tried, low), np.where(fits, high, tried)
         tried = (low + high) / 2
@@ -138,37 +138,25 @@ def _boxes(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     return np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32)
 
 
-def make_network(
-    lanes: Lanes,
-    width: float,
-    height: float,
-    speed_limit: float,
-    config: SimConfig,
-    clearance: Callable[[np.ndarray], np.ndarray] | None = None,
-) -> Network:
-    """The network of a map's lanes; `speed_limit` (m/s) is traffic's on a straight.
-
-    Args: clearance of points float32 [n, 2] (m), float32 [n] as `roads.clearances`. Without it, `room` is 0.
-    """
+def make_network(lanes: Lanes, road: Road, config: SimConfig) -> Network:
+    """The network of a map's lanes, for traffic on its road."""
     f, traffic = np.float32, config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
-    sides = f(width), f(height)
-    speeds, room = np.empty(len(points), dtype=np.float32), np.zeros(len(points), dtype=np.float32)
-    clear = np.zeros(len(lanes.crossings), dtype=np.float32)
+    speeds, clear = np.empty(len(points), dtype=np.float32), np.empty(len(lanes.crossings), dtype=np.float32)
+    room = np.empty(0, dtype=np.float32)
     if len(lanes):
-        _speed_profile(
-            points, offsets, steps, successors, f(speed_limit), f(traffic.lateral), f(traffic.comfort), speeds
-        )
+        top = f(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
+        _speed_profile(points, offsets, steps, successors, top, f(traffic.lateral), f(traffic.comfort), speeds)
         crossing = lanes.crossing_offsets, lanes.crossings
-        _clear_points(points, offsets, steps, *crossing, *sides, f(config.vehicle.width + traffic.beside), clear)
-    if clearance is not None:
+        apart = f(config.vehicle.width + traffic.beside)
+        _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
         beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
-        room = _room_on_right(lanes, config, clearance)
+        room = _room_on_right(lanes, road, config)
         room[np.repeat(beside, np.diff(offsets))] = 0.0
         _ease(offsets, steps, successors, f(traffic.taper), room)
     found = {"speeds": speeds, "clear": clear, "room": room, "boxes": _boxes(points, offsets)}
     frozen = {name: freeze(array) for name, array in found.items()}
-    return Network(**vars(lanes), **frozen, width=sides[0], height=sides[1])
+    return Network(**vars(lanes), **frozen, width=road.width, height=road.height)
 
 
 @leaf

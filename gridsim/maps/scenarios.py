@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from gridsim.config import FILE_SPEEDS, TRAFFIC_PACE, SimConfig
+from gridsim.config import FILE_SPEEDS, SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.generators.city import city_layout
 from gridsim.maps.generators.curved import curved_layout
@@ -19,7 +18,7 @@ from gridsim.maps.generators.roundabout import roundabout_layout
 from gridsim.maps.generators.seamless import seamless_layout
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.roads import THICK_WALL, Lanes, Strips, clearance_nodes, clearances, make_road
+from gridsim.maps.roads import THICK_WALL, Lanes, Strips, clearance_nodes, make_road
 
 TRAINING_SEED = 0  # first seed of the training maps
 VALIDATION_SEED = 1_000_000  # ... of the maps on which the champion is chosen
@@ -89,12 +88,9 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
         from gridsim.maps.files import load_map  # imported here, because workers never read files
 
         return load_map(name, config)
-    config = config or SimConfig()
     spec = REGISTRY[name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
     strips, lanes, width, height = spec.layout(rng)
     nodes = clearance_nodes(strips, width, height)
     road = make_road(nodes, spec.speed_interval, spec.thinnest)
-    top = TRAFFIC_PACE * sum(spec.speed_interval)
-    network = make_network(lanes, width, height, top, config, partial(clearances, road))
-    return Map(name, seed, road, lanes, strips, network)
+    return Map(name, seed, road, lanes, strips, make_network(lanes, road, config or SimConfig()))

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import oracle
 import pytest
+from pictures import straight_road
 
 from gridsim.car.ego import DISTANCE, IDLE, End
 from gridsim.car.vehicle import Action
@@ -187,7 +188,7 @@ def cross():
     straight = ((SIDE, 0.0),)
     lanes = lay_lanes([Path(SIDE, 128.0, math.pi, straight), Path(128.0, 0.0, math.pi / 2, straight)], SIDE, SIDE)
     road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 1.0)
-    network = make_network(lanes, SIDE, SIDE, 30.0, CONFIG)
+    network = make_network(lanes, straight_road(SIDE, SIDE, 30.0), CONFIG)
     return Map("cross", 0, road, lanes, strips, network)
 
 

@@ -7,7 +7,7 @@ import oracle
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pictures import crashes
+from pictures import crashes, straight_road
 
 from gridsim.car.ego import STEERING
 from gridsim.car.vehicle import path_curvature
@@ -16,7 +16,6 @@ from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
-from gridsim.maps.roads import freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.sensing.boxes import boxes_touch
 from gridsim.traffic.behaviour import drivers, flow, idm
@@ -48,11 +47,9 @@ FAR = np.full(5, 1e6, dtype=F)  # a start that is near nothing
 DT = CONFIG.episode.control_period
 
 
-def network_of(paths, width, height, limit=12.0, abreast=1, beside=None, config=CONFIG):
-    lanes = lay_lanes(paths, width, height, abreast)
-    for array in vars(lanes).values():
-        freeze(array)
-    return make_network(lanes, width, height, limit, config, beside)
+def network_of(paths, width, height, limit=12.0, abreast=1, half_width=0.0, config=CONFIG):
+    road = straight_road(width, height, limit, half_width)
+    return make_network(lay_lanes(paths, width, height, abreast), road, config)
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +206,7 @@ def test_lanes_are_as_fast_as_their_bends_allow(heading, radius):
 def narrow():
     """A road of two lanes along x, eastwards at y = 30.25 and westwards at 33.75, 4 m either side of its middle."""
     paths = [Path(0.0, 30.25, 0.0, ((1024.0, 0.0),)), Path(1024.0, 33.75, math.pi, ((1024.0, 0.0),))]
-    return network_of(paths, 1024.0, 64.0, 8.5, beside=lambda points: 4.0 - np.abs(points[:, 1] - 32.0))
+    return network_of(paths, 1024.0, 64.0, 8.5, half_width=4.0)
 
 
 @pytest.mark.parametrize("length", [4.0, 6.0])

@@ -78,6 +78,13 @@ def small_road(lines=(), arcs=(), side=64.0):
     return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 1.0), oracle.ExactRoad(strips, side, side)
 
 
+def straight_road(width, height, limit, half_width=0.0):
+    """A road along x in the middle of a torus, where traffic may drive at `limit` m/s; 0 m wide, it has no room for it
+    to move over."""
+    nodes = clearance_nodes(Strips.of([[0.0, height / 2, width, height / 2, half_width]]), width, height)
+    return make_road(nodes, (limit, limit), 1.0)
+
+
 def record_drive(path, scenario, start, episodes):
     """Record a person's drive: episodes from one start, of these actions, until they end; the states in the file."""
     simulator, states = manual(scenario), []
