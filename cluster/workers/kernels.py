@@ -77,7 +77,7 @@ def _marker(settings: RunSettings) -> Path:
 def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray, Limits]:
     """The smallest drive: configuration, a map without a road, a genome of zeros, an episode, its traffic, limits."""
     config, genome = SimConfig(), np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)
-    road, episodes = blank(config), np.zeros(1, dtype=EPISODE)
+    road, episodes = blank(), np.zeros(1, dtype=EPISODE)
     worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config)
     return config, road, genome, episodes, worlds, Limits(1.0, 1)
 

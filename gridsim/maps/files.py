@@ -319,4 +319,4 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
     _warn(path.stem, file, free, nodes, config.episode.revisit)
     starts = np.zeros((len(poses), 5), dtype=np.float32)
     starts[:, :3], starts[:, 3] = poses, START_SPEED
-    return without_lanes(name, nodes, file.speed, 2.0 * HALF_WALL, config, starts)
+    return without_lanes(name, nodes, file.speed, 2.0 * HALF_WALL, starts)

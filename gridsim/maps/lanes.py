@@ -15,11 +15,15 @@ import numpy as np
 
 from gridsim.config import CROSSING_GAP
 from gridsim.jit import njit
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.network import Network
+from gridsim.maps.roads import Strips, freeze
+
+Plan = tuple[Strips, Network]  # of a map: its drivable area and its lanes
 
 LANE_STEP = 1.0  # m between points of a lane, at most
 FORKS = 3  # most successors of a lane: straight on, left and right
 _SAME = 0.01  # m and rad within which one lane's end is another's beginning
+_ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 
 
 class Path(NamedTuple):
@@ -160,11 +164,11 @@ def _crossings(points: np.ndarray, offsets: np.ndarray, related: np.ndarray, sid
     return cross | cross.T
 
 
-def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int = 1) -> Lanes:
+def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int = 1) -> Network:
     """Lanes along paths, on a torus with these sides (m).
 
     Each group of `abreast` consecutive paths runs side by side, from left to right. Lanes of a group have the same
-    number of points and are neighbours.
+    number of points and are neighbours. `speeds`, `clear` and `room` are 0.
 
     Raises: ValueError if a lane has no successor.
     """
@@ -187,13 +191,20 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     index = np.arange(n, dtype=np.int32)
     neighbours = index[:, None] // abreast == index // abreast
     cross = _crossings(points, offsets, neighbours | follows | follows.T, sides)
-    return Lanes(
-        points=points,
-        offsets=offsets,
-        successors=successors,
-        steps=steps.astype(np.float32),
-        left=np.where(index % abreast == 0, -1, index - 1).astype(np.int32),
-        right=np.where(index % abreast == abreast - 1, -1, index + 1).astype(np.int32),
-        crossing_offsets=np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
-        crossings=np.nonzero(cross)[1].astype(np.int32),
-    )
+    low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
+    arrays = {
+        "points": points,
+        "speeds": np.zeros(len(points), dtype=np.float32),
+        "offsets": offsets,
+        "steps": steps.astype(np.float32),
+        "successors": successors,
+        "left": np.where(index % abreast == 0, -1, index - 1).astype(np.int32),
+        "right": np.where(index % abreast == abreast - 1, -1, index + 1).astype(np.int32),
+        "crossing_offsets": np.concatenate([[0], np.cumsum(cross.sum(axis=1))]).astype(np.int32),
+        "crossings": np.nonzero(cross)[1].astype(np.int32),
+        "clear": np.zeros(cross.sum(), dtype=np.float32),
+        "room": np.zeros(len(points), dtype=np.float32),
+        "boxes": np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32),
+    }
+    frozen = {name: freeze(array) for name, array in arrays.items()}
+    return Network(**frozen, width=np.float32(width), height=np.float32(height))

@@ -1,4 +1,4 @@
-"""A map as arrays: its road, its lanes, the lane network for traffic, and start poses."""
+"""A map as arrays: its road, its lanes, and start poses."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.config import START_SPEED, SimConfig
+from gridsim.config import START_SPEED
 from gridsim.jit import njit
 from gridsim.maps.lanes import lay_lanes
-from gridsim.maps.network import Network, make_network
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Lanes, Road, Strips, freeze, make_road
+from gridsim.maps.network import Network
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, freeze, make_road
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,8 @@ class Map:
     name: str  # its scenario's, or a file's path
     seed: int  # from which it was built
     road: Road
-    lanes: Lanes  # for starts, traffic and drivers
     strips: Strips  # the exact drivable area, for pictures and tests
-    network: Network  # the lanes as traffic's kernels read them
+    network: Network  # its lanes
     torus: bool = True  # whether leaving on one side means entering on the other
     # float32 [n, 5], start poses of a map from a file, which has no lanes; else empty.
     starts: np.ndarray = field(default_factory=lambda: freeze(np.zeros((0, 5), dtype=np.float32)))
@@ -41,16 +40,16 @@ class Map:
 
     @cached_property
     def mileage(self) -> np.ndarray:
-        """Cumulative length (m) at each point of `lanes`, with all lanes laid end to end: float64 [points]."""
-        step = np.diff(self.lanes.points.astype(np.float64), axis=0)
+        """Cumulative length (m) at each point of the network, with all lanes laid end to end: float64 [points]."""
+        step = np.diff(self.network.points.astype(np.float64), axis=0)
         length = np.hypot(step[:, 0], step[:, 1])
-        length[self.lanes.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
+        length[self.network.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
         return freeze(np.concatenate([[0.0], np.cumsum(length)]))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The map as plain arrays, which processes can share without copying."""
         own = {"name": self.name, "seed": self.seed, "torus": self.torus, "starts": self.starts}
-        parts = (own, vars(self.lanes), vars(self.strips), self.road._asdict(), self.network._asdict())
+        parts = (own, vars(self.strips), self.road._asdict(), self.network._asdict())
         return {name: np.asarray(value) for part in parts for name, value in part.items()}
 
     @classmethod
@@ -61,7 +60,6 @@ class Map:
             name=str(values["name"]),
             seed=int(values["seed"]),
             road=Road(**{name: values[name] for name in Road._fields}),
-            lanes=Lanes(**{part.name: values[part.name] for part in fields(Lanes)}),
             strips=Strips(**{part.name: values[part.name] for part in fields(Strips)}),
             network=Network(**{name: values[name] for name in Network._fields}),
             torus=bool(values["torus"]),
@@ -78,24 +76,18 @@ class Map:
 
 
 def without_lanes(
-    name: str,
-    nodes: np.ndarray,
-    speed_interval: tuple[float, float],
-    thinnest: float,
-    config: SimConfig,
-    starts: np.ndarray,
+    name: str, nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: float, starts: np.ndarray
 ) -> Map:
     """A map that is all one clearance field (m) [rows, columns], not a torus, with starts [n, 5] in place of lanes."""
     height, width = (side / CELLS_PER_M for side in nodes.shape)
-    lanes, road = lay_lanes([], width, height), make_road(nodes, speed_interval, thinnest)
-    network = make_network(lanes, road, config)
-    return Map(name, 0, road, lanes, Strips.of(), network, torus=False, starts=freeze(starts))
+    road, network = make_road(nodes, speed_interval, thinnest), lay_lanes([], width, height)
+    return Map(name, 0, road, Strips.of(), network, torus=False, starts=freeze(starts))
 
 
-def blank(config: SimConfig) -> Map:
+def blank() -> Map:
     """A map of 8 m x 8 m without any road, used to compile kernels before the first map is built."""
     nodes = np.full((8 * CELLS_PER_M, 8 * CELLS_PER_M), FIELD_FLOOR, dtype=np.float32)
-    return without_lanes("blank", nodes, (0.0, 1.0), THICK_WALL, config, np.zeros((0, 5), dtype=np.float32))
+    return without_lanes("blank", nodes, (0.0, 1.0), THICK_WALL, np.zeros((0, 5), dtype=np.float32))
 
 
 @njit
@@ -116,10 +108,10 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
     A start is x, y (m), heading (rad), speed (m/s), steering (rad), on the lane's centre line and along it. On a map
     without lanes, shares index `Map.starts`.
     """
-    if not len(road_map.lanes):
+    if not len(road_map.network.steps):
         return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(road_map.lanes.points, road_map.mileage, shares, np.float32(START_SPEED), starts)
+    _starts_at(road_map.network.points, road_map.mileage, shares, np.float32(START_SPEED), starts)
     return starts
 
 

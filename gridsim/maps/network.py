@@ -9,26 +9,32 @@ import numpy as np
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
 from gridsim.jit import leaf, njit
-from gridsim.maps.roads import Lanes, Road, clearances, freeze
+from gridsim.maps.roads import Road, clearances, freeze
 
 _F, _N = np.float32, np.uint64
 _HALF, _NEXT = _F(0.5), _N(1)
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9)  # points of a car's side that are checked, as shares of its half length
-_ROUNDED = 1e-3  # m, more than the rounding error of a box's sides in float32
 
 
 class Network(NamedTuple):
-    """Lanes as kernels read them; arrays flat, read-only and C-contiguous. See `roads.Lanes`."""
+    """Directed lanes as polylines of equally spaced points: s metres along lane l is at index s / steps[l].
 
-    points: np.ndarray  # float32 [n, 2], m
+    As kernels read them: arrays read-only and C-contiguous. A map's `speeds`, `clear` and `room` are `make_network`'s.
+    """
+
+    points: np.ndarray  # float32 [n, 2], m; those of a lane in driving direction, not wrapped over the torus
     speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
-    offsets: np.ndarray  # int32 [lanes + 1]
-    steps: np.ndarray  # float32 [lanes], m between a lane's points
-    successors: np.ndarray  # int32 [lanes, k]
-    left: np.ndarray  # int32 [lanes], neighbouring lane in the same direction, or -1
-    right: np.ndarray
-    crossing_offsets: np.ndarray  # int32 [lanes + 1]
-    crossings: np.ndarray  # int32 [c], the junction lanes that cross each lane, lane by lane
+    offsets: np.ndarray  # int32 [lanes + 1], where each lane's points begin
+    steps: np.ndarray  # float32 [lanes], m between a lane's points; 1 m at most
+    # int32 [lanes, k], padded with -1; every lane has at least one. A successor begins where the lane ends, up to whole
+    # turns of the torus.
+    successors: np.ndarray
+    left: np.ndarray  # int32 [lanes], lane to which a car may change, or -1; its point i is beside point i
+    right: np.ndarray  # as `left`
+    crossing_offsets: np.ndarray  # int32 [lanes + 1], where each lane's part of `crossings` begins
+    # int32 [c], for each lane the lanes with which it conflicts in a junction: they cross it or merge into its end.
+    # Lanes with the same beginning, predecessors, successors and neighbours are not among them.
+    crossings: np.ndarray
     clear: np.ndarray  # float32 [c], m along each crossing lane beyond which a car on it no longer blocks this lane
     room: np.ndarray  # float32 [n], m that a car can move to the right for oncoming cars
     boxes: np.ndarray  # float32 [lanes, 4], m: middle x, y and half sides of each lane's bounding box
@@ -85,7 +91,7 @@ def _ease(offsets, steps, successors, slope, room):
                     room[onward] = min(room[onward], room[last] + slope * steps[lane])
 
 
-def _room_on_right(lanes: Lanes, road: Road, config: SimConfig) -> np.ndarray:
+def _room_on_right(lanes: Network, road: Road, config: SimConfig) -> np.ndarray:
     """How far (m) a car at each point can move to the right, limited by its right side; found by bisection."""
     vehicle, traffic = config.vehicle, config.traffic
     k, counts = np.arange(len(lanes.points)), np.diff(lanes.offsets)
@@ -130,33 +136,21 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
             clear[c] = last * steps[other]
 
 
-def _boxes(points: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """`Network.boxes` of lanes."""
-    if len(offsets) < 2:
-        return np.zeros((0, 4), dtype=np.float32)
-    low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
-    return np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32)
-
-
-def make_network(lanes: Lanes, road: Road, config: SimConfig) -> Network:
-    """The network of a map's lanes, for traffic on its road."""
+def make_network(lanes: Network, road: Road, config: SimConfig) -> Network:
+    """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`."""
     f, traffic = np.float32, config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
     speeds, clear = np.empty(len(points), dtype=np.float32), np.empty(len(lanes.crossings), dtype=np.float32)
-    room = np.empty(0, dtype=np.float32)
-    if len(lanes):
-        top = f(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
-        _speed_profile(points, offsets, steps, successors, top, f(traffic.lateral), f(traffic.comfort), speeds)
-        crossing = lanes.crossing_offsets, lanes.crossings
-        apart = f(config.vehicle.width + traffic.beside)
-        _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
-        beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
-        room = _room_on_right(lanes, road, config)
-        room[np.repeat(beside, np.diff(offsets))] = 0.0
-        _ease(offsets, steps, successors, f(traffic.taper), room)
-    found = {"speeds": speeds, "clear": clear, "room": room, "boxes": _boxes(points, offsets)}
-    frozen = {name: freeze(array) for name, array in found.items()}
-    return Network(**vars(lanes), **frozen, width=road.width, height=road.height)
+    top = f(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
+    _speed_profile(points, offsets, steps, successors, top, f(traffic.lateral), f(traffic.comfort), speeds)
+    crossing = lanes.crossing_offsets, lanes.crossings
+    apart = f(config.vehicle.width + traffic.beside)
+    _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
+    beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
+    room = _room_on_right(lanes, road, config)
+    room[np.repeat(beside, np.diff(offsets))] = 0.0
+    _ease(offsets, steps, successors, f(traffic.taper), room)
+    return lanes._replace(speeds=freeze(speeds), clear=freeze(clear), room=freeze(room))
 
 
 @leaf

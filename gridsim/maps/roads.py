@@ -1,4 +1,4 @@
-"""Roads: strips with exact geometry, lanes with successors, and the fields that kernels read.
+"""Roads: strips with exact geometry, and the fields that kernels read.
 
 The drivable area is the union of strips (lines and arcs with a half width) without the blocks (oriented rectangles,
 such as parked cars). The signed clearance of a point is the maximum over the strips of (half width - distance to the
@@ -67,36 +67,6 @@ class Strips(_Arrays):
         """From rows of numbers."""
         rows = ((lines, 5), (arcs, 6), (blocks, 5))
         return cls(*(np.asarray(part, dtype=np.float64).reshape(-1, width) for part, width in rows))
-
-
-@dataclass(frozen=True)
-class Lanes(_Arrays):
-    """Directed lanes as polylines of equally spaced points: s metres along lane l is at index s / steps[l].
-
-    Attributes:
-        points: float32 [n, 2], m; a lane's points lie together, in driving direction, not wrapped over the torus.
-        offsets: int32 [lanes + 1], where each lane's points begin.
-        successors: int32 [lanes, k], padded with -1; every lane has at least one. A successor begins where the lane
-            ends, up to whole turns of the torus.
-        steps: float32 [lanes], m along the lane between its points; 1 m at most.
-        left: int32 [lanes], the lane to the left to which a car may change, or -1. Its point i is beside point i.
-        right: int32 [lanes], as `left`.
-        crossing_offsets: int32 [lanes + 1], where each lane's part of `crossings` begins.
-        crossings: int32, for each lane the lanes with which it conflicts in a junction: they cross it or merge into its
-            end. Lanes with the same beginning, predecessors, successors and neighbours are not among them.
-    """
-
-    points: np.ndarray
-    offsets: np.ndarray
-    successors: np.ndarray
-    steps: np.ndarray
-    left: np.ndarray
-    right: np.ndarray
-    crossing_offsets: np.ndarray
-    crossings: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.offsets) - 1
 
 
 @njit(nogil=True)

@@ -16,9 +16,10 @@ from gridsim.maps.generators.curved import curved_layout
 from gridsim.maps.generators.highway import highway_layout
 from gridsim.maps.generators.roundabout import roundabout_layout
 from gridsim.maps.generators.seamless import seamless_layout
+from gridsim.maps.lanes import Plan
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
-from gridsim.maps.roads import THICK_WALL, Lanes, Strips, clearance_nodes, make_road
+from gridsim.maps.roads import THICK_WALL, clearance_nodes, make_road
 
 TRAINING_SEED = 0  # first seed of the training maps
 VALIDATION_SEED = 1_000_000  # ... of the maps on which the champion is chosen
@@ -32,7 +33,7 @@ class Scenario:
     speed_interval: tuple[float, float]  # m/s, within which speed counts
     traffic: int  # default number of other cars
     thinnest: float  # m, of its walls and parked cars
-    layout: Callable[[np.random.Generator], tuple[Strips, Lanes, float, float]]  # ... and width, height in m
+    layout: Callable[[np.random.Generator], Plan]
 
 
 REGISTRY: dict[str, Scenario] = {
@@ -90,7 +91,7 @@ def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
         return load_map(name, config)
     spec = REGISTRY[name]
     rng = np.random.default_rng(np.random.SeedSequence([seed, *name.encode()]))
-    strips, lanes, width, height = spec.layout(rng)
-    nodes = clearance_nodes(strips, width, height)
+    strips, lanes = spec.layout(rng)
+    nodes = clearance_nodes(strips, float(lanes.width), float(lanes.height))
     road = make_road(nodes, spec.speed_interval, spec.thinnest)
-    return Map(name, seed, road, lanes, strips, make_network(lanes, road, config or SimConfig()))
+    return Map(name, seed, road, strips, make_network(lanes, road, config or SimConfig()))

@@ -18,14 +18,14 @@ PERIOD, DASH = 6.0, 2.5  # m from dash to dash, and length of a dash
 
 def lane_marks(road_map: Map) -> np.ndarray:
     """Dashes float32 [n, 6]: centre x, y (m), direction (cosine, sine), half length (m), 1 between opposite lanes."""
-    lanes, mileage, size = road_map.lanes, road_map.mileage, road_map.size
-    if not len(lanes):
+    lanes, mileage, size = road_map.network, road_map.mileage, road_map.size
+    if not len(lanes.steps):
         return freeze(np.zeros((0, 6), dtype=np.float32))
     points = lanes.points.astype(np.float64)
     step = np.diff(points, axis=0, append=points[-1:])
     step[lanes.offsets[1:] - 1] = step[lanes.offsets[1:] - 2]
     direction = step / np.hypot(*step.T)[:, None]
-    lane = np.repeat(np.arange(len(lanes)), np.diff(lanes.offsets))
+    lane = np.repeat(np.arange(len(lanes.steps)), np.diff(lanes.offsets))
     road = (np.diff(lanes.crossing_offsets) == 0)[lane]  # no junction
     tree = cKDTree(_within(points, size), boxsize=size)
     at = np.arange(PERIOD / 2, mileage[-1], PERIOD)

@@ -60,8 +60,8 @@ def test_environment_and_rollout_drive_alike(champion):
     """What a person sees in the environment is what evolution saw, the wheels (the last input) included."""
     policy = "mlp:8+motion+steering"
     scenario, spec = build("curved", 12), PolicySpec.parse(policy)
-    start = np.array([*scenario.lanes.points[3], 0.0, 5.0, 0.0], dtype=np.float32)
-    start[2] = np.arctan2(*(scenario.lanes.points[4] - scenario.lanes.points[3])[::-1])
+    start = np.array([*scenario.network.points[3], 0.0, 5.0, 0.0], dtype=np.float32)
+    start[2] = np.arctan2(*(scenario.network.points[4] - scenario.network.points[3])[::-1])
     rng, steps, without = np.random.default_rng(4), 0, 0
     while steps < 40 or steps == without:  # until one drives for whom the last input matters
         genome = rng.normal(size=spec.size).astype(np.float32)

@@ -189,7 +189,7 @@ def cross():
     lanes = lay_lanes([Path(SIDE, 128.0, math.pi, straight), Path(128.0, 0.0, math.pi / 2, straight)], SIDE, SIDE)
     road = make_road(clearance_nodes(strips, SIDE, SIDE), (5.0, 12.0), 1.0)
     network = make_network(lanes, straight_road(SIDE, SIDE, 30.0), CONFIG)
-    return Map("cross", 0, road, lanes, strips, network)
+    return Map("cross", 0, road, strips, network)
 
 
 def on_lane(lane, along, speed, pose):

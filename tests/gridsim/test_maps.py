@@ -236,7 +236,7 @@ def test_tiles_do_not_show():
 def test_one_map_for_all_seeds(track):
     assert build(track.name, 0) is build(track.name, 2_000_003)
     assert label(track.name) == "track"
-    assert (len(track.lanes), track.mileage.tolist()) == (0, [0.0])
+    assert (len(track.network.steps), track.mileage.tolist()) == (0, [0.0])
     assert 100 < len(track.starts) <= 512
     assert not track.starts.flags.writeable
     starts = sample_starts(track, 300, np.random.default_rng(1))

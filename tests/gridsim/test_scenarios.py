@@ -43,8 +43,8 @@ def lengths(lanes):
 
 
 def lay(name, seed):
-    strips, lanes, width, height = REGISTRY[name].layout(np.random.default_rng(seed))
-    return SimpleNamespace(strips=strips, lanes=lanes, sides=np.array([width, height]))
+    strips, lanes = REGISTRY[name].layout(np.random.default_rng(seed))
+    return SimpleNamespace(strips=strips, lanes=lanes, sides=np.array([lanes.width, lanes.height], dtype=float))
 
 
 @pytest.fixture(scope="module", params=REGISTRY)
@@ -88,9 +88,9 @@ def test_every_lane_goes_on_where_it_ends(laid):
     for m in laid:
         lanes = m.lanes
         assert (lanes.successors[:, 0] >= 0).all()
-        points = [lane(lanes, i).astype(float) for i in range(len(lanes))]
+        points = [lane(lanes, i).astype(float) for i in range(len(lanes.steps))]
         angles = [headings(p) for p in points]
-        for i in range(len(lanes)):
+        for i in range(len(lanes.steps)):
             following = lanes.successors[i][lanes.successors[i] >= 0].tolist()
             assert len(set(following)) == len(following)
             for j in following:
@@ -105,7 +105,7 @@ def test_every_lane_is_found_by_a_predecessor_and_leads_back_to_itself(name, lai
         graph = lane_graph(m.lanes)
         parts, _ = connected_components(graph, connection="strong")
         assert parts == {"highway": highway.LANE_COUNT, "curved": 2}.get(name, 1)
-        assert set(m.lanes.successors[m.lanes.successors >= 0].tolist()) == set(range(len(m.lanes)))
+        assert set(m.lanes.successors[m.lanes.successors >= 0].tolist()) == set(range(len(m.lanes.steps)))
 
 
 def test_neighbours_are_each_others(name, laid):
@@ -137,10 +137,10 @@ def test_crossings_are_the_lanes_that_come_close(name, laid):
     for m in laid[:2]:
         lanes = m.lanes
         crossings = np.split(lanes.crossings, lanes.crossing_offsets[1:-1])
-        points = [lane(lanes, i).astype(float) for i in range(len(lanes))]
+        points = [lane(lanes, i).astype(float) for i in range(len(lanes.steps))]
         middle = np.array([p[len(p) // 2] for p in points])
         size = np.array([np.linalg.norm(p - c, axis=1).max() for p, c in zip(points, middle, strict=True)])
-        for i in range(len(lanes)):
+        for i in range(len(lanes.steps)):
             mine = set(crossings[i].tolist())
             away = np.linalg.norm(wrapped(middle - middle[i], m.sides), axis=1) - size - size[i]
             assert mine <= set(np.flatnonzero(away < CROSSING_GAP).tolist())
@@ -161,7 +161,7 @@ def test_crossings_are_the_lanes_that_come_close(name, laid):
 def lane_graph(lanes):
     one, k = np.nonzero(lanes.successors >= 0)
     other = lanes.successors[one, k]
-    return csr_array((lengths(lanes)[one], (one, other)), shape=(len(lanes), len(lanes)))
+    return csr_array((lengths(lanes)[one], (one, other)), shape=(len(lanes.steps), len(lanes.steps)))
 
 
 def test_no_loop_is_so_short_that_driving_it_counts_nothing(laid):
@@ -180,7 +180,7 @@ def test_a_car_on_rails_touches_nothing(laid):
     """A car of 4 m x 2 m, its middle on the centre line, heading along it: its outline stays on the exact road."""
     for m in laid[:4]:
         exact = oracle.ExactRoad(m.strips, *m.sides)
-        poses = [np.column_stack([p, headings(p)]) for p in (lane(m.lanes, i) for i in range(len(m.lanes)))]
+        poses = [np.column_stack([p, headings(p)]) for p in (lane(m.lanes, i) for i in range(len(m.lanes.steps)))]
         assert exact.outline_on_road(np.concatenate(poses), 2.0, 1.0).all()
 
 
@@ -188,7 +188,7 @@ def test_the_field_is_the_exact_road(built):
     for scenario in built:
         exact = oracle.ExactRoad(scenario.strips, float(scenario.road.width), float(scenario.road.height))
         rng = np.random.default_rng(scenario.seed)
-        lanes = scenario.lanes.points[rng.integers(len(scenario.lanes.points), size=6000)]
+        lanes = scenario.network.points[rng.integers(len(scenario.network.points), size=6000)]
         points = (lanes + rng.uniform(-9.0, 9.0, lanes.shape)).astype(F)
         true = exact.clearance(points)
         error = clearances(scenario.road, freeze(points))
@@ -206,7 +206,7 @@ def test_starts_are_at_rest_all_over_the_road_and_not_in_a_wall(built):
         assert not crashes(scenario.road, starts).any()
         assert (starts[:, 3:] == 0.0).all()
         sides = [scenario.road.width, scenario.road.height]
-        tiles, roads = (len(np.unique(at[:, :2] % sides // 32, axis=0)) for at in (starts, scenario.lanes.points))
+        tiles, roads = (len(np.unique(at[:, :2] % sides // 32, axis=0)) for at in (starts, scenario.network.points))
         assert tiles >= 0.85 * roads  # points lie on the sides of tiles, too
 
 
@@ -295,7 +295,7 @@ def test_the_highway_goes_round_and_bends_easily():
 def test_curved_loops_wind_both_ways_and_keep_apart():
     for seed in range(40):
         m = lay("curved", seed)
-        n = len(m.lanes) // 2
+        n = len(m.lanes.steps) // 2
         assert lengths(m.lanes)[:n].sum() >= 450.0 - 2 * math.pi * 1.75
         sweeps = m.strips.arcs[:, 4]
         assert min((sweeps > 0.3).sum(), (sweeps < -0.3).sum()) >= 2

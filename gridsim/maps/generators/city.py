@@ -12,8 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gridsim.maps.generators.squares import DIRECTIONS, Layout, components
-from gridsim.maps.lanes import Path
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.lanes import Path, Plan
 
 SIDE = 256.0  # m, of the torus
 LANE_WIDTH = 3.0  # m
@@ -63,8 +62,8 @@ def _parked(rng: np.random.Generator, first: float, last: float) -> Iterator[tup
         along += rng.uniform(*CAR_PITCH)
 
 
-def city_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """A city: (strips, lanes, width m, height m)."""
+def city_layout(rng: np.random.Generator) -> Plan:
+    """A city."""
     (columns, apart_x), (rows, apart_y) = GRIDS[rng.integers(len(GRIDS))]
     xs, ys = _positions(rng, columns, apart_x), _positions(rng, rows, apart_y)
     edges = street_graph(rng, columns, rows)

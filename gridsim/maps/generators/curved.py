@@ -11,8 +11,7 @@ import math
 import numpy as np
 
 from gridsim.jit import njit
-from gridsim.maps.lanes import Path, backwards, beside, lay_lanes, sample, strips_along
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.lanes import Path, Plan, backwards, beside, lay_lanes, sample, strips_along
 
 SIDE = 256.0  # m, of the torus
 MARGIN = 20.0  # m, corners from the torus's sides, so that the road does not cross them
@@ -93,8 +92,8 @@ def _rounded(corners: np.ndarray, rng: np.random.Generator) -> Path | None:
     return Path(x, y, headings[-1], tuple(pieces))
 
 
-def curved_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """A loop: (strips, lanes, width m, height m)."""
+def curved_layout(rng: np.random.Generator) -> Plan:
+    """A loop."""
     while True:
         middle = _rounded(_corners(rng), rng)
         if middle is None or sum(length for length, _ in middle.pieces) < SHORTEST_LOOP:
@@ -103,4 +102,4 @@ def curved_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float
         if not _meets_itself(points, step):
             break
     paths = beside(middle, -LANE_WIDTH / 2) + beside(backwards(middle), -LANE_WIDTH / 2)
-    return strips_along(middle, HALF_ROAD), lay_lanes(paths, SIDE, SIDE), SIDE, SIDE
+    return strips_along(middle, HALF_ROAD), lay_lanes(paths, SIDE, SIDE)

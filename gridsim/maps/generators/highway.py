@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsim.maps.lanes import Path, beside, lay_lanes, strips_along
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.lanes import Path, Plan, beside, lay_lanes, strips_along
 
 WIDTH, HEIGHT = 1024.0, 128.0  # m, of the torus
 LANE_COUNT = 4
@@ -23,8 +22,8 @@ STEEPEST = 0.6  # rad, of the heading from the x axis
 STRAIGHT = 20.0  # m between S-bends, at least
 
 
-def highway_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """A highway: (strips, lanes, width m, height m)."""
+def highway_layout(rng: np.random.Generator) -> Plan:
+    """A highway."""
     while True:
         radii = rng.uniform(*RADIUS, (BENDS, 2))
         shifts = rng.uniform(*SHIFT, BENDS) * rng.choice([-1.0, 1.0], BENDS)
@@ -43,4 +42,4 @@ def highway_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, floa
     offsets = LANE_WIDTH * (np.arange(LANE_COUNT)[::-1] - (LANE_COUNT - 1) / 2)  # from left to right
     lanes = [beside(middle, offset) for offset in offsets]
     abreast = [lane[k] for k in range(len(pieces)) for lane in lanes]
-    return strips_along(middle, HALF_ROAD), lay_lanes(abreast, WIDTH, HEIGHT, LANE_COUNT), WIDTH, HEIGHT
+    return strips_along(middle, HALF_ROAD), lay_lanes(abreast, WIDTH, HEIGHT, LANE_COUNT)

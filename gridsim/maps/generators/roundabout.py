@@ -8,7 +8,7 @@ import numpy as np
 
 from gridsim.maps.generators.squares import DIRECTIONS, Layout, Pieces, rotated
 from gridsim.maps.generators.tiles import HALF_ROAD, LANE_WIDTH, TILE, TILES, tile_graph
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.lanes import Plan
 
 RADIUS = 10.5  # m, of the ring's centre line; 30 m across in all, as small rural ones are
 HALF_RING = 4.5  # m, half width of the ring, wide enough for a lorry to turn
@@ -49,15 +49,15 @@ def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
             layout.arcs.append([cx + x, cy + y, FLARE, first, side * (angle - math.pi / 2), HALF_FLARE])
 
 
-def roundabout_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """A network in which each T and crossing is a roundabout: (strips, lanes, width m, height m)."""
+def roundabout_layout(rng: np.random.Generator) -> Plan:
+    """A network in which each T and crossing is a roundabout."""
     while True:
         edges = tile_graph(rng)
         if (edges.sum(axis=1) > 2).sum() >= FEWEST:
             return lay_tiles(rng, edges, 1.0)
 
 
-def lay_tiles(rng: np.random.Generator, edges: np.ndarray, share: float) -> tuple[Strips, Lanes, float, float]:
+def lay_tiles(rng: np.random.Generator, edges: np.ndarray, share: float) -> Plan:
     """The map of a graph; `share` of the T and crossing tiles are roundabouts."""
     layout = Layout(HALF_ROAD, LANE_WIDTH)
     for tile in range(len(edges)):

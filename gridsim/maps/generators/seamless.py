@@ -6,11 +6,11 @@ import numpy as np
 
 from gridsim.maps.generators.roundabout import lay_tiles
 from gridsim.maps.generators.tiles import tile_graph
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.lanes import Plan
 
 ROUNDABOUT_SHARE = 0.05  # of the T and crossing tiles
 
 
-def seamless_layout(rng: np.random.Generator) -> tuple[Strips, Lanes, float, float]:
-    """A network: (strips, lanes, width m, height m)."""
+def seamless_layout(rng: np.random.Generator) -> Plan:
+    """A network."""
     return lay_tiles(rng, tile_graph(rng), ROUNDABOUT_SHARE)

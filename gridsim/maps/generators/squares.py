@@ -9,8 +9,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gridsim.maps.lanes import Path, lay_lanes
-from gridsim.maps.roads import Lanes, Strips
+from gridsim.maps.lanes import Path, Plan, lay_lanes
+from gridsim.maps.roads import Strips
 
 # Edges of a square in counter-clockwise order: east, north, west, south.
 DIRECTIONS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -104,6 +104,6 @@ class Layout:
                     way = pieces(turn, half, self.offset)
                     self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
 
-    def finish(self, side: float) -> tuple[Strips, Lanes, float, float]:
-        """The strips, lanes, width and height (m) of a square map."""
-        return Strips.of(self.lines, self.arcs, self.blocks), lay_lanes(self.paths, side, side), side, side
+    def finish(self, side: float) -> Plan:
+        """The strips and lanes of a square map."""
+        return Strips.of(self.lines, self.arcs, self.blocks), lay_lanes(self.paths, side, side)
