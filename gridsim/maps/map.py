@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -49,7 +49,7 @@ class Map:
     def arrays(self) -> dict[str, np.ndarray]:
         """The map as plain arrays, which processes can share without copying."""
         own = {"name": self.name, "seed": self.seed, "torus": self.torus, "starts": self.starts}
-        parts = (own, vars(self.strips), self.road._asdict(), self.network._asdict())
+        parts = (own, self.strips._asdict(), self.road._asdict(), self.network._asdict())
         return {name: np.asarray(value) for part in parts for name, value in part.items()}
 
     @classmethod
@@ -60,7 +60,7 @@ class Map:
             name=str(values["name"]),
             seed=int(values["seed"]),
             road=Road(**{name: values[name] for name in Road._fields}),
-            strips=Strips(**{part.name: values[part.name] for part in fields(Strips)}),
+            strips=Strips(**{name: values[name] for name in Strips._fields}),
             network=Network(**{name: values[name] for name in Network._fields}),
             torus=bool(values["torus"]),
             starts=values["starts"],

@@ -10,7 +10,6 @@ compare it with the strips.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -40,33 +39,18 @@ class Road(NamedTuple):
     thinnest: np.float32  # m; no ray passes a wall that is at least as thick as this
 
 
-class _Arrays:
-    """Base of records that hold read-only views of arrays."""
+class Strips(NamedTuple):
+    """Centre lines with half widths, in metres: the exact drivable area. Arrays float64, read-only."""
 
-    def __post_init__(self):
-        for name, array in vars(self).items():
-            object.__setattr__(self, name, freeze(array))
-
-
-@dataclass(frozen=True)
-class Strips(_Arrays):
-    """Centre lines with half widths, in metres: the exact drivable area.
-
-    Attributes:
-        lines: float64 [n, 5]: x0, y0, x1, y1, half width.
-        arcs: float64 [m, 6]: centre x, centre y, radius, start angle, sweep (rad, counter-clockwise), half width.
-        blocks: float64 [k, 5]: centre x, centre y, heading (rad), half length, half width; not drivable.
-    """
-
-    lines: np.ndarray
-    arcs: np.ndarray
-    blocks: np.ndarray = field(default_factory=lambda: np.zeros((0, 5)))
+    lines: np.ndarray  # [n, 5]: x0, y0, x1, y1, half width
+    arcs: np.ndarray  # [m, 6]: centre x, y, radius, start angle, sweep (rad, counter-clockwise), half width
+    blocks: np.ndarray  # [k, 5]: centre x, y, heading (rad), half length, half width; not drivable
 
     @classmethod
     def of(cls, lines: ArrayLike = (), arcs: ArrayLike = (), blocks: ArrayLike = ()) -> Strips:
         """From rows of numbers."""
         rows = ((lines, 5), (arcs, 6), (blocks, 5))
-        return cls(*(np.asarray(part, dtype=np.float64).reshape(-1, width) for part, width in rows))
+        return cls(*(freeze(np.asarray(part, dtype=np.float64).reshape(-1, width)) for part, width in rows))
 
 
 @njit(nogil=True)

@@ -194,7 +194,7 @@ def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Ma
     assert copied.seed == city.seed
     for again in (city, copied, copy.deepcopy(city), pickle.loads(pickle.dumps(city))):
         np.testing.assert_equal(again.arrays(), city.arrays())
-        parts = (*again.road, *again.network, *vars(again.strips).values())
+        parts = (*again.road, *again.network, *again.strips)
         for array in (part for part in parts if isinstance(part, np.ndarray)):
             assert array.flags.c_contiguous
             assert not array.flags.writeable

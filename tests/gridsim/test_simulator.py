@@ -216,7 +216,7 @@ def plain():
 @pytest.fixture(scope="module")
 def straight():
     """A road of 8 m round a torus of 1,024 m, along x."""
-    strips = Strips(np.array([[0, 32.0, 1024, 32.0, 4.0]]), np.zeros((0, 6)))
+    strips = Strips.of([[0, 32.0, 1024, 32.0, 4.0]])
     return make_road(clearance_nodes(strips, 1024.0, 64.0), INTERVAL, 1.0)
 
 
