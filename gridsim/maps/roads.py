@@ -23,7 +23,7 @@ FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
 THICK_WALL = 3.0  # m; among walls of this thickness or more, rays need no checks
 
-_F, _I, _U, _N = np.float32, np.int32, np.uint32, np.uint64
+_F = np.float32
 
 
 class Road(NamedTuple):

@@ -15,7 +15,7 @@ from gridsim.sensing.boxes import boxes_touch
 from gridsim.traffic.world import ALONG, COS, LANE, SHIFT, SIN, SPEED, X, Y, lane_after
 
 _F, _I, _N = np.float32, np.int32, np.uint64
-_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+_ZERO, _ONE = _F(0.0), _F(1.0)
 
 
 @leaf
