@@ -54,6 +54,7 @@ def soak(network, drivers, constants, world, steps, stood) -> tuple[int, float, 
     Returns: (overlaps, sum of all cars' speeds over all steps in m/s, most steps for which any car stood).
     """
     nobody = np.zeros(5, dtype=np.float32)
+    nobody[X] = np.inf  # no ego car is near
     overlaps, total, longest = 0, 0.0, 0
     for _ in range(steps):
         flow(network, drivers, world, nobody)

@@ -30,7 +30,7 @@ from gridsim.config import (
 )
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
-from gridsim.traffic.encounters import is_there, meets_ego, shifted_right, touches_ego, way_to_ego_collision
+from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
 from gridsim.traffic.world import (
     ACCELERATION,
@@ -238,7 +238,6 @@ def _find_gaps(network, drivers, world, ego):
         world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
     # The search goes beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
     beyond = _F(2.0) * (drivers.half_length + CAUTION)
-    ego_is_there = is_there(ego)
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
@@ -252,10 +251,9 @@ def _find_gaps(network, drivers, world, ego):
                 update_gap(network, drivers, world[i], world[j], False)
             if squared < other_far * other_far:
                 update_gap(network, drivers, world[j], world[i], False)
-        if ego_is_there:
-            dx, dy = torus_distance(ego[X] - x, network.width), torus_distance(ego[Y] - y, network.height)
-            if dx * dx + dy * dy < far * far:
-                update_gap(network, drivers, world[i], ego, True)
+        dx, dy = torus_distance(ego[X] - x, network.width), torus_distance(ego[Y] - y, network.height)
+        if dx * dx + dy * dy < far * far:
+            update_gap(network, drivers, world[i], ego, True)
 
 
 @leaf
@@ -322,7 +320,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
             if j == i:
                 continue
             other = world[j] if j < world.shape[0] else ego
-            if (j < world.shape[0] and other[LANE] < _ZERO) or not is_there(other):
+            if j < world.shape[0] and other[LANE] < _ZERO:
                 continue
             dx, dy = other[X] - car[X], other[Y] - car[Y]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
@@ -382,8 +380,7 @@ def _choose_neighbour(network, drivers, world, i, ego):
         for j in range(world.shape[0]):
             if j != i and world[j, LANE] >= _ZERO:
                 update_gap(network, drivers, car, world[j], False)
-        if is_there(ego):
-            update_gap(network, drivers, car, ego, True)
+        update_gap(network, drivers, car, ego, True)
         if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe_braking:
             car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO
             car[GAP], car[LEAD_SPEED] = nearest, lead_speed
@@ -420,8 +417,7 @@ def _move(network, drivers, car, ego):
 def flow(network, drivers, world, ego):
     """One control period of a world's traffic. The ego car must not have moved yet.
 
-    Args: world [cars, FIELDS], changed; ego, a car's state of which X to STEERING are read. COS and SIN of 0 mean that
-    there is no ego car.
+    Args: world [cars, FIELDS], changed; ego, a car's state of which X to STEERING are read.
     """
     cars = world.shape[0]
     _find_gaps(network, drivers, world, ego)

@@ -19,17 +19,10 @@ _ZERO, _ONE = _F(0.0), _F(1.0)
 
 
 @leaf
-def is_there(ego):
-    """Whether there is an ego car."""
-    return ego[COS] != _ZERO or ego[SIN] != _ZERO
-
-
-@leaf
 def meets_ego(network, drivers, car, ego):
     """Whether the ego car is near, a length behind at most, and oncoming or crossing, or was when the car shifted."""
-    same_way = car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO
-    if same_way or not is_there(ego):
-        return False
+    if car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO:
+        return False  # they go the same way
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
     behind = _F(-2.0) * drivers.half_length
     return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > behind
@@ -37,9 +30,7 @@ def meets_ego(network, drivers, car, ego):
 
 @leaf
 def touches_ego(network, drivers, car, ego):
-    """Whether a car touches the ego car, if there is one."""
-    if not is_there(ego):
-        return False
+    """Whether a car touches the ego car."""
     dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
     return boxes_touch(drivers, dx, dy, car[COS], car[SIN], ego[COS], ego[SIN])
 

@@ -21,7 +21,6 @@ from gridsim.config import (
 )
 from gridsim.jit import leaf
 from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
-from gridsim.traffic.encounters import is_there
 from gridsim.traffic.world import (
     ALONG,
     COS,
@@ -140,16 +139,15 @@ def may_enter(network, drivers, world, i, ego):
             needed += place
     # The ego car goes first, unless it is behind this car. Its turn is unknown, so all the ground ahead of it is kept
     # free. A car that is already in a junction, as in a roundabout, drives on.
-    if is_there(ego):
-        dx, dy = ego[X] - car[X], ego[Y] - car[Y]
-        dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-        forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-        same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
-        way = EGO_CLEARANCE + CROSSING_TIME * max(ego[SPEED], _ZERO)
-        far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
-        if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < EGO_BEHIND)):
-            if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):
-                return False
-            rear = _way_to_point(network, beyond, ego[X], ego[Y], drivers.half_width + EGO_INSIDE) - drivers.half_length
-            room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
+    dx, dy = ego[X] - car[X], ego[Y] - car[Y]
+    dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+    forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+    same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
+    way = EGO_CLEARANCE + CROSSING_TIME * max(ego[SPEED], _ZERO)
+    far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
+    if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < EGO_BEHIND)):
+        if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):
+            return False
+        rear = _way_to_point(network, beyond, ego[X], ego[Y], drivers.half_width + EGO_INSIDE) - drivers.half_length
+        room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
     return room >= needed

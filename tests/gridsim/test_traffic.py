@@ -42,7 +42,7 @@ F = np.float32
 CONFIG = SimConfig()
 K, D = constants(CONFIG), drivers(CONFIG)
 LENGTH = CONFIG.vehicle.length
-NOBODY = np.zeros(14, dtype=F)  # an ego car that is not there
+NOBODY = np.array([math.inf, *np.zeros(13)], dtype=F)  # an ego car that is near nothing
 FAR = np.full(5, 1e6, dtype=F)  # a start that is near nothing
 DT = CONFIG.episode.control_period
 
