@@ -109,12 +109,6 @@ def idm(drivers, speed, desired, gap, leader):
 
 
 @leaf
-def horizon(drivers, speed):
-    """How far ahead (m) a car at a speed (m/s) looks."""
-    return drivers.jam + LOOK_AHEAD + speed * (LOOK_AHEAD_TIME + speed / (_F(2.0) * drivers.comfort))
-
-
-@leaf
 def _ahead(network, car, other):
     """Distance (m) along the lanes from a car to another ahead on its lane or its next two lanes; else 1e9."""
     lane, along = other[LANE], other[ALONG]
@@ -234,7 +228,9 @@ def _find_gaps(network, drivers, world, ego):
     """Find the nearest obstacle within each car's horizon: its GAP and LEAD_SPEED."""
     cars = world.shape[0]
     for i in range(cars):
-        world[i, HORIZON] = horizon(drivers, world[i, SPEED])
+        speed = world[i, SPEED]
+        way = speed * (LOOK_AHEAD_TIME + speed / (_F(2.0) * drivers.comfort))  # to notice something and to stop
+        world[i, HORIZON] = drivers.jam + LOOK_AHEAD + way
         world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
     # The search goes beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
     beyond = _F(2.0) * (drivers.half_length + CAUTION)
