@@ -31,11 +31,6 @@ def components(edges: np.ndarray) -> np.ndarray:
     return connected_components(joined, directed=False)[1]
 
 
-def goes_round(edges: np.ndarray) -> bool:
-    """Whether some straight road of a grid closes round the torus; edges as for `components`."""
-    return bool(edges[..., 0].all(axis=1).any() or edges[..., 1].all(axis=0).any())
-
-
 def rotated(x: float, y: float, quarters: int) -> tuple[float, float]:
     """A point rotated counter-clockwise by quarter turns."""
     c, s = DIRECTIONS[quarters % 4]
