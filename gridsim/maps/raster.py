@@ -30,32 +30,26 @@ _APART = 24  # nodes of wall around a window, so that averages on one side do no
 _BACK = np.array([0.0, 0.0, math.pi])
 
 
-def _thickened(free: np.ndarray, depth: np.ndarray, pixel: float) -> np.ndarray | None:
-    """The road after thin walls are thickened, so that the nodes of the field do not miss them.
-
-    A wall is thin where no disc of radius HALF_WALL fits into it; such a disc is put on each point of its middle line.
-    `depth` is the distance (m) of a wall's pixels to the road. None if there is no thin wall.
-    """
-    middle = ~free & (depth < HALF_WALL) & (depth >= ndimage.maximum_filter(depth, size=3))
-    thick = depth >= HALF_WALL
-    if middle.any() and thick.any():
-        middle &= ndimage.distance_transform_edt(~thick) * pixel > HALF_WALL + _TIP
-    return free & (ndimage.distance_transform_edt(~middle) * pixel > HALF_WALL) if middle.any() else None
+def _depth(inside: np.ndarray, pixel: float) -> np.ndarray:
+    """Distance (m) of a region's pixels to its edge, which is half a pixel before the nearest pixel outside."""
+    return np.maximum(ndimage.distance_transform_edt(inside) - 0.5, 0.0) * pixel
 
 
 def _signed(free: np.ndarray, pixel: float) -> np.ndarray:
-    """Distance (m) of pixels' centres to the edge between road and wall, positive on the road."""
+    """Distance (m) of pixels' centres to the edge between road and wall, positive on the road.
 
-    def outside(free: np.ndarray) -> np.ndarray:
-        return np.maximum(ndimage.distance_transform_edt(~free) - 0.5, 0.0) * pixel
-
-    depth = outside(free)
-    thickened = _thickened(free, depth, pixel)
-    if thickened is not None:
-        free, depth = thickened, outside(thickened)
-    # The distance to the nearest pixel of the other kind, less half a pixel, as the edge lies between the two centres.
-    inside = np.maximum(ndimage.distance_transform_edt(free) - 0.5, 0.0) * pixel
-    return np.where(free, inside, -depth).astype(np.float32)
+    Thin walls are thickened before, so that the nodes of the field do not miss them. A wall is thin where no disc of
+    radius HALF_WALL fits into it; such a disc is put on each point of its middle line.
+    """
+    depth = _depth(~free, pixel)
+    thick = depth >= HALF_WALL
+    middle = ~free & ~thick & (depth >= ndimage.maximum_filter(depth, size=3))
+    if middle.any() and thick.any():
+        middle &= ndimage.distance_transform_edt(~thick) * pixel > HALF_WALL + _TIP
+    if middle.any():
+        free = free & (ndimage.distance_transform_edt(~middle) * pixel > HALF_WALL)
+        depth = _depth(~free, pixel)
+    return np.where(free, _depth(free, pixel), -depth).astype(np.float32)
 
 
 def signed_clearance(free: np.ndarray, resolution: float, columns: int, rows: int) -> np.ndarray:
