@@ -24,13 +24,9 @@ class Atlas(NamedTuple):
 
 
 def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
-    """Concatenate maps. A single map is not copied."""
-    lanes = networks[0]
-    if len(networks) > 1:
-        names = [name for name in Network._fields if name not in ("width", "height")]
-        columns = {name: [getattr(network, name) for network in networks] for name in names}
-        together = {name: freeze(np.concatenate(arrays)) for name, arrays in columns.items()}
-        lanes = Network(**together, width=lanes.width, height=lanes.height)
+    """Concatenate maps. A single field, which may be large, is not copied."""
+    names = [name for name in Network._fields if name not in ("width", "height")]
+    lanes = {name: freeze(np.concatenate([getattr(network, name) for network in networks])) for name in names}
     fields = [road.field for road in roads]
     return Atlas(
         field=fields[0] if len(fields) == 1 else freeze(np.concatenate(fields)),
@@ -39,7 +35,7 @@ def make_atlas(roads: Sequence[Road], networks: Sequence[Network]) -> Atlas:
         sizes=freeze(
             np.array([[r.width, r.height, r.speed_low, r.speed_high, r.thinnest] for r in roads], dtype=np.float32)
         ),
-        lanes=lanes,
+        lanes=Network(**lanes, width=networks[0].width, height=networks[0].height),
         lane_bounds=_bounds([(network.points, network.steps, network.crossings) for network in networks]),
     )
 
