@@ -103,17 +103,6 @@ def choose_lane(network, lane, car):
     return network.successors[lane, min(_I(_draw(car) * _F(count)), _I(count - 1))]
 
 
-@njit
-def _is_free(network, world, n, x, y, apart):
-    for j in range(n):
-        if world[j, LANE] >= _ZERO:
-            dx, dy = world[j, X] - x, world[j, Y] - y
-            dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-            if dx * dx + dy * dy < apart * apart:
-                return False
-    return True
-
-
 @njit(nogil=True)
 def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
     """Spawn a world [cars, FIELDS], uniformly over the lanes from `first` m on, apart from each other and the ego."""
@@ -133,7 +122,13 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
             set_pose(network, car)
             dx, dy = car[X] - start[0], car[Y] - start[1]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-            if dx * dx + dy * dy >= ego_gap * ego_gap and _is_free(network, world, i, car[X], car[Y], gap):
+            free = dx * dx + dy * dy >= ego_gap * ego_gap
+            for j in range(i):
+                if world[j, LANE] >= _ZERO:
+                    dx, dy = world[j, X] - car[X], world[j, Y] - car[Y]
+                    dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
+                    free &= dx * dx + dy * dy >= gap * gap
+            if free:
                 car[SEED] = _F(mix(bits) >> _U(40))
                 car[SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
                 car[NEXT] = _F(choose_lane(network, lane, car))
