@@ -119,9 +119,10 @@ def _sample(paths: Sequence[Path], steps: np.ndarray, offsets: np.ndarray) -> tu
     return _sample_pieces(starts, pieces, np.cumsum([0, *(len(path.pieces) for path in paths)]), steps, offsets)
 
 
-def _wrapped(away: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Differences [..., 2] of points, the short way on the torus."""
-    return away - np.round(away / sides) * sides
+def _apart(one: np.ndarray, other: np.ndarray, sides: np.ndarray) -> np.ndarray:
+    """How far apart points [n, 2] and [m, 2] are along x and y on the torus: [n, m, 2]."""
+    away = other - one[:, None]
+    return np.abs(away - np.round(away / sides) * sides)
 
 
 @njit
@@ -139,29 +140,15 @@ def _near(one, other, width, height):
 
 
 @njit
-def _near_pairs(points, offsets, one, other, width, height):
-    """`_near` of pairs of lanes."""
-    near = np.empty(len(one), dtype=np.bool_)
-    for k in range(len(one)):
-        i, j = one[k], other[k]
-        near[k] = _near(points[offsets[i] : offsets[i + 1]], points[offsets[j] : offsets[j + 1]], width, height)
-    return near
-
-
-def _crossings(points: np.ndarray, offsets: np.ndarray, related: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Whether cars on two lanes may collide in a junction: bool [lanes, lanes], symmetric."""
-    middle = points[(offsets[:-1] + offsets[1:]) // 2]
-    distance = np.hypot(*(points - np.repeat(middle, np.diff(offsets), axis=0)).T)
-    radius = np.maximum.reduceat(distance, offsets[:-1])
-    away = _wrapped(middle - middle[:, None], sides)
-    apart = np.hypot(away[..., 0], away[..., 1]) - radius - radius[:, None]
-    one, other = np.nonzero(np.triu(~related & (apart < CROSSING_GAP + _SAME)))
-    first = points[offsets[:-1]]
-    fork = (np.abs(_wrapped(first[other] - first[one], sides)) < _SAME).all(axis=1)
-    one, other = one[~fork], other[~fork]
-    cross = np.zeros_like(related)
-    cross[one, other] = _near_pairs(points, offsets, one, other, *sides)
-    return cross | cross.T
+def _crossings(points, offsets, candidates, width, height):
+    """Which of the candidates, pairs of lanes, may collide in a junction: bool [lanes, lanes], symmetric."""
+    cross = np.zeros_like(candidates)
+    for i in range(len(cross)):
+        one = points[offsets[i] : offsets[i + 1]]
+        for j in range(i + 1, len(cross)):
+            if candidates[i, j] and _near(one, points[offsets[j] : offsets[j + 1]], width, height):
+                cross[i, j] = cross[j, i] = True
+    return cross
 
 
 def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int = 1) -> Network:
@@ -182,7 +169,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     starts = np.array([path[:3] for path in paths], dtype=np.float64).reshape(n, 3)
     turn = starts[:, 2] - ends[:, None, 2]
     same_way = np.abs(turn - np.round(turn / (2 * math.pi)) * (2 * math.pi)) < _SAME
-    follows = same_way & (np.abs(_wrapped(starts[:, :2] - ends[:, None, :2], sides)) < _SAME).all(axis=2)
+    follows = same_way & (_apart(ends[:, :2], starts[:, :2], sides) < _SAME).all(axis=2)
     if not follows.any(axis=1).all():
         raise ValueError("a lane must end where another begins")
     successors = np.full((n, FORKS), -1, dtype=np.int32)
@@ -190,8 +177,11 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
     successors[one, np.arange(len(one)) - np.searchsorted(one, one)] = other
     index = np.arange(n, dtype=np.int32)
     neighbours = index[:, None] // abreast == index // abreast
-    cross = _crossings(points, offsets, neighbours | follows | follows.T, sides)
+    forks = (_apart(starts[:, :2], starts[:, :2], sides) < _SAME).all(axis=2)
     low, high = (ufunc.reduceat(points.astype(np.float64), offsets[:-1]) for ufunc in (np.minimum, np.maximum))
+    middle, half = (low + high) / 2, (high - low) / 2 + _ROUNDED
+    near = (_apart(middle, middle, sides) - half - half[:, None] < CROSSING_GAP).all(axis=2)
+    cross = _crossings(points, offsets, near & ~(neighbours | forks | follows | follows.T), *sides)
     arrays = {
         "points": points,
         "speeds": np.zeros(len(points), dtype=np.float32),
@@ -204,7 +194,7 @@ def lay_lanes(paths: Sequence[Path], width: float, height: float, abreast: int =
         "crossings": np.nonzero(cross)[1].astype(np.int32),
         "clear": np.zeros(cross.sum(), dtype=np.float32),
         "room": np.zeros(len(points), dtype=np.float32),
-        "boxes": np.concatenate([(low + high) / 2, (high - low) / 2 + _ROUNDED], axis=1).astype(np.float32),
+        "boxes": np.concatenate([middle, half], axis=1).astype(np.float32),
     }
     frozen = {name: freeze(array) for name, array in arrays.items()}
     return Network(**frozen, width=np.float32(width), height=np.float32(height))
