@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import combinations, permutations
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -71,16 +72,14 @@ class Layout:
             # This area is already covered, but near the seams of the other three strips their clearance is too small.
             dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
             self.line(dx * half + x, dy * half + y, x, y)
-        for k, a in enumerate(arms):
-            for b in arms[k + 1 :]:
-                ax, ay = DIRECTIONS[a]
-                bx, by = DIRECTIONS[b]
-                if (b - a) % 4 == 2:
-                    self.line(ax * half + x, ay * half + y, bx * half + x, by * half + y)
-                else:
-                    first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
-                    sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
-                    self.arcs.append([half * (ax + bx) + x, half * (ay + by) + y, half, first, sweep, self.half_road])
+        for a, b in combinations(arms, 2):
+            (ax, ay), (bx, by) = DIRECTIONS[a], DIRECTIONS[b]
+            if (b - a) % 4 == 2:
+                self.line(ax * half + x, ay * half + y, bx * half + x, by * half + y)
+            else:
+                first = math.atan2(-by, -bx)  # from the corner towards edge a's middle
+                sweep = math.remainder(math.atan2(-ay, -ax) - first, 2 * math.pi)
+                self.arcs.append([half * (ax + bx) + x, half * (ay + by) + y, half, first, sweep, self.half_road])
 
     def connect(
         self,
@@ -91,13 +90,10 @@ class Layout:
         pieces: Callable[[int, float, float], Pieces] = through_square,
     ) -> None:
         """Lanes from each of some sides of a square to each other one; `pieces` is called like `through_square`."""
-        for entry in arms:
+        for entry, exit in permutations(arms, 2):
             edge_x, edge_y = rotated(half, self.offset, entry)
-            for exit in arms:
-                if exit != entry:
-                    turn = (exit - entry) % 4
-                    way = pieces(turn, half, self.offset)
-                    self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
+            way = pieces((exit - entry) % 4, half, self.offset)
+            self.paths.append(Path(x + edge_x, y + edge_y, (entry + 2) * math.pi / 2, way))
 
     def finish(self, side: float) -> Plan:
         """The strips and lanes of a square map."""
