@@ -224,12 +224,11 @@ def read_free(file: MapFile) -> np.ndarray:
     """
     data = _bytes(file.image)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
+        with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
             picture = Image.open(io.BytesIO(data), formats=tuple(dict.fromkeys(PICTURES.values())))
-            if picture.width * picture.height > MAX_PIXELS:
-                raise Image.DecompressionBombError
-    except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+        if picture.width * picture.height > MAX_PIXELS:
+            raise Image.DecompressionBombError
+    except Image.DecompressionBombError:
         raise GridSimError(f"{file.image}: more than {MAX_PIXELS:,} pixels; make the picture smaller") from None
     except Exception:
         raise GridSimError(f"{file.image}: not a readable picture ({', '.join(PICTURES)})") from None
