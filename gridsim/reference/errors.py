@@ -66,18 +66,13 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
 
 
 def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Series:
-    """A drive and the reference driver's profile along its path, from the poses [n, 5] at the control steps.
+    """A drive and the reference's profile along its path, from poses [n, 5] at the control steps (`drive.poses_of`).
 
-    Poses are as `view.drive.poses_of` gives them. Reversing, and the same metres driven again, are left out, because a
-    reference only drives forward. So is standing, where steering has no effect: a path from rest begins after the first
-    control step that moves the car.
+    Left out are reversing, metres that are driven again, and standing, where steering has no effect; the first 5 m,
+    whose curvature is not known; and the end, from where the reference could not have stopped for what may come.
 
-    The reference begins with the agent's speed and ignores traffic, so the error in traffic includes the delay by other
-    cars. Its curvature is that of the driven path over 10 m: an agent that weaves in longer waves slows the reference
-    down too, so look at both errors.
-
-    The first 5 m are left out, because their curvature is not known. So is the end, from where the reference could no
-    longer have stopped: what it would have had to brake for is not known.
+    The reference begins with the agent's speed and ignores traffic. Its curvature is that of the driven path over 10 m:
+    an agent that weaves in longer waves slows it down, so look at both errors.
 
     Raises: ValueError if the car never moved forward.
     """
