@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, STOP_LINE_GAP, SimConfig
-from gridsim.counter import GOLDEN, mix, uniform
+from gridsim.counter import GOLDEN, mix, uniform, uniform64
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import Network, wrapped
 
@@ -105,17 +105,16 @@ def choose_lane(network, lane, car):
 
 @njit(nogil=True)
 def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
-    """Spawn a world [cars, FIELDS], uniformly over the lanes from `first` m on, apart from each other and the ego."""
+    """Spawn an empty world's cars, uniformly over the lanes from `first` m on, apart from each other and the ego."""
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
-        car[:] = _ZERO
-        car[LANE], car[JUNCTION_BEHIND], car[PERMIT] = -_ONE, -_ONE, -_ONE
+        car[JUNCTION_BEHIND], car[PERMIT] = -_ONE, -_ONE
         car[LANE_TIMER] = _F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
         for _ in range(60):
             draws += 1
             bits = mix(key + _U(draws) * GOLDEN)
-            metres = (bits >> _U(11)) * (1.0 / (1 << 53)) * mileage[-1]
+            metres = uniform64(bits) * mileage[-1]
             lane = np.searchsorted(mileage, metres, side="right") - 1
             lane = min(lane, len(mileage) - 2)
             car[LANE], car[ALONG] = _F(lane), _F(first[lane] + metres - mileage[lane])
@@ -144,6 +143,7 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
     Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
     worlds, traffic = np.zeros((len(starts), cars, FIELDS), dtype=np.float32), config.traffic
+    worlds[:, :, LANE] = -1.0
     if cars and len(network.offsets) > 1:
         half = config.vehicle.length / 2
         lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
@@ -156,6 +156,4 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
         gaps = _F(traffic.spawn_gap), _F(traffic.spawn_gap_ego)
         for world, start, key in zip(worlds, np.asarray(starts, dtype=np.float32), keys, strict=True):
             _spawn(network, mileage, first, start, _U(key), *gaps, world)
-    else:
-        worlds[:, :, LANE] = -1.0
     return worlds
