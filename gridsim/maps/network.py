@@ -138,18 +138,18 @@ def _clear_points(points, offsets, steps, crossing_offsets, crossings, width, he
 
 def make_network(lanes: Network, road: Road, config: SimConfig) -> Network:
     """Lanes with what traffic needs to know of them on a road: `speeds`, `clear` and `room`."""
-    f, traffic = np.float32, config.traffic
+    traffic = config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
     speeds, clear = np.empty(len(points), dtype=np.float32), np.empty(len(lanes.crossings), dtype=np.float32)
-    top = f(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
-    _speed_profile(points, offsets, steps, successors, top, f(traffic.lateral), f(traffic.comfort), speeds)
+    top = _F(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
+    _speed_profile(points, offsets, steps, successors, top, _F(traffic.lateral), _F(traffic.comfort), speeds)
     crossing = lanes.crossing_offsets, lanes.crossings
-    apart = f(config.vehicle.width + traffic.beside)
+    apart = _F(config.vehicle.width + traffic.beside)
     _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
     beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
     room = _room_on_right(lanes, road, config)
     room[np.repeat(beside, np.diff(offsets))] = 0.0
-    _ease(offsets, steps, successors, f(traffic.taper), room)
+    _ease(offsets, steps, successors, _F(traffic.taper), room)
     return lanes._replace(speeds=freeze(speeds), clear=freeze(clear), room=freeze(room))
 
 
