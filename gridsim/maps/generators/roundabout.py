@@ -15,38 +15,31 @@ HALF_RING = 4.5  # m, half width of the ring, wide enough for a lorry to turn
 FLARE = 8.0  # m, radius of the arcs by which lanes join and leave the ring
 HALF_FLARE = HALF_ROAD - LANE_WIDTH / 2  # m, half width of those arcs, whose outer edge continues the arm's
 FEWEST = 6  # roundabouts on a map, at least
-
-
-def _flare() -> tuple[float, float, float]:
-    """The arc by which an arm's lane joins the ring: (x, y of its centre for the eastern arm, ring angle in rad).
-
-    It is tangent to the lane's centre line and, from outside, to the ring's.
-    """
-    y = LANE_WIDTH / 2 + FLARE
-    x = math.sqrt((RADIUS + FLARE) ** 2 - y**2)
-    return x, y, math.atan2(y, x)
+# The arc by which the eastern arm's lane joins the ring, tangent to the lane's centre line and, from outside, to the
+# ring's: x and y of its centre (m), and where on the ring it ends (rad).
+FLARE_Y = LANE_WIDTH / 2 + FLARE
+FLARE_X = math.sqrt((RADIUS + FLARE) ** 2 - FLARE_Y**2)
+FLARE_ANGLE = math.atan2(FLARE_Y, FLARE_X)
 
 
 def _around(turn: int, half: float, _offset: float) -> Pieces:
     """Pieces of the lane through a roundabout, counter-clockwise; arguments as for `squares.through_square`."""
-    x, _, angle = _flare()
-    straight = (half - x, 0.0)
-    flare = ((math.pi / 2 - angle) * FLARE, -1.0 / FLARE)
-    ring = ((turn * math.pi / 2 - 2 * angle) * RADIUS, 1.0 / RADIUS)
+    straight = (half - FLARE_X, 0.0)
+    flare = ((math.pi / 2 - FLARE_ANGLE) * FLARE, -1.0 / FLARE)
+    ring = ((turn * math.pi / 2 - 2 * FLARE_ANGLE) * RADIUS, 1.0 / RADIUS)
     return (straight, flare, ring, flare, straight)
 
 
 def _roundabout(layout: Layout, x: float, y: float, arms: list[int]) -> None:
     """The strips of a roundabout centred on (x, y)."""
-    flare_x, flare_y, angle = _flare()
     layout.arcs.append([x, y, RADIUS, 0.0, 2 * math.pi, HALF_RING])
     for arm in arms:
         dx, dy = DIRECTIONS[arm]
         inner = RADIUS - HALF_RING + HALF_ROAD + 0.25  # its round end must not cover the island
         layout.line(dx * TILE / 2 + x, dy * TILE / 2 + y, dx * inner + x, dy * inner + y)
         for side in (1.0, -1.0):  # way in, way out
-            (cx, cy), first = rotated(flare_x, side * flare_y, arm), arm * math.pi / 2 - side * math.pi / 2
-            layout.arcs.append([cx + x, cy + y, FLARE, first, side * (angle - math.pi / 2), HALF_FLARE])
+            (cx, cy), first = rotated(FLARE_X, side * FLARE_Y, arm), arm * math.pi / 2 - side * math.pi / 2
+            layout.arcs.append([cx + x, cy + y, FLARE, first, side * (FLARE_ANGLE - math.pi / 2), HALF_FLARE])
 
 
 def roundabout_layout(rng: np.random.Generator) -> Plan:
