@@ -122,8 +122,7 @@ def _bytes(path: Path) -> bytes:
         status = path.stat()
         regular = stat.S_ISREG(status.st_mode)
         if regular and status.st_size <= limit:
-            with path.open("rb") as file:
-                return file.read(limit)
+            return path.read_bytes()
     except OSError as error:
         raise GridSimError(f"{path}: {error.strerror or error}") from None
     except ValueError:
