@@ -1,7 +1,7 @@
 """Sends a run to MLflow from a thread of its own, so that MLflow never stops or slows the run.
 
-MLflow takes two seconds to import and to open its store, and milliseconds for a row. The thread syncs whenever
-something is new, and a last time when the run ends. A sync sends what MLflow lacks, and nothing twice: it asks MLflow
+MLflow takes two seconds to import and to open its store, and milliseconds for a row. The thread syncs every two
+seconds, and a last time when the run ends. A sync sends what MLflow lacks, and nothing twice: it asks MLflow
 once what it has, and repeats an unanswered request with the same timestamps, which MLflow recognises. What cannot be
 sent is kept, tried again, and in the end reported in one line. All of it is also in the run's folder, from which it can
 be sent later (`train.send_missing`).
@@ -46,13 +46,13 @@ class Tracker:
         self._status: Status | None = None  # set by close()
         self._ended = False
 
-        self._tried, self._news, self._closed = (threading.Event() for _ in range(3))
+        self._tried, self._closed = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
         self._preload = threading.Thread(target=preload, name="preload", daemon=True)
 
     def wait_ready(self, timeout_s: float = 30.0) -> str:
         """The run's id, once there is one. Raises TrackingError when an attempt fails, or after `timeout_s`."""
-        self._notify()
+        self._start()
         self._tried.wait(timeout_s)
         if self.run_id is None:
             raise TrackingError(f"{shown(self.uri)}: {self.error or f'MLflow not ready after {timeout_s:g} s'}")
@@ -73,17 +73,17 @@ class Tracker:
         """Send metrics of a step, at `wall_s` after the run's start, or now. The last of these ends MLflow's run."""
         self._rows.append(Row(step, row, wall_s, time.time_ns() // 1_000_000))
         self._wall_s = wall_s
-        self._notify()
+        self._start()
 
     def log_files(self, paths: Iterable[Path]) -> None:
         """Send files, each under its own name; they must stay as they are until `close` returns."""
         self._files += paths
-        self._notify()
+        self._start()
 
     def log_model(self, folder: Path, model: Model) -> None:
         """Write the champion as a torch model into a run's folder, send it and register it, unless that is done."""
         self._model = folder, model
-        self._notify()
+        self._start()
 
     def describe(self, note: str) -> None:
         """Replace the run's description, Markdown, when it ends; one written in MLflow's UI is left alone."""
@@ -100,7 +100,6 @@ class Tracker:
         if status != "FINISHED":
             self._model = None  # a resumed run finds a better one
         self._closed.set()
-        self._news.set()
         timeout_s = timeout_s or (CLOSE_S if status == "FINISHED" else STOP_S)
         self._thread.join(timeout_s)
         steps = sorted({row.step for row in self._rows})
@@ -114,21 +113,17 @@ class Tracker:
         reason = self.error or f"no answer within {timeout_s:g} s"
         return f"not logged to MLflow at {shown(self.uri)}: {', '.join(lost)}: {reason}"
 
-    def _notify(self) -> None:
+    def _start(self) -> None:
         if self._thread.ident is None:
             self._thread.start()
-        self._news.set()
 
     def _work(self) -> None:
-        """Sync when something is new, and once or twice when closed."""
+        """Sync now and then, which is no request if nothing is new, and once or twice when closed."""
         while not self._closed.is_set():
-            self._news.clear()
             synced = self._sync()
             if synced and self._preload.ident is None:
                 self._preload.start()
             self._closed.wait(FLUSH_S if synced else RETRY_S)
-            if synced:
-                self._news.wait()
         if not self._sync():
             time.sleep(CHANCE_S)
             self._sync()
