@@ -385,7 +385,7 @@ def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any]
         with contextlib.suppress(TrackingError):  # the tracker reports what is missing when it closes
             summary["mlflow_run_id"] = tracker.wait_ready(30.0)
             write_summary(run.path, summary)
-    tracker.describe(note)
+    tracker.note = note
     tracker.log_files(sorted(path for path in run.path.glob("[!.]*") if path.is_file()))
 
 

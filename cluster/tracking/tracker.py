@@ -35,13 +35,13 @@ class Tracker:
         self.run_id: str | None = None  # MLflow's id of the run, once there is one
         self.error: str | None = None  # why the last sync failed, in one line
         self.sent = Counter(row=0, file=0, model=0)  # what reached MLflow that was not there before
+        self.note = ""  # Markdown that replaces the run's description as it ends, unless a user has written another
         self._identity = identity
         self._run: LoggedRun | None = None
         # What MLflow lacks: the run adds to it, and the thread removes what it has sent.
         self._rows: list[Row] = []
         self._files: list[Path] = []
         self._model: tuple[Path, Model] | None = None
-        self._note = ""
         self._wall_s: float | None = None
         self._status: Status | None = None  # set by close()
         self._ended = False
@@ -84,10 +84,6 @@ class Tracker:
         """Write the champion as a torch model into a run's folder, send it and register it, unless that is done."""
         self._model = folder, model
         self._start()
-
-    def describe(self, note: str) -> None:
-        """Replace the run's description, Markdown, when it ends; one written in MLflow's UI is left alone."""
-        self._note = note
 
     def close(self, status: Status, timeout_s: float | None = None) -> str | None:
         """Send what is left, end the run as `status`, and return None, or one line about what could not be sent.
@@ -168,7 +164,7 @@ class Tracker:
 
     def _end(self) -> None:
         if self._status is not None:
-            self._opened.end(self._status, self._wall_s, self._note)
+            self._opened.end(self._status, self._wall_s, self.note)
             self._ended = True
 
 
