@@ -157,18 +157,16 @@ class LoggedRun:
         """Add the parameters and tags that the run lacks, and ask which steps it has."""
         from mlflow.entities import Param, RunTag
 
-        run_id, data = run.info.run_id, run.data
-        if not self._identity.finished:
+        run_id, data, identity = run.info.run_id, run.data, self._identity
+        params = [Param(name, value) for name, value in identity.params.items() if name not in data.params]
+        tags = {name: value for name, value in self._tags().items() if name not in data.tags}
+        if not identity.finished:
             self._client.update_run(run_id, status="RUNNING")
+            # MLflow does not let parameters change; what is different now (another commit) is added as a tag.
+            for wanted, have in ((identity.params, data.params), (self._tags(), data.tags)):
+                tags |= {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
         for name in data.metrics:
             self._logged[name] = {metric.step for metric in self._client.get_metric_history(run_id, name)}
-        # MLflow does not let parameters change; what differs in a run that goes on (another commit) is added as a tag.
-        resumed: dict[str, str] = {}
-        for wanted, have in ((self._identity.params, data.params), (self._tags(), data.tags)):
-            changed = {f"resumed/{name}": new for name, new in wanted.items() if have.get(name, new) != new}
-            resumed |= {} if self._identity.finished else changed
-        params = [Param(*param) for param in self._identity.params.items() if param[0] not in data.params]
-        tags = {name: value for name, value in self._tags().items() if name not in data.tags} | resumed
         self._client.log_batch(run_id, params=params, tags=[RunTag(*tag) for tag in tags.items()])
 
     def _tags(self) -> dict[str, str]:
