@@ -9,7 +9,6 @@ import os
 import pickle
 import signal
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -83,7 +82,7 @@ class Actor:
             self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
             for name in gone:
                 self._maps.pop(name, None)
-            self._task = replace(pickle.loads(shared))  # `replace` makes its arrays read-only
+            self._task = pickle.loads(shared)
 
 
 class Shared:

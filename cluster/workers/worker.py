@@ -15,12 +15,11 @@ from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import Mutation, breed
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
-from gridsim.maps.roads import freeze
 
 
 @dataclass(frozen=True)
 class _Common:
-    """What all chunks of a call share; broadcast once. Its arrays become read-only.
+    """What all chunks of a call share; broadcast once.
 
     Attributes:
         policy: the network, as in `mlp:6,7`.
@@ -37,12 +36,6 @@ class _Common:
     maps: tuple[tuple[str, int], ...]
     limits: Limits
     config: SimConfig
-
-    def __post_init__(self) -> None:
-        """Make arrays read-only, like those from the object store: Numba would compile again for writable ones."""
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, name, freeze(value))
 
 
 @dataclass(frozen=True)
@@ -96,7 +89,7 @@ class Worker:
         else:
             if stop - first < len(task.episodes):
                 task = replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
-            found = self.evaluate(task, maps, freeze(recipes))
+            found = self.evaluate(task, maps, recipes)
         return *found, time.perf_counter() - started
 
     def evaluate(

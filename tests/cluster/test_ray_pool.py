@@ -88,7 +88,7 @@ class Inspecting(Worker):
         assert not sys.modules.keys() & BANNED
         for array in (task.parents, task.episodes, recipes, *(each.road.field for each in maps)):
             assert array.flags.aligned
-            assert not array.flags.writeable
+        assert not any(each.road.field.flags.writeable for each in maps)
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN, "Ctrl-C would reach a worker"
         assert os.environ.get("OMP_NUM_THREADS") == "1", "a worker has more than one thread"
         assert psutil.Process().memory_full_info().uss <= 220 << 20
