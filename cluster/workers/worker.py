@@ -82,13 +82,12 @@ class Worker:
 
         Returns: what `evaluate` or `collect` does, and the seconds it took (for statistics only).
         """
-        started = time.perf_counter()
+        started, these = time.perf_counter(), slice(first, stop)
+        task = replace(task, episodes=task.episodes[these], worlds=task.worlds[these])
         found: tuple[Any, ...]
         if isinstance(task, CollectTask):
-            found = self.collect(task, maps, first, stop)
+            found = self.collect(replace(task, epsilons=task.epsilons[these], keys=task.keys[these]), maps)
         else:
-            if stop - first < len(task.episodes):
-                task = replace(task, episodes=task.episodes[first:stop], worlds=task.worlds[first:stop])
             found = self.evaluate(task, maps, recipes)
         return *found, time.perf_counter() - started
 
@@ -100,17 +99,9 @@ class Worker:
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
         return evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.worlds)
 
-    def collect(self, task: CollectTask, maps: Sequence[Map], first: int, stop: int) -> tuple[Experience, np.ndarray]:
-        """Experience and RESULT [stop - first] of the task's episodes from `first` on."""
-        these = slice(first, stop)
+    def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
+        """What `rollout.collect` returns."""
+        spec = PolicySpec.parse(task.policy)
         return collect(
-            PolicySpec.parse(task.policy),
-            task.weights,
-            maps,
-            task.episodes[these],
-            task.epsilons[these],
-            task.keys[these],
-            task.limits,
-            task.config,
-            task.worlds[these],
+            spec, task.weights, maps, task.episodes, task.epsilons, task.keys, task.limits, task.config, task.worlds
         )

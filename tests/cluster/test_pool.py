@@ -55,9 +55,9 @@ class Answering(Worker):
         worlds = np.repeat(task.worlds[task.episodes["rewind"] > 0][None], len(recipes), axis=0)
         return results, rewound, worlds
 
-    def collect(self, task: CollectTask, maps: Sequence[Map], first: int, stop: int) -> tuple[Experience, np.ndarray]:
+    def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
         """Episodes of key % 5 steps whose rows are all marked by their keys."""
-        keys = task.keys[first:stop]
+        keys = task.keys
         results = np.zeros(len(keys), dtype=RESULT)
         results["steps"] = keys % 5
         row = np.repeat(keys, results["steps"] + 1)
