@@ -19,53 +19,32 @@ from gridsim.maps.map import Map
 
 @dataclass(frozen=True)
 class _Common:
-    """What all chunks of a call share; broadcast once.
+    """What all chunks of a call share; broadcast once."""
 
-    Attributes:
-        policy: the network, as in `mlp:6,7`.
-        episodes: EPISODE [episodes].
-        worlds: the traffic that each begins with, float32 [episodes, cars, world.FIELDS].
-        maps: (scenario, seed) of each map that `episodes` indexes.
-        limits: where an episode ends if nothing happens.
-        config: the simulator's.
-    """
-
-    policy: str
-    episodes: np.ndarray
-    worlds: np.ndarray
-    maps: tuple[tuple[str, int], ...]
-    limits: Limits
+    policy: str  # as in `mlp:6,7`
+    episodes: np.ndarray  # EPISODE [episodes]
+    worlds: np.ndarray  # the traffic that each begins with, float32 [episodes, cars, world.FIELDS]
+    maps: tuple[tuple[str, int], ...]  # (scenario, seed) of each map that `episodes` indexes
+    limits: Limits  # where an episode ends if nothing happens
     config: SimConfig
 
 
 @dataclass(frozen=True)
 class Task(_Common):
-    """A generation. A call says which members (recipes) drive which episodes.
+    """A generation. A call says which members (recipes) drive which episodes."""
 
-    Attributes:
-        parents: genomes float32 [parents, genes] that the recipes name.
-        key: the generation's number for breeding, 64 bits.
-        mutation: how children differ from their parents.
-    """
-
-    parents: np.ndarray
-    key: int
-    mutation: Mutation
+    parents: np.ndarray  # genomes float32 [parents, genes] that the recipes name
+    key: int  # the generation's number for breeding, 64 bits
+    mutation: Mutation  # how children differ from their parents
 
 
 @dataclass(frozen=True)
 class CollectTask(_Common):
-    """A batch of experience: one network drives all episodes.
+    """A batch of experience: one network drives all episodes."""
 
-    Attributes:
-        weights: float32 [genes].
-        epsilons: float32 [episodes], the share of random actions in each.
-        keys: uint64 [episodes], of the random numbers of each.
-    """
-
-    weights: np.ndarray
-    epsilons: np.ndarray
-    keys: np.ndarray
+    weights: np.ndarray  # float32 [genes]
+    epsilons: np.ndarray  # float32 [episodes], the share of random actions in each
+    keys: np.ndarray  # uint64 [episodes], of the random numbers of each
 
 
 AnyTask = Task | CollectTask
