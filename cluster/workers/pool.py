@@ -53,35 +53,22 @@ def size(chunk: Chunk) -> int:
 
 
 class Call(ABC):
-    """One call of a pool: what is asked for, what it returned, and what it took.
-
-    Attributes:
-        task, recipes, asked: what is asked for, as in `WorkerPool.evaluate`.
-        results: RESULT [rows, columns]; zero where nothing was asked for and where it was lost.
-        lost: bool [rows], those that killed every worker that tried them.
-        wall_s: seconds from call to return.
-        busy_s: seconds that each worker (by its number) was at work. A replacement keeps the number.
-        episode_s: seconds of these that each column took, for all rows together, float64 [columns].
-        retries: parcels that were sent again because their worker died or failed.
-        bytes_down: payload sent to workers, recipes mostly; grows with the population.
-        bytes_up: payload sent back.
-        broadcast_bytes: put into the object store: the task and the maps that were new to it.
-        warnings: a line for each row that was lost, and for each worker that was replaced because it was silent.
-        total, done: how many episodes are to be driven, in all, and how many of these are, or are lost.
-    """
+    """One call of a pool: what is asked for, as in `WorkerPool.evaluate`, what it returned, and what it took."""
 
     noun: ClassVar[str]  # what its rows are
 
     def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk], rows: int, columns: int):
         self.task, self.recipes, self.asked = task, recipes, asked
-        self.results = np.zeros((rows, columns), RESULT)
-        self.lost = np.zeros(rows, bool)
-        self.wall_s = 0.0
-        self.busy_s: dict[int, float] = {}
-        self.episode_s = np.zeros(columns)
-        self.retries = self.bytes_down = self.bytes_up = self.broadcast_bytes = 0
-        self.warnings: list[str] = []
-        self.total, self.done = sum(map(size, asked)), 0
+        self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for and where it was lost
+        self.lost = np.zeros(rows, bool)  # those that killed every worker that tried them
+        self.wall_s = 0.0  # from call to return
+        self.busy_s: dict[int, float] = {}  # seconds of work, by the worker's number, which a replacement keeps
+        self.episode_s = np.zeros(columns)  # seconds of these that each column took, for all rows together
+        self.retries = 0  # parcels that were sent again because their worker died or failed
+        self.bytes_down = self.bytes_up = 0  # payload sent to workers, recipes mostly, and back
+        self.broadcast_bytes = 0  # put into the object store: the task and the maps that were new to it
+        self.warnings: list[str] = []  # a line for each row that was lost, and for each silent worker that was replaced
+        self.total, self.done = sum(map(size, asked)), 0  # episodes to be driven, and those that are, or are lost
 
     def work(self, chunk: Chunk) -> tuple[np.ndarray, int, int]:
         """Arguments of `Worker.answer` for a chunk: its recipes, its first episode and the one after its last."""
@@ -120,25 +107,19 @@ class Call(ABC):
 
 
 class Outcome(Call):
-    """What `evaluate` returned: rows are members, in the order of the recipes, columns episodes.
-
-    Attributes:
-        rewound: float32 [episodes, 5], for episodes with a `rewind` the state so many steps before the end. Only one
-            member drives such an episode.
-        worlds: float32 [episodes, cars, world.FIELDS], the traffic at that time.
-    """
+    """What `evaluate` returned: rows are members, in the order of the recipes, columns episodes."""
 
     noun = "members"
     task: Task
 
     def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk]):
         super().__init__(task, recipes, asked, len(recipes), len(task.episodes))
-        self.rewound = np.zeros((len(task.episodes), 5), np.float32)
-        self.worlds = np.zeros_like(task.worlds)
+        self.rewound = np.zeros((len(task.episodes), 5), np.float32)  # states so many steps before the end as `rewind`
+        self.worlds = np.zeros_like(task.worlds)  # the traffic at that time, float32 [episodes, cars, world.FIELDS]
 
     def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
         results, rewound, worlds, seconds = answer
-        if rewound.size:
+        if rewound.size:  # only one member drives such an episode
             self.rewound[chunk.columns], self.worlds[chunk.columns] = rewound[0], worlds[0]
         self._count(worker, chunk, results, seconds)
 
@@ -150,11 +131,7 @@ class Outcome(Call):
 
 
 class Collected(Call):
-    """What `collect` returned: rows are episodes, in one column.
-
-    Attributes:
-        experience: of all episodes that are not lost, in their order.
-    """
+    """What `collect` returned: rows are episodes, in one column."""
 
     noun = "episodes"
     task: CollectTask
@@ -166,6 +143,7 @@ class Collected(Call):
 
     @cached_property
     def experience(self) -> Experience:
+        """Of all episodes that are not lost, in their order."""
         return join([self._parts.pop(first) for first in sorted(self._parts)])
 
     def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
