@@ -30,11 +30,7 @@ INLINE = 1 << 16
 
 
 class Actor:
-    """Runs in a worker's process: holds the current task and its maps, answers chunks.
-
-    Args:
-        factory: makes the worker.
-    """
+    """Runs in a worker's process: holds the current task and its maps, answers chunks."""
 
     def __init__(self, factory: Callable[[], Worker]):
         self._worker = factory()
@@ -86,12 +82,7 @@ class Actor:
 
 
 class Shared:
-    """The coordinator's end: the latest task, and the maps of its scenario in the object store.
-
-    Args:
-        put: puts something into the store; returns its reference.
-        build_map: builds a map.
-    """
+    """The coordinator's end: the latest task, and maps of its scenario in the store, where `put` puts them."""
 
     def __init__(self, put: Callable[[Any], Any], build_map: BuildMap):
         self._put, self._build_map = put, build_map

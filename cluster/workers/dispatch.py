@@ -19,19 +19,12 @@ MAX_KILLS = 3  # workers that a member kills before it is lost
 
 
 class Dispatch:
-    """The parcels of one call, on their way to workers and back. Workers have numbers.
-
-    Args:
-        parcels: the parcels; where one is split, its pieces are added at the end.
-
-    Attributes:
-        retries: parcels that were sent again because their worker died; one that is split then counts once.
-        deaths: workers that died in a row, without an answer in between.
-    """
+    """The parcels of one call, on their way to workers and back. Workers have numbers."""
 
     def __init__(self, parcels: Sequence[Parcel]):
-        self.parcels = list(parcels)
-        self.retries = self.deaths = 0
+        self.parcels = list(parcels)  # where one is split, its pieces are added at the end
+        self.retries = 0  # parcels that were sent again because their worker died; one that is split then counts once
+        self.deaths = 0  # workers that died in a row, without an answer in between
         self._open = set(range(len(self.parcels)))  # neither answered nor lost
         self._todo = deque(range(len(self.parcels)))  # of these, the ones that no worker holds
         self._held: dict[int, deque[int]] = {}  # by worker, the one that it works on first

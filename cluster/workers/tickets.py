@@ -14,12 +14,7 @@ EMPTY = 1 << 20  # more bytes than a pipe holds
 
 
 class Tickets:
-    """One process's end of the queue.
-
-    Args:
-        path: of the pipe.
-        new: whether to create it.
-    """
+    """One process's end of the queue, the pipe at `path`; it is created if `new`."""
 
     def __init__(self, path: str, new: bool = False):
         self.path, made = path, f"{path}.new" if new else path
