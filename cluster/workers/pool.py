@@ -164,6 +164,7 @@ class WorkerPool(ABC):
     """Evaluates generations and collects experience. What it returns depends on the arguments, never on the workers.
 
     A call returns only when `meanwhile` is done to its end. What it raises ends the call.
+    Raises: PoolError if what is asked for cannot be done.
     """
 
     def evaluate(
@@ -179,8 +180,6 @@ class WorkerPool(ABC):
         Args:
             asked: which members drive which episodes, the longest first; None is all members on all episodes.
             meanwhile: what to do here while workers are busy.
-
-        Raises: PoolError if that cannot be done.
         """
         outcome = Outcome(task, recipes, rectangle(len(recipes), len(task.episodes)) if asked is None else asked)
         self._work(outcome, on_progress, meanwhile)
@@ -189,10 +188,7 @@ class WorkerPool(ABC):
     def collect(
         self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
     ) -> Collected:
-        """Drive the task's policy through its episodes and return all transitions.
-
-        Raises: PoolError if that cannot be done.
-        """
+        """Drive the task's policy through its episodes and return all transitions."""
         collected = Collected(task)
         self._work(collected, on_progress, meanwhile)
         return collected
