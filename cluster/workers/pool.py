@@ -200,8 +200,7 @@ class WorkerPool(ABC):
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         """Have all that is asked for done, and fill `call`."""
 
-    @abstractmethod
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - there may be nothing to do
         """Stop all that the pool started. May be called again, and at any moment."""
 
 
@@ -225,9 +224,6 @@ class SerialPool(WorkerPool):
             if on_progress:
                 on_progress(*call.progress())
         call.wall_s = time.perf_counter() - started
-
-    def close(self) -> None:
-        pass
 
 
 def finish(meanwhile: Meanwhile | None) -> None:
