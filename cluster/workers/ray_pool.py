@@ -2,15 +2,12 @@
 
 What differs from Ray's defaults, and why:
 
-* A Ray of our own goes without dashboard server, autoscaler monitor and log monitor, none of which a run uses: they
-  cost a second at the start, another one at the end, and 1.5 core-seconds of the workers' time (`ray_session`).
 * Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the system
   kills Ray's processes when their parent *thread* dies, and so they die with us, whatever kills us.
 * Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
   `dispatch` has to know which chunk killed which worker.
-* Where a call takes little time, the workers of this machine take its parcels from a queue (`tickets`): each gets one
-  call of Ray's and gives one answer, in place of one for each parcel, which would cost it a millisecond. What a worker
-  had taken when it died or failed is then sent in parcels, as on a cluster.
+* Where a call takes little time, the workers of this machine take its parcels from a queue (`tickets`), with one call
+  of Ray's each. What a worker had taken when it died or failed is then sent in parcels, as on a cluster.
 * For half a minute, or forever, Ray does not report a worker that is stopped, or whose host is cut off. A worker that
   has not answered for `patience_s` is replaced, and what it held is sent to another one.
 """
