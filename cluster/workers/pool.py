@@ -96,10 +96,10 @@ class Call(ABC):
         rows = len(self.results)
         return (rows * self.done // self.total if self.total else 0), rows
 
-    def describe(self, index: int, parcel: Parcel) -> str:
-        """A parcel in words."""
+    def failure(self, index: int, parcel: Parcel, error: BaseException) -> PoolError:
+        """What to raise where a worker raised an error on a parcel."""
         spans = ", ".join(f"{chunk.rows.start} to {chunk.rows.stop - 1}" for chunk in parcel)
-        return f"parcel {index} ({self.noun} {spans})"
+        return PoolError(f"a worker failed on parcel {index} ({self.noun} {spans}): {last_line(error)}")
 
     @abstractmethod
     def identify(self, row: int) -> str:
@@ -220,7 +220,7 @@ class SerialPool(WorkerPool):
                 for chunk in parcel:
                     call.add(0, chunk, *self._worker.answer(call.task, maps, *call.work(chunk)))
             except Exception as error:
-                raise PoolError(f"a worker failed on {call.describe(index, parcel)}: {last_line(error)}") from error
+                raise call.failure(index, parcel, error) from error
             if on_progress:
                 on_progress(*call.progress())
         call.wall_s = time.perf_counter() - started

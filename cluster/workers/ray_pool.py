@@ -41,7 +41,6 @@ from cluster.workers.pool import (
     WorkerPool,
     cut,
     finish,
-    last_line,
     metres,
 )
 from cluster.workers.tickets import Tickets, abandoned
@@ -262,8 +261,7 @@ class RayPool(WorkerPool):
             if serial == self._serial:
                 at = self._dispatch.at(slot.number)
                 if self._dispatch.parcels[at] != FROM_QUEUE:  # else its parcels are sent, and one fails again
-                    what = self._call.describe(at, self._dispatch.parcels[at])
-                    raise PoolError(f"a worker failed on {what}: {last_line(cause)}") from error
+                    raise self._call.failure(at, self._dispatch.parcels[at], cause) from error
             slot.serial = 0  # it may not have the task
             slot.maps.clear()
             answer = pickle.dumps({})
