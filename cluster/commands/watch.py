@@ -9,9 +9,8 @@ import math
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -165,8 +164,8 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     return champion, f"elite of {step} {number}"
 
 
-def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
-    """A function that returns each drive's driver and its title. Raises GridSimError."""
+def _driver(flags: WatchFlags) -> tuple[Champion, str]:
+    """The next drive's driver and its title. Raises GridSimError."""
     source, of_run = Path(flags.source), flags.generation is not None or flags.follow
     if flags.generation is not None and flags.follow:
         raise GridSimError("--generation and --follow exclude each other; leave one out")
@@ -178,14 +177,11 @@ def _driver(flags: WatchFlags) -> Callable[[], tuple[Champion, str]]:
         raise GridSimError(f"{source}: no such file or folder; give a run's folder or a champion.npz")
     if of_run and not (source / CONFIG).is_file():
         raise RunError(f"{source} is not a run's folder: it has no {CONFIG}")
-    if not flags.follow:
-        found = elite(source, flags.generation) if of_run else (load_champion(source), "champion")
-        return lambda: found
-    if not checkpoint_time(source):
+    if flags.follow and not checkpoint_time(source):
         print(f"waiting for the first {read_config(source / CONFIG)[0].counts[0]} ...", flush=True)
         while not checkpoint_time(source):
             time.sleep(0.1)
-    return partial(elite, source, None)
+    return elite(source, flags.generation) if of_run else (load_champion(source), "champion")
 
 
 def _drives(flags: WatchFlags, seconds: float, most: int | None = 1) -> Iterator[tuple[Recording, str]]:
@@ -193,9 +189,8 @@ def _drives(flags: WatchFlags, seconds: float, most: int | None = 1) -> Iterator
     if _is_recording(flags):
         yield from _recorded(flags)
         return
-    driver = _driver(flags)
     for seed in itertools.islice(itertools.count(flags.seed), most):
-        champion, name = driver()
+        champion, name = _driver(flags)
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, seed, champion.sim)
         traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic
