@@ -130,14 +130,21 @@ def _watch() -> int:
     )
     if flags.scenario:
         check_name(flags.scenario)
-    if flags.beside and not flags.output.lower().endswith(".html"):
+    output = Path(flags.output)
+    suffix = output.suffix.lower()
+    if flags.beside and suffix != ".html":
         raise GridSimError("several champions can only be shown on a page: --output drive.html")
-    if flags.output.lower().endswith(".html"):
-        _page(flags, seconds)
-    elif flags.output:
-        _film(flags, size, seconds)
-    else:
+    if not flags.output:
         _show(flags, size, seconds)
+        return 0
+    if suffix not in (*CODING, ".html"):
+        raise GridSimError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
+    if not output.parent.is_dir():
+        raise GridSimError(f"--output {output}: there is no folder {output.parent}; create it first")
+    if suffix == ".html":
+        _page(flags, output, seconds)
+    else:
+        _film(flags, output, size, seconds)
     return 0
 
 
@@ -224,19 +231,8 @@ def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
         yield drive, f"{title}    episode {episode + 1} of {episodes}" if episodes > 1 else title
 
 
-def _output(flags: WatchFlags) -> Path:
-    """Where to write. Raises GridSimError for another kind of file, or if there is no such folder."""
-    output = Path(flags.output)
-    if output.suffix.lower() not in (*CODING, ".html"):
-        raise GridSimError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
-    if not output.parent.is_dir():
-        raise GridSimError(f"--output {output}: there is no folder {output.parent}; create it first")
-    return output
-
-
-def _page(flags: WatchFlags, limit: float) -> None:
-    """Write --output as a page: drives of all sources from the same start, on the same road."""
-    output = _output(flags)
+def _page(flags: WatchFlags, output: Path, limit: float) -> None:
+    """Write a page: drives of all sources from the same start, on the same road."""
     shown: list[Shown] = []
     for source in (flags.source, *flags.beside):
         one = dataclasses.replace(flags, source=source)
@@ -256,9 +252,8 @@ def _page(flags: WatchFlags, limit: float) -> None:
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; open it in any browser")
 
 
-def _film(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
-    """Write --output as a film."""
-    output = _output(flags)
+def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) -> None:
+    """Write a film."""
     suffix = output.suffix.lower()
     fps = flags.fps or (10 if suffix == ".gif" else 20)
     if suffix == ".gif" and 100 % fps:
