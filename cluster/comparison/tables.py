@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,19 +27,11 @@ COLUMNS = (
 NOTHING = "–"
 
 
-class Spread(NamedTuple):
-    """Median and quartiles of a figure over n seeds; nan if n is 0."""
-
-    n: int
-    lower: float
-    median: float
-    upper: float
-
-
-def spread(values: Iterable[float]) -> Spread:
-    """Median and quartiles (linear interpolation) of the finite values; the others were not measured."""
+def spread(values: Iterable[float]) -> tuple[int, float, float, float]:
+    """The number of finite values (the others were not measured), and their quartiles; nan if there are none."""
     found = [value for value in values if math.isfinite(value)]
-    return Spread(len(found), *np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist())
+    lower, median, upper = np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist()
+    return len(found), lower, median, upper
 
 
 @dataclass(frozen=True)
@@ -61,8 +52,8 @@ class Group:
         """One number for each run."""
         return [run.figures.get(figure, math.nan) for run in self.runs]
 
-    def spread(self, figure: str) -> Spread:
-        """Median and quartiles over seeds."""
+    def spread(self, figure: str) -> tuple[int, float, float, float]:
+        """The number of seeds that have it, and its quartiles over them."""
         return spread(self.values(figure))
 
 
