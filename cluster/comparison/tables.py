@@ -57,51 +57,44 @@ class Group:
         return spread(self.values(figure))
 
 
+Kind = tuple[str, int, str, str]  # a group's scenario, traffic, observation and learner
+
+
 def group(runs: Sequence[Run], plan: Plan | None = None) -> list[Group]:
     """Runs by road and learner, in the order of the registry and of NAMES; with a plan, also the missing ones."""
-    settings = [each.settings for each in (plan.cells(Path()) if plan else runs)]
+    kinds: dict[Kind, list[RunSettings]] = {}
+    for each in plan.cells(Path()) if plan else runs:
+        s = each.settings
+        kinds.setdefault((s.scenario, s.traffic, s.observation, s.learner), []).append(s)
 
     def order(kind: Kind) -> tuple[int, str, int, int, str]:
         scenario, traffic, observation, learner = kind
         return [*REGISTRY, scenario].index(scenario), scenario, traffic, [*NAMES].index(learner), observation
 
-    kinds = sorted({_kind(each) for each in settings}, key=order)
     several_observations = len({observation for _, _, observation, _ in kinds}) > 1
     found = []
-    for kind in kinds:
+    for kind in sorted(kinds, key=order):
         scenario, traffic, observation, learner = kind
         several_traffics = len({other[1] for other in kinds if other[0] == scenario}) > 1
         road = label(scenario) + (f", {traffic} cars" if several_traffics else "")
         name = NAMES[learner] + (f" on {observation}" if several_observations else "")
-        asked = [each for each in settings if _kind(each) == kind]
-        varied = _varied(asked)
-        for variant in dict.fromkeys(_variant(each, varied) for each in asked):
-            seeds = sorted(each.seed for each in asked if _variant(each, varied) == variant)
-            finished = [
-                run for run in runs if _kind(run.settings) == kind and _variant(run.settings, varied) == variant
-            ]
-            finished.sort(key=lambda run: run.settings.seed)
+        for variant, settings in _variants(kinds[kind]).items():
+            asked, seeds = set(settings), sorted(each.seed for each in settings)
+            finished = sorted((run for run in runs if run.settings in asked), key=lambda run: run.settings.seed)
             full_name = f"{name}, {variant}" if variant else name
             found.append(Group(*kind, variant, road, full_name, tuple(finished), tuple(seeds)))
     return found
 
 
-Kind = tuple[str, int, str, str]
-
-
-def _kind(settings: RunSettings) -> Kind:
-    return settings.scenario, settings.traffic, settings.observation, settings.learner
-
-
-def _varied(settings: Sequence[RunSettings]) -> list[str]:
-    """In which of their settings runs of one kind differ, besides seeds and limits."""
+def _variants(settings: Sequence[RunSettings]) -> dict[str, list[RunSettings]]:
+    """Settings of one kind by what they differ in besides seeds and limits, in words."""
     values = [dataclasses.asdict(each) for each in settings]
     left_out = {"seed", "until", *settings[0].unbound}
-    return [name for name in values[0] if name not in left_out and len({each[name] for each in values}) > 1]
-
-
-def _variant(settings: RunSettings, varied: Sequence[str]) -> str:
-    return ", ".join(f"{name} {getattr(settings, name)}" for name in varied)
+    varied = [name for name in values[0] if name not in left_out and len({each[name] for each in values}) > 1]
+    found: dict[str, list[RunSettings]] = {}
+    for each in settings:
+        found.setdefault(", ".join(f"{name} {getattr(each, name)}" for name in varied), []).append(each)
+    return found
 
 
 def table_csv(groups: Sequence[Group], folder: Path) -> bytes:

@@ -38,5 +38,5 @@ def run(learner, scenario, seed, percent, training_s=10.0, success=0.9, traffic=
     figures = dict.fromkeys([*RUN_FIGURES, *ERROR_FIGURES], 1.0)
     figures |= {"velocity_error_percent": percent, "training_s": training_s, "success_rate": success} | more
     name = f"{scenario}-{learner}-s{seed}"
-    settings = Plan(traffic=traffic, observation=observation).settings(scenario, learner, seed)
+    settings = Plan(traffic=traffic, observation=observation, budget="1k").settings(scenario, learner, seed)
     return Run(Path(name), settings, name, figures)
