@@ -104,13 +104,8 @@ def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
     writer.writeheader()
     for each in groups:
         finished = {run.settings.seed for run in each.runs}
-        common = {
-            "scenario": label(each.scenario),
-            "traffic": each.traffic,
-            "observation": each.observation,
-            "learner": each.learner,
-            "variant": each.variant,
-        }
+        common = {name: getattr(each, name) for name in ("traffic", "observation", "learner", "variant")}
+        common["scenario"] = label(each.scenario)
         for run in each.runs:
             where = run.folder.relative_to(folder) if run.folder.is_relative_to(folder) else run.folder
             numbers = {name: repr(value) for name, value in run.figures.items() if math.isfinite(value)}
