@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -129,7 +129,8 @@ class Plan:
         for seed, scenario, learner in itertools.product(range(self.seeds), self.scenarios, self.learners):
             for variant in self.variants(learner):
                 words = [label(scenario), learner, *(f"{name}={value}" for name, value in variant.items()), f"s{seed}"]
-                found.append(Cell(folder / file_name("-".join(words)), self.settings(scenario, learner, seed, variant)))
+                settings = self.settings(scenario, learner, seed, **variant)
+                found.append(Cell(folder / file_name("-".join(words)), settings))
         return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
@@ -151,10 +152,8 @@ class Plan:
                 raise GridSimError(f"--grid {text:.80}: give numbers, as in {flag}=1,2") from None
         return [dict(chosen) for chosen in itertools.product(*choices)]
 
-    def settings(
-        self, scenario: str, learner: Learner, seed: int, variant: Mapping[str, Any] | None = None
-    ) -> RunSettings:
-        """The settings of one run."""
+    def settings(self, scenario: str, learner: Learner, seed: int, **variant: Any) -> RunSettings:
+        """The settings of one run; `variant` is one of `variants`."""
         car_steps, _ = limits(self.budget)
         common: dict[str, Any] = {
             "scenario": scenario,
@@ -167,11 +166,11 @@ class Plan:
             steps = car_steps or UNBOUND
             usual = DqnSettings.suited[self.observation]["evaluate_every"]
             every = min(usual, max(steps // EVALUATIONS, 1))
-            return DqnSettings(**common | dict(variant or {}), car_steps=steps, evaluate_every=every)
+            return DqnSettings(**common | variant, car_steps=steps, evaluate_every=every)
         if self.population:
             common["population"] = self.population
         return EvolveSettings(
-            **common | dict(variant or {}),
+            **common | variant,
             search="random" if learner == "random" else "evolution",
             recombination="two" if learner == "two-parents" else "all",
             car_steps=car_steps,
