@@ -84,13 +84,7 @@ def measured(run: Run) -> Run:
     return dataclasses.replace(run, figures={**run.figures, **errors_of(run)})
 
 
-def series(
-    champion: Champion,
-    scenario: str | None = None,
-    episodes: int = 64,
-    seed: int = HELD_OUT_SEED,
-    traffic: int | None = None,
-) -> list[Series]:
+def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: int) -> list[Series]:
     """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference.errors`.
 
     Episodes in which it does not drive a metre forward are left out.
@@ -112,7 +106,7 @@ def series(
 def errors_of(run: Run) -> dict[str, float]:
     """ERROR_FIGURES of a run's champion, nan if it never drives a metre forward. Raises GridSimError."""
     settings, champion = run.settings, load_champion(run.folder / CHAMPION)
-    found = series(champion, settings.scenario, HELD_OUT_EPISODES, traffic=settings.traffic)
+    found = series(champion, settings.scenario, HELD_OUT_EPISODES, HELD_OUT_SEED, settings.traffic)
     figures = errors(found, VehicleConfig()) if found else {}
     driven, expected = figures.get("metres", 0.0) / HELD_OUT_EPISODES + LEFT_OUT_M, run.figures["distance_m"]
     if driven < LEAST_SHARE * expected:

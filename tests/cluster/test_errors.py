@@ -32,8 +32,8 @@ def champion():
     return load_champion(CHAMPION)
 
 
-def errors(champion, *args, **options):
-    return errors_of(series(champion, *args, **options), CAR)
+def errors(champion, scenario="seamless", episodes=64, traffic=0):
+    return errors_of(series(champion, scenario, episodes, HELD_OUT_SEED, traffic), CAR)
 
 
 def along(points, speed, steering=0.0):
