@@ -260,7 +260,7 @@ class Progress(Line):
         """Read a finished run; one that is damaged counts as failed."""
         self.head, self.facts, self.rest = self._counter(), "reading what is finished", cell.name
         try:
-            self._results.runs.append(measured(read_run(cell.folder)))
+            self._results.runs.append(measured(read_run(cell.path)))
         except GridSimError as error:
             self._fail(cell, str(error))
 

@@ -59,7 +59,7 @@ def _train(cell: Cell, workers: Workers, train: Train, on_event: OnEvent) -> Non
         reporter = _CellReporter(cell, on_event)
         train(cell.open(), reporter=reporter)
         reporter.note("measuring errors")
-        on_event(cell, "done", measured(read_run(cell.folder)))
+        on_event(cell, "done", measured(read_run(cell.path)))
     except (GridSimError, FloatingPointError) as error:  # the other runs go on
         on_event(cell, "failed", str(error))
         workers.close()  # the next run starts new ones
@@ -70,7 +70,7 @@ class _CellReporter(Reporter):
 
     def __init__(self, cell: Cell, on_event: OnEvent):
         self._send = partial(on_event, cell)
-        self.resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.folder)}"
+        self.resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.path)}"
 
     def note(self, text: str, more: str = "") -> None:
         self._send("note", (text, more))

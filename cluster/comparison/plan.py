@@ -17,11 +17,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from cluster.comparison.results import LEARNERS, Learner, Run, read_run
 from cluster.runs import checkpoint
-from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, new_run, open_run, read_config
+from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, open_run, read_config
 from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking.address import shown
 from cluster.tracking.description import file_name
@@ -41,39 +41,32 @@ PLANNED = (
 )  # fmt: skip
 
 
-class Cell(NamedTuple):
+class Cell(RunFolder):
     """One training run of a comparison."""
-
-    folder: Path
-    settings: RunSettings
-
-    @property
-    def name(self) -> str:
-        return self.folder.name
 
     def finished(self) -> bool:
         """Whether there is a summary, the last file that a run writes."""
-        return (self.folder / SUMMARY).is_file()
+        return (self.path / SUMMARY).is_file()
 
     def check(self) -> None:
         """Raises GridSimError if the folder holds something else."""
-        if (self.folder / CONFIG).is_file():
-            if read_config(self.folder / CONFIG)[0] != self.settings:
+        if (self.path / CONFIG).is_file():
+            if read_config(self.path / CONFIG)[0] != self.settings:
                 raise GridSimError(
-                    f"{self.folder} is not what {COMPARISON} asks for: one of them was edited, or another version of "
+                    f"{self.path} is not what {COMPARISON} asks for: one of them was edited, or another version of "
                     "GridSim wrote it; start a new comparison"
                 )
         # A run that is killed while it writes its first file leaves a hidden one.
-        elif self.folder.is_file() or any(self.folder.glob("[!.]*")):
-            raise GridSimError(f"{self.folder} is in the way and is not a run; move it elsewhere")
+        elif self.path.is_file() or any(self.path.glob("[!.]*")):
+            raise GridSimError(f"{self.path} is in the way and is not a run; move it elsewhere")
 
     def open(self) -> RunFolder:
         """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""
-        if (self.folder / CHECKPOINT).is_file():
-            return open_run(self.folder)
-        if self.folder.exists():  # killed before its first step
-            shutil.rmtree(self.folder)
-        return new_run(self.folder.parent, self.name, self.settings)
+        if (self.path / CHECKPOINT).is_file():
+            return open_run(self.path)
+        if self.path.exists():  # killed before its first step
+            shutil.rmtree(self.path)
+        return self
 
 
 @dataclass(frozen=True)
@@ -251,7 +244,7 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
     for folder in folders:
         if (folder / COMPARISON).is_file():
             comparison = open_comparison(folder)
-            runs = [read_run(cell.folder) for cell in comparison.plan.cells(comparison.path) if cell.finished()]
+            runs = [read_run(cell.path) for cell in comparison.plan.cells(comparison.path) if cell.finished()]
             if not runs:
                 raise GridSimError(f"{folder}: none of its runs is finished; continue it with --resume {folder}")
             found += runs

@@ -243,7 +243,7 @@ def test_runs_at_once_have_the_champions_of_each_alone(up: Machines) -> None:
     command = f"gridsim-compare --address auto --jobs 2 --workers 1 {asked}"
     up.laptop.run(RAY, "exec", up.config, command, timeout=UP_S)
     for cell in plan.cells(up.head.home / "runs/c"):
-        assert summary(cell.folder)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
+        assert summary(cell.path)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
 
 
 @pytest.mark.e2e

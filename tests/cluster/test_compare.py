@@ -103,16 +103,16 @@ def test_a_finished_run_that_is_damaged_counts_as_failed_and_stops_no_other(tmp_
     folder = ComparisonFolder(tmp_path / "c", dataclasses.replace(PLAN, seeds=1))
     damaged, *others, new = folder.plan.cells(folder.path)
     for cell in (damaged, *others):
-        make_run(cell.folder, settings=cell.settings)
+        make_run(cell.path, settings=cell.settings)
     folder.write()
-    (damaged.folder / "champion.npz").write_text("PK")
+    (damaged.path / "champion.npz").write_text("PK")
     monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
     monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
     monkeypatch.chdir(tmp_path)
     code, out, err = call(compare_main, monkeypatch, capsys, "--resume", "c", "--workers", 0)
     assert code == 1
-    assert f"gridsim-compare: {damaged.name} failed: {damaged.folder}/champion.npz" in err
+    assert f"gridsim-compare: {damaged.name} failed: {damaged.path}/champion.npz" in err
     assert "gridsim-compare: error: 1 of 4 runs failed" in err
     assert f"run 4/4  {new.name}: success 50%" in out
     assert "| curved | evolution | missing |" in (folder.path / "table.md").read_text()
@@ -192,7 +192,7 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
         return jobs
 
     def both_saved():
-        return all((cell.folder / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
+        return all((cell.path / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
 
     short = tempfile.mkdtemp(prefix="gs-", dir="/tmp")  # the path of a socket in it must be short
     process = start("gridsim-compare", *asked, "--budget", "1G", "--generations", "12", *at_once, "--name", "c",
@@ -213,7 +213,7 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
         assert process.returncode == 1, errors
         assert "failed: its process ended with exit code -9" in errors
         assert "gridsim-compare: error: 2 of 4 runs failed" in errors
-        assert [(cell.folder / "summary.json").exists() for cell in cells] == [False, False, True, True]
+        assert [(cell.path / "summary.json").exists() for cell in cells] == [False, False, True, True]
     finally:
         process.kill()
         process.communicate()
@@ -222,4 +222,4 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     assert not [name for name in os.listdir(short) if name.startswith("pymp-")], "the folder of a socket"
     shutil.rmtree(short)
     for cell in cells:
-        assert summary(cell.folder)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
+        assert summary(cell.path)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256

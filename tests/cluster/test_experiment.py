@@ -65,10 +65,10 @@ def test_plan_that_makes_no_sense(change, said):
 def test_a_comparison_that_was_stopped_has_something_of_everything(tmp_path):
     roads = tuple(REGISTRY)
     cells = Plan(seeds=3).cells(tmp_path)
-    assert len({cell.folder for cell in cells}) == len(cells) == 60
+    assert len({cell.path for cell in cells}) == len(cells) == 60
     found = {(cell.settings.scenario, cell.settings.learner) for cell in cells[:20]}
     assert found == set(itertools.product(roads, LEARNERS))
-    assert cells[0].folder == tmp_path / f"{roads[0]}-evolution-s0"
+    assert cells[0].path == tmp_path / f"{roads[0]}-evolution-s0"
 
 
 def test_each_combination_of_a_grid_is_compared(tmp_path):
@@ -81,8 +81,8 @@ def test_each_combination_of_a_grid_is_compared(tmp_path):
     assert {(cell.settings.policy, vars(cell.settings)["sigma"]) for cell in cells} == {
         ("mlp:64", 0.3), ("mlp:64", 0.5), ("mlp:6,7", 0.3), ("mlp:6,7", 0.5),
     }  # fmt: skip
-    make_run(cells[2].folder, settings=cells[2].settings)
-    groups = group(read_runs([cells[2].folder]), plan)
+    make_run(cells[2].path, settings=cells[2].settings)
+    groups = group(read_runs([cells[2].path]), plan)
     assert [(each.name, len(each.runs), each.seeds) for each in groups] == [
         ("evolution, policy mlp:64, sigma 0.3", 0, (0, 1)),
         ("evolution, policy mlp:64, sigma 0.5", 0, (0, 1)),
@@ -128,7 +128,7 @@ def test_a_comparison_stands_for_its_finished_runs(tmp_path):
     assert open_comparison(tmp_path) == folder
     with pytest.raises(GridSimError, match="none of its runs"):
         read_runs([tmp_path])
-    make_run(PLAN.cells(tmp_path)[0].folder)
+    make_run(PLAN.cells(tmp_path)[0].path)
     assert [found.folder.name for found in read_runs([tmp_path])] == ["curved-evolution-s0"]
 
 
@@ -158,18 +158,18 @@ def test_edited_comparison_is_refused(tmp_path, change):
 
 def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
     first, second, third = PLAN.cells(tmp_path)[:3]
-    make_run(first.folder, settings=first.settings)
+    make_run(first.path, settings=first.settings)
     first.check()
     with pytest.raises(GridSimError, match="one of them was edited, or another version of GridSim wrote it"):
         dataclasses.replace(PLAN, traffic=4).cells(tmp_path)[0].check()
     with pytest.raises(GridSimError, match="one of them was edited"):
         dataclasses.replace(PLAN, population=64).cells(tmp_path)[0].check()
-    shutil.move(first.folder, second.folder)
+    shutil.move(first.path, second.path)
     with pytest.raises(GridSimError, match="one of them was edited"):
         second.check()
-    third.folder.mkdir()
-    (third.folder / ".config.json.123.tmp").write_text("{")  # left by a run that was killed as it began
+    third.path.mkdir()
+    (third.path / ".config.json.123.tmp").write_text("{")  # left by a run that was killed as it began
     third.check()
-    (third.folder / "mine.txt").write_text("dear diary")
+    (third.path / "mine.txt").write_text("dear diary")
     with pytest.raises(GridSimError, match="in the way"):
         third.check()
