@@ -270,8 +270,7 @@ class Progress(Line):
         if kind == "begin":
             self._begun[name], self._lines[name] = now, f"{name}  starting"
         elif kind == "note":
-            text, more = content
-            self._lines[name] = f"{name}  {text}  {more}"
+            self._lines[name] = f"{name}  {content}"
         elif kind == "warning":
             print(f"{name}: warning: {content}", file=sys.stderr, flush=True)
         else:

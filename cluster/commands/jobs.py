@@ -31,8 +31,7 @@ from gridsim.errors import GridSimError
 CLOSING_S = 90.0  # for a run to be saved and closed after a signal; Ray takes most of it
 Kind = Literal["begin", "note", "warning", "done", "failed"]
 OnEvent = Callable[[Cell, Kind, Any], None]
-"""Receives the events of a run: "begin"; "note" with two texts; "warning" or "failed" with a text; "done" with its
-`Run`."""
+"""Receives the events of a run: "begin"; "note", "warning" or "failed" with a text; "done" with its `Run`."""
 Train = Callable[..., Session]
 """`train` with all arguments but the run and the reporter."""
 
@@ -72,8 +71,8 @@ class _CellReporter(Reporter):
         self._send = partial(on_event, cell)
         self.resume = f"{command_path(cell.settings.command)} --resume {short_path(cell.path)}"
 
-    def note(self, text: str, more: str = "") -> None:
-        self._send("note", (text, more))
+    def note(self, text: str) -> None:
+        self._send("note", text)
 
     def warn(self, text: str) -> None:
         self._send("warning", text)
@@ -88,7 +87,7 @@ class _CellReporter(Reporter):
 
     def row(self, steps: int, row: dict[str, float]) -> None:
         success = f"success {row['validation/success_rate']:.0%}"
-        self.note(f"{progress_of(self._learning, bound=False)}  {success}", self._learning.describe(row))
+        self.note(f"{progress_of(self._learning, bound=False)}  {success}  {self._learning.describe(row)}")
 
 
 class _Job:
@@ -148,7 +147,7 @@ def _compile(cells: Sequence[Cell], on_event: OnEvent) -> None:
         warming = kernels.Warming(cell.settings)
         try:
             if warming.processes:
-                on_event(cells[0], "note", ("compiling the simulator for this machine, once", ""))
+                on_event(cells[0], "note", "compiling the simulator for this machine, once")
                 warming.wait()
         finally:
             warming.stop()

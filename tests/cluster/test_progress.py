@@ -108,7 +108,7 @@ def test_a_comparison_shows_the_same(width):
     folder = ComparisonFolder(Path("runs/c"), plan)
     shown = compare.Progress(console, folder, cells, 2, compare.Results(folder.path, plan))
     learner = learning((12, 10**15, "generations"))
-    note = f"{progress.progress_of(learner, bound=False)}  success 37%", learner.describe(ROW)
+    note = f"{progress.progress_of(learner, bound=False)}  success 37%  {learner.describe(ROW)}"
     for cell in cells[:2]:
         shown.show(cell, "begin", None)
         shown.show(cell, "note", note)
