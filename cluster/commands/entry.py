@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from functools import partial
 from importlib import import_module
 from importlib.metadata import version
@@ -26,18 +27,13 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     Raised in the former, it can be lost, or leave the import lock held, so that other threads wait for it forever.
     Raised in a function that LLVM calls while it loads a kernel, it ends the process with a segmentation fault.
     """
-    if frame and (frame.f_code.co_filename.startswith("<frozen importlib") or _below_llvm(frame)):
+    if frame and (
+        frame.f_code.co_filename.startswith("<frozen importlib")
+        or any("llvmlite" in caller.f_code.co_filename for caller, _ in traceback.walk_stack(frame))
+    ):
         threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
     else:
         raise KeyboardInterrupt
-
-
-def _below_llvm(frame: FrameType | None) -> bool:
-    while frame:
-        if "llvmlite" in frame.f_code.co_filename:
-            return True
-        frame = frame.f_back
-    return False
 
 
 def _enter(module: str, name: str) -> None:
