@@ -26,7 +26,7 @@ from evolution.episodes.rollout import Limits
 from evolution.episodes.rollout import evaluate as roll_out
 from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
-from evolution.networks.policy import CnnSpec, MlpSpec, Observation, PolicySpec, act_on
+from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -60,11 +60,6 @@ class Champion:
     def sha256(self) -> str:
         """Digest of the genome's bytes."""
         return hashlib.sha256(self.genome.tobytes()).hexdigest()
-
-    @property
-    def observation(self) -> Observation:
-        """What it sees: rays or grid."""
-        return PolicySpec.parse(self.policy).observation
 
     def traffic_on(self, scenario: str) -> int:
         """Other cars on a scenario by default: on its own as many as it learned among, elsewhere the usual number."""
