@@ -26,7 +26,7 @@ from evolution.episodes.rollout import Limits
 from evolution.episodes.rollout import evaluate as roll_out
 from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
-from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec, act_on
+from evolution.networks.policy import CnnSpec, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -91,15 +91,11 @@ class Champion:
         """A Gymnasium environment on the champion's scenario, or another."""
         from gridsim.envs.env import GridSimEnv
 
+        scenario = scenario or self.scenario
         spec = PolicySpec.parse(self.policy)
-        sees: dict[str, Any] = {"observation": spec.observation}
-        if isinstance(spec, CnnSpec):
-            sees["frames"] = spec.frames
-        elif isinstance(spec, MlpSpec):
-            sees |= {"motion": spec.motion, "steering": spec.steering}
-        if scenario in (None, self.scenario):
-            sees["traffic"] = self.traffic
-        return GridSimEnv(scenario=scenario or self.scenario, config=self.sim, **{**sees, **options})
+        own: dict[str, Any] = {"observation": spec.observation, "traffic": self.traffic_on(scenario)}
+        own |= {name: value for name, value in vars(spec).items() if name in ("motion", "steering", "frames")}
+        return GridSimEnv(scenario=scenario, config=self.sim, **own | options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write champion.npz. Raises CheckpointError if it cannot be written."""
