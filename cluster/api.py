@@ -50,7 +50,7 @@ def evolve(
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
     `.../mean` is over all members on training episodes, `.../best` of the best genome so far on its own episodes.
-    Raises: SettingsError or PoolError; the message is one line.
+    Raises: GridSimError; the message is one line.
     """
     return _train(settings or EvolveSettings(**flags), workers, on_generation, fitness)
 

@@ -35,10 +35,6 @@ IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 S = TypeVar("S", bound="RunSettings")
 
 
-class SettingsError(GridSimError):
-    """Settings that make no sense; the message is one line for the user."""
-
-
 @dataclass(frozen=True)
 class RunSettings:
     """What any learner's run depends on: two runs with equal settings have the same champion."""
@@ -109,44 +105,40 @@ class RunSettings:
         return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
 
     def check(self) -> None:
-        """Raises SettingsError, one line that says what to change."""
-        try:
-            self._check()
-        except ValueError as error:
-            raise SettingsError(str(error)) from error
-
-    def _check(self) -> None:
-        """Raises ValueError, one line."""
+        """Raises GridSimError, one line that says what to change."""
         check_name(self.scenario)
         if is_map_file(self.scenario):
             build(self.scenario, 0)  # cached, so that it is read once
         self._check_range(0, MAX_TRAFFIC, "traffic")
         if self.traffic and is_map_file(self.scenario):
-            raise SettingsError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
+            raise GridSimError(f"--traffic {self.traffic}: {self.scenario} has no lanes for traffic; use --traffic 0")
         self._check_range(0, MAX_SEED, "seed")
         self._check_range(0, MAX_STEPS, "car_steps")
         self._check_positive("until")
         low, high = speed_interval(self.scenario)
         if self.pace and not low <= self.pace <= high:
-            raise SettingsError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
-        spec = PolicySpec.parse(self.policy)
+            raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
+        try:
+            spec = PolicySpec.parse(self.policy)
+        except ValueError as error:
+            raise GridSimError(str(error)) from error
         if spec.observation != self.observation:
-            raise SettingsError(
+            raise GridSimError(
                 f"policy {self.policy} sees the {spec.observation}; "
                 f"give --observation {spec.observation}, or a policy such as {self.default_policy()}"
             )
 
     def _check_range(self, least: float, most: float, *names: str) -> None:
-        """Raises SettingsError for a field that is out of its range."""
+        """Raises GridSimError for a field that is out of its range."""
         for name in names:
             value = getattr(self, name)
             if not least <= value <= most:
-                raise SettingsError(f"--{name.replace('_', '-')} must be {least:,} to {most:,}, not {value:,}")
+                raise GridSimError(f"--{name.replace('_', '-')} must be {least:,} to {most:,}, not {value:,}")
 
     def _check_positive(self, *names: str) -> None:
         for name in names:
             if not 0.0 < getattr(self, name) < math.inf:
-                raise SettingsError(f"--{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
+                raise GridSimError(f"--{name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -223,17 +215,17 @@ class EvolveSettings(RunSettings):
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or 0 < self.generations <= int(so_far["generation"])
 
-    def _check(self) -> None:
-        super()._check()
+    def check(self) -> None:
+        super().check()
         self._check_range(0, MAX_STEPS, "generations")
         self._check_range(4, MAX_POPULATION, "population")
         self._check_range(0, 1, "mutation_rate")
         classic = self.recombination == "two" or self.search == "random"
         for name in ("elites", "mutation_rate"):
             if not classic and getattr(self, name) != getattr(EvolveSettings, name):
-                raise SettingsError(f"--{name.replace('_', '-')} is for --recombination two; add that, or leave it out")
+                raise GridSimError(f"--{name.replace('_', '-')} is for --recombination two; add that, or leave it out")
         if not 0 <= self.elites <= MAX_ELITES or (classic and self.elites >= self.population):
-            raise SettingsError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
+            raise GridSimError(f"--elites must be 0 to {MAX_ELITES:,}, and below the population, not {self.elites}")
         self._check_range(1, MAX_STEPS, "tournament")
         self._check_positive("sigma")
 
@@ -307,48 +299,48 @@ class DqnSettings(RunSettings):
     def ended(self, so_far: Mapping[str, Any]) -> bool:
         return super().ended(so_far) or bool(so_far["converged"]) or 0 < self.episodes <= int(so_far["episodes"])
 
-    def _check(self) -> None:
-        super()._check()
+    def check(self) -> None:
+        super().check()
         self._check_range(1, MAX_STEPS, "evaluate_every", "batch", "anneal", "target_period")
         self._check_range(0, MAX_STEPS, "episodes")
         self._check_range(0, 1, "discount", "epsilon", "converged")
         self._check_positive("updates", "learning_rate")
         self._check_range(0, MAX_UPDATES, "updates")
         if not self.batch <= self.replay <= MAX_REPLAY:
-            raise SettingsError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
+            raise GridSimError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
         if self.device not in ("auto", "cpu", "cuda"):
-            raise SettingsError(f"--device must be auto, cpu or cuda, not {self.device}")
+            raise GridSimError(f"--device must be auto, cpu or cuda, not {self.device}")
 
 
 SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}
 
 
 def check_workers(workers: int, address: str, patience_s: float) -> None:
-    """Raises SettingsError if a run cannot be computed with these values; no result depends on them."""
+    """Raises GridSimError if a run cannot be computed with these values; no result depends on them."""
     if not 0 <= workers <= MAX_WORKERS:
-        raise SettingsError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
+        raise GridSimError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
     if workers == 0 and address:
-        raise SettingsError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
+        raise GridSimError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
     if not 0.0 <= patience_s < math.inf:
-        raise SettingsError(f"--patience must be 0 or more, not {patience_s:g}")
+        raise GridSimError(f"--patience must be 0 or more, not {patience_s:g}")
 
 
 def from_dict(kind: type[S], values: dict[str, Any]) -> S:
-    """Settings from what `dataclasses.asdict` made of them. Raises SettingsError for names or types that do not fit."""
+    """Settings from what `dataclasses.asdict` made of them. Raises GridSimError for names or types that do not fit."""
     fields = {f.name: f for f in dataclasses.fields(kind)}
     unknown = sorted(set(values) - set(fields))
     if unknown:
-        raise SettingsError(f"unknown setting {unknown[0]!r}, perhaps of another version of GridSim; start a new run")
+        raise GridSimError(f"unknown setting {unknown[0]!r}, perhaps of another version of GridSim; start a new run")
     defaults = kind()
     for name, value in values.items():
         wanted = type(getattr(defaults, name))
         if wanted is float and isinstance(value, int) and not isinstance(value, bool):
             value = values[name] = float(value)
         if type(value) is not wanted:
-            raise SettingsError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
+            raise GridSimError(f"setting {name!r} must be {wanted.__name__}, not {value!r}")
         choices = get_args(get_type_hints(kind)[name])
         if choices and value not in choices:
-            raise SettingsError(f"setting {name!r} must be {' or '.join(choices)}, not {value!r}")
+            raise GridSimError(f"setting {name!r} must be {' or '.join(choices)}, not {value!r}")
     settings = kind(**values)
     settings.check()
     return settings

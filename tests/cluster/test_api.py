@@ -11,11 +11,12 @@ from cluster import api
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
 from cluster.runs.checkpoint import CheckpointError, save
 from cluster.runs.run import RunFolder
-from cluster.runs.settings import DqnSettings, SettingsError
+from cluster.runs.settings import DqnSettings
 from evolution.episodes.rollout import Limits, trajectory
 from evolution.networks import convnet
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import STEERING
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import build
 
 SMALL = EvolveSettings(scenario="curved", population=32, generations=2, seed=3)
@@ -124,7 +125,7 @@ def test_bad_champions_are_refused(champion, tmp_path):
         evaluate(champion, "moon")
     with pytest.raises(ValueError, match="1 or more"):
         evaluate(champion, episodes=0)
-    with pytest.raises(SettingsError):
+    with pytest.raises(GridSimError, match="--elites must be"):
         evolve(EvolveSettings(population=4, elites=8, recombination="two"))
 
 

@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cluster.runs.settings import DqnSettings, SettingsError
+from cluster.runs.settings import DqnSettings
 from cluster.training import dqn as dqn_loop
 from cluster.training.dqn import Dqn
 from cluster.training.trainer import Maps
 from cluster.workers.pool import Chunk, Collected, PoolError, SerialPool
 from cluster.workers.worker import Worker
 from gridsim.config import SimConfig
+from gridsim.errors import GridSimError
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -126,7 +127,7 @@ def test_no_batch_is_begun_beyond_a_bound(loop, bound):
     ],
 )
 def test_settings_that_no_run_can_have(changes, words):
-    with pytest.raises(SettingsError, match=f"^{words}"):
+    with pytest.raises(GridSimError, match=f"^{words}"):
         DqnSettings(**changes).check()
 
 

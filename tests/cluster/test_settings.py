@@ -4,8 +4,9 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from cluster.runs.settings import DqnSettings, EvolveSettings, SettingsError, from_dict
+from cluster.runs.settings import DqnSettings, EvolveSettings, from_dict
 from evolution.search.base import SearchConfig
+from gridsim.errors import GridSimError
 
 POLICIES = {
     "mlp:64+steering": EvolveSettings("city", traffic=0),
@@ -42,7 +43,7 @@ def test_what_a_file_does_not_say_is_as_by_default():
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(change, said):
-    with pytest.raises(SettingsError, match=said):
+    with pytest.raises(GridSimError, match=said):
         from_dict(EvolveSettings, asdict(EvolveSettings()) | change)
 
 
@@ -103,5 +104,5 @@ def test_there_are_no_more_groups_than_members_for_them(population, groups):
     ],
 )
 def test_settings_that_make_no_sense_are_refused_in_one_line(wrong, said):
-    with pytest.raises(SettingsError, match=rf"^[^\n]*{said}[^\n]*$"):
+    with pytest.raises(GridSimError, match=rf"^[^\n]*{said}[^\n]*$"):
         EvolveSettings(**wrong).check()

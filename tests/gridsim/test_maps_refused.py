@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import crashes, picture, save, strip
 
-from cluster.runs.settings import EvolveSettings, SettingsError, from_dict
+from cluster.runs.settings import EvolveSettings, from_dict
 from gridsim.errors import GridSimError
 from gridsim.maps.files import MAX_PIXELS, load_map
 
@@ -26,7 +26,7 @@ def refused(name):
     message = str(caught.value)
     assert "\n" not in message
     assert len(message) < 600
-    with pytest.raises(SettingsError):
+    with pytest.raises(GridSimError):
         from_dict(EvolveSettings, {"scenario": str(name)})
     return message
 
