@@ -26,8 +26,6 @@ MAX_REPLAY = 10_000_000
 LEAST_GROUP = 16  # members of a group, so that its best are good
 MAX_STEPS = 10**15  # car-steps or episodes
 MAX_UPDATES = 1_000_000  # for each thousand car-steps
-# Evolution's default budgets.
-CAR_STEPS, CAR_STEPS_IN_TRAFFIC = 30_000_000, 60_000_000
 
 IN_WORDS = tyro.conf.arg(help_behavior_hint="")
 """For flags whose help describes the default in words."""
@@ -186,7 +184,7 @@ class EvolveSettings(RunSettings):
 
     def default_car_steps(self) -> int:
         """Used if neither generations nor car-steps are given."""
-        return CAR_STEPS_IN_TRAFFIC if self.traffic else CAR_STEPS
+        return 60_000_000 if self.traffic else 30_000_000
 
     @property
     def algorithm(self) -> str:
