@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from gridsim.car.ego import SPEED, X, Y
 from gridsim.maps.map import Map
@@ -160,9 +160,7 @@ def comparison(groups: Sequence[Group], path: Path) -> None:
 
 def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
     """How well a champion drives on roads it never saw."""
-    table = Table(title=title, title_justify="left", show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
+    table = Table("", Column(justify="right"), title=title, title_justify="left", show_header=False)
     table.add_row("episodes", f"{figures['episodes']:.0f}")
     table.add_row("success (2,000 m without a collision)", f"{figures['success_rate']:.1%}")
     table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
@@ -174,9 +172,8 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
 
 def errors_table(title: str, figures: Mapping[str, float]) -> Table:
     """Velocity and steering errors, as from `gridsim.reference.errors.errors`."""
-    table = Table("", "mean", "max", title=title, title_justify="left")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    numbers = Column("mean", justify="right"), Column("max", justify="right")
+    table = Table("", *numbers, title=title, title_justify="left")
     for head, mean, largest, digits in (
         ("velocity error, m/s", "velocity_mean_mps", "velocity_max_mps", 2),
         ("  % of the reference's mean speed", "velocity_mean_percent", "velocity_max_percent", 1),
