@@ -92,9 +92,8 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     axis.set_facecolor(_WALL)
     axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
     axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
-    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m")
-    left, right, low, high = bounds(scenario)
-    axis.set(xlim=(left, right), ylim=(low, high))
+    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=title)
+    axis.axis(bounds(scenario))
     points = states[:, [X, Y]].astype(np.float64)
     steps = np.stack([points[:-1], points[1:]], axis=1)
     near = np.abs(points[1:] - points[:-1]).max(axis=1) < min(width, height) / 2
@@ -105,7 +104,6 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     axis.plot(*points[0], marker="o", color="#2f9e44", markersize=9, markeredgecolor="white", label="start")
     axis.plot(*points[-1], marker="s", color="#e03131", markersize=8, markeredgecolor="white", label="end")
     axis.legend(loc="upper right")
-    axis.set_title(title)
     figure.colorbar(lines, ax=axis, shrink=0.8, label="speed, m/s")
     figure.savefig(path, dpi=100)
 
