@@ -108,7 +108,6 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig
         # Centre x, y (m) and half of the dash dx, dy (m).
         "marks": np.stack([x, y, half * cosine, half * sine], axis=1).round(2).tolist(),
         "picture": base64.b64encode(_picture(road_map)).decode(),
-        "first": 0 if together else len(shown) - 1,
         "together": together,
         "drives": [each.packed() for each in shown],
     }

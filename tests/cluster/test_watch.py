@@ -136,7 +136,7 @@ def test_a_page_of_several_champions_begins_with_all_of_them(tmp_path, monkeypat
         (found,) = re.findall(r'type="application/json">(.*)</script>', (tmp_path / page).read_text())
         data = json.loads(found)
         assert [each["short"] for each in data["drives"]] == marks
-        assert (data["together"], data["first"]) == (len(sources) > 1, 0)
+        assert data["together"] == (len(sources) > 1)
 
 
 def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
