@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Mapping
@@ -325,13 +324,12 @@ def check_workers(workers: int, address: str, patience_s: float) -> None:
 
 def from_dict(kind: type[S], values: dict[str, Any]) -> S:
     """Settings from what `dataclasses.asdict` made of them. Raises GridSimError for names or types that do not fit."""
-    fields = {f.name: f for f in dataclasses.fields(kind)}
-    unknown = sorted(set(values) - set(fields))
+    usual = vars(kind())
+    unknown = sorted(values.keys() - usual.keys())
     if unknown:
         raise GridSimError(f"unknown setting {unknown[0]!r}, perhaps of another version of GridSim; start a new run")
-    defaults = kind()
     for name, value in values.items():
-        wanted = type(getattr(defaults, name))
+        wanted = type(usual[name])
         if wanted is float and isinstance(value, int) and not isinstance(value, bool):
             value = values[name] = float(value)
         if type(value) is not wanted:
