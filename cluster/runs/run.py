@@ -30,7 +30,6 @@ from gridsim.maps.scenarios import is_map_file, label
 
 HISTORY, ELITES, SUMMARY, PAGE = "history.csv", "elites.npz", "summary.json", "drive.html"
 CONFIG_FORMAT = 2
-OLD_FORMATS = (1,)  # GridSim 0.1: other searches, other parameters
 
 
 class RunError(GridSimError):
@@ -86,7 +85,7 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
         form = config.get("format")
-        if form in OLD_FORMATS:
+        if form == 1:
             raise RunError(f"{path} is of a run of GridSim 0.1, which this version cannot continue; start a new run")
         if form != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim; start a new run")
