@@ -1,9 +1,4 @@
-"""Champions: how they are saved, and what you can do with one: load it, drive it, evaluate it.
-
->>> champion = load_champion("runs/NAME")  # doctest: +SKIP
->>> env = champion.make_env()  # doctest: +SKIP
->>> evaluate(champion, "seamless", episodes=64)  # doctest: +SKIP
-"""
+"""Champions: how they are saved, and what you can do with one: load it, drive it, evaluate it."""
 
 from __future__ import annotations
 

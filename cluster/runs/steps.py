@@ -1,9 +1,8 @@
-"""What is kept of each step of a run, its row of the history and its elite, in a file that grows with the run.
+"""The row of the history and the elite of each step of a run, in a file that grows with the run.
 
-The checkpoint holds only the number of these records and their digest, and so is as small after thousands of steps as
-after the first. Records are on the disk before the checkpoint that counts them: any that a kill leaves uncounted are
-cut off when the run is resumed, and made again. When a run ends, its history moves into the checkpoint and its elites
-into elites.npz, and the file is deleted.
+The checkpoint holds only the number of these records and their digest. Records are on the disk before the checkpoint
+that counts them: any that a kill leaves uncounted are cut off when the run is resumed, and made again. When a run ends,
+its history moves into the checkpoint and its elites into elites.npz, and the file is deleted.
 """
 
 from __future__ import annotations
