@@ -16,9 +16,8 @@ from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointErro
 from cluster.runs.run import read_config
 from cluster.runs.settings import MAX_TRAFFIC, EvolveSettings
 from cluster.training.trainer import summarise
+from evolution.episodes import rollout
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
-from evolution.episodes.rollout import Limits
-from evolution.episodes.rollout import evaluate as roll_out
 from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
 from evolution.networks.policy import CnnSpec, PolicySpec, act_on
@@ -170,8 +169,8 @@ def evaluate(
     """
     chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
     spec, sim, genomes = PolicySpec.parse(champion.policy), champion.sim, champion.genome[None]
-    limits = Limits(sim.episode.target, sim.episode.steps)
-    results = roll_out(spec, genomes, roads, chosen.rows, limits, sim, worlds=chosen.worlds)[0]
+    limits = rollout.Limits(sim.episode.target, sim.episode.steps)
+    results = rollout.evaluate(spec, genomes, roads, chosen.rows, limits, sim, worlds=chosen.worlds)[0]
     return summarise(results[0], sim.episode.control_period)
 
 
