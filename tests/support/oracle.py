@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -219,17 +218,6 @@ def _in_annular_sector(p: np.ndarray, d: np.ndarray, arcs: np.ndarray) -> list[t
 # --- The car ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Car:
-    """A car and its books."""
-
-    x: float
-    y: float
-    heading: float  # rad
-    speed: float  # m/s
-    steering: float  # rad
-
-
 def act(config: SimConfig, action: int, speed: float, steering: float) -> tuple[float, float]:
     """(acceleration m/s2, steering rad after the period) of one of the paper's eight actions, in its order:
     accelerate, left, right, brake, none, accelerate-left, accelerate-right, reverse."""
@@ -275,64 +263,49 @@ def on_arc(config: SimConfig, x: float, y: float, heading: float, kappa: float, 
     )
 
 
-def advance(config: SimConfig, car: Car, acceleration: float) -> tuple[Car, np.ndarray]:
-    """One control period with the car's present steering.
+def advance(
+    config: SimConfig, x: float, y: float, heading: float, speed: float, steering: float, acceleration: float
+) -> np.ndarray:
+    """One control period.
 
-    Returns: (car afterwards, the moments at which its outline is looked at, [n, 5]: x, y, heading, speed, m driven);
-    the last of them is the end of the period.
+    Returns: the moments at which the car's outline is looked at, [n, 5]: x, y, heading, speed, m driven; the last of
+    them is the end of the period.
     """
     dt = config.episode.control_period
-    kappa = curvature(config, car.speed, car.steering)
-    fastest = max(abs(car.speed), abs(car.speed + acceleration * dt))
+    kappa = curvature(config, speed, steering)
+    fastest = max(abs(speed), abs(speed + acceleration * dt))
     n = math.floor(fastest * dt / CHECK_EVERY) + 1
     looks = []
     for k in range(1, n + 1):
-        s, speed = path_length(config, car.speed, acceleration, dt * k / n)
-        looks.append((*on_arc(config, car.x, car.y, car.heading, kappa, s), speed, s))
-    return Car(*looks[-1][:4], car.steering), np.array(looks)
+        s, after = path_length(config, speed, acceleration, dt * k / n)
+        looks.append((*on_arc(config, x, y, heading, kappa, s), after, s))
+    return np.array(looks)
 
 
 # --- The episode -----------------------------------------------------------------------------------------------------
 
 
-@dataclass
 class Books:
-    """New ground, and when an episode ends. A square driven again within `revisit` metres of driving counts nothing;
-    metres reversed are owed, and paid before anything counts again."""
+    """New ground. A square driven again within `revisit` metres of driving counts nothing; metres reversed are owed,
+    and paid before anything counts again."""
 
-    config: SimConfig
-    width: float
-    height: float
-    interval: tuple[float, float]  # m/s, within which speed counts
-    target: float
-    max_steps: int
-    distance: float = 0.0
-    paced: float = 0.0
-    odometer: float = 0.0
-    owed: float = 0.0
-    idle: int = 0
-    steps: int = 0
-    square: tuple[int, int] | None = None
-    fresh: bool = True
-    last_seen: dict[tuple[int, int], float] = field(default_factory=dict)
-
-    def begin(self, x: float, y: float) -> None:
-        """The square of the start is new ground."""
-        self.square = self._square(x, y)
-        self.last_seen[self.square] = 0.0
+    def __init__(self, config: SimConfig, road: ExactRoad, interval: tuple[float, float], x: float, y: float):
+        """Speed counts within the interval (m/s); the square of the start is new ground."""
+        self.episode, self.interval, self.sides = config.episode, interval, (road.width, road.height)
+        self.distance = self.paced = self.odometer = self.owed = 0.0
+        self.idle, self.fresh, self.square = 0, True, self._square(x, y)
+        self.last_seen = {self.square: 0.0}
 
     def _square(self, x: float, y: float) -> tuple[int, int]:
-        return int(x % self.width // SQUARE), int(y % self.height // SQUARE)
+        return int(x % self.sides[0] // SQUARE), int(y % self.sides[1] // SQUARE)
 
-    def enter(self, x: float, y: float, speed: float, moved: float, crashed: bool) -> str:
-        """Book one control step that moved the car to (x, y); how the episode stands: "" or its end's name."""
-        episode = self.config.episode
-        self.steps += 1
+    def enter(self, x: float, y: float, speed: float, moved: float) -> None:
+        """Book one control step that moved the car to (x, y)."""
         self.odometer += abs(moved)
         square = self._square(x, y)
         if square != self.square:
             ago = self.odometer - self.last_seen.get(square, -math.inf)
-            if ago > episode.revisit:
+            if ago > self.episode.revisit:
                 self.fresh = True
             elif ago > SAME_VISIT:
                 self.fresh = False
@@ -348,28 +321,7 @@ class Books:
         self.distance += gained
         if self.interval[0] <= speed <= self.interval[1]:
             self.paced += gained
-        self.idle = self.idle + 1 if gained < episode.progress else 0
-        if crashed:
-            return "COLLISION"
-        if self.idle >= episode.patience:
-            return "IDLE"
-        if self.distance >= self.target:
-            return "SUCCESS"
-        if self.steps >= self.max_steps:
-            return "TIME"
-        return ""
-
-
-@dataclass
-class Drive:
-    """An episode as the oracle saw it; arrays have a row a control step."""
-
-    pose: np.ndarray  # float64 [n, 3]: x, y, heading, not wrapped over the torus
-    speed: np.ndarray
-    steering: np.ndarray
-    distance: np.ndarray
-    paced: np.ndarray
-    end: str  # name of End; "RUNNING" when the actions ran out
+        self.idle = self.idle + 1 if gained < self.episode.progress else 0
 
 
 def drive(
@@ -380,30 +332,39 @@ def drive(
     actions: np.ndarray,
     target: float,
     max_steps: int,
-) -> Drive:
-    """Drive a whole episode from start (x, y, heading, speed, steering) under given actions."""
-    car = Car(*map(float, start))
-    steps, steering = [], []
+) -> tuple[np.ndarray, str]:
+    """Drive a whole episode from start (x, y, heading, speed, steering) under given actions.
+
+    Returns: a row a control step, float64 [n, 7]: x, y (not wrapped over the torus), heading, speed, steering,
+    distance, distance at a speed within the interval; and the name of its End, "RUNNING" if the actions ran out.
+    """
+    x, y, heading, speed, steering = map(float, start)
+    books = Books(config, road, interval, x, y)
+    steps, angles = [], []
     for action in actions:
-        acceleration, angle = act(config, int(action), car.speed, car.steering)
-        car, looks = advance(config, replace(car, steering=angle), acceleration)
-        steps.append(looks)
-        steering.append(angle)
+        acceleration, steering = act(config, int(action), speed, steering)
+        steps.append(advance(config, x, y, heading, speed, steering, acceleration))
+        x, y, heading, speed = map(float, steps[-1][-1, :4])
+        angles.append(steering)
     every = np.concatenate(steps)
     on_road = road.outline_on_road(every[:, :3], config.vehicle.length / 2, config.vehicle.width / 2)
-    books = Books(config, road.width, road.height, interval, target, max_steps)
-    books.begin(float(start[0]), float(start[1]))
-    rows, end, at = [], "", 0
-    for looks, angle in zip(steps, steering, strict=True):
-        off = np.flatnonzero(~on_road[at : at + len(looks)])
-        at += len(looks)
-        x, y, heading, speed, driven = looks[off[0] if off.size else -1]
-        end = books.enter(x, y, speed, driven, bool(off.size))
+    each_on = np.split(on_road, np.cumsum([len(looks) for looks in steps[:-1]]))
+    rows, end = [], "RUNNING"
+    for looks, on, angle in zip(steps, each_on, angles, strict=True):
+        x, y, heading, speed, driven = looks[-1 if on.all() else on.argmin()]
+        books.enter(x, y, speed, driven)
         rows.append((x, y, heading, speed, angle, books.distance, books.paced))
-        if end:
+        if not on.all():
+            end = "COLLISION"
+        elif books.idle >= config.episode.patience:
+            end = "IDLE"
+        elif books.distance >= target:
+            end = "SUCCESS"
+        elif len(rows) >= max_steps:
+            end = "TIME"
+        if end != "RUNNING":
             break
-    table = np.array(rows)
-    return Drive(table[:, :3], table[:, 3], table[:, 4], table[:, 5], table[:, 6], end or "RUNNING")
+    return np.array(rows), end
 
 
 # --- Other cars ------------------------------------------------------------------------------------------------------
