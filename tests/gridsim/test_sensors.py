@@ -36,42 +36,35 @@ def random_points(exact, n, rng, margin=0.0, side=SIDE):
     return points[:n]
 
 
-class Views:
-    """Poses on the road of one map, what the kernel sees there, and what is there."""
-
-    def __init__(self, seed, count=2500):
-        self.scenario = build("seamless", seed)
-        self.exact = oracle.ExactRoad(self.scenario.strips, SIDE, SIDE)
+@pytest.fixture(scope="module")
+def places():
+    """Of each of four maps: its road, the exact one, and on it 2,500 points [n, 2] with headings [n]."""
+    found = []
+    for seed in range(4):
+        scenario = build("seamless", seed)
+        exact = oracle.ExactRoad(scenario.strips, SIDE, SIDE)
         rng = np.random.default_rng(1000 + seed)
-        self.points = random_points(self.exact, count, rng)
-        self.headings = rng.uniform(-math.pi, math.pi, count).astype(F)
-        self.angles = self.headings[:, None].astype(float) + RAYS
-        self.seen = look(self.scenario.road, self.points, self.headings).astype(float)
-        self.true = self.exact.cast(self.points, self.angles, REACH)
+        points = random_points(exact, 2500, rng)
+        found.append((scenario.road, exact, points, rng.uniform(-math.pi, math.pi, len(points)).astype(F)))
+    return found
 
 
-@pytest.fixture(scope="module")
-def views():
-    return [Views(seed) for seed in range(4)]
-
-
-@pytest.fixture(scope="module")
-def scenario(views):
-    return views[0].scenario
-
-
-def test_rays_are_those_of_the_exact_geometry(views):
+def test_rays_are_those_of_the_exact_geometry(places):
     """10,000 poses: any place on the road, any heading."""
-    seen, true = (np.concatenate([getattr(v, name) for v in views]) for name in ("seen", "true"))
+    ranges = [look(road, points, headings).astype(float) for road, _, points, headings in places]
+    exact_ranges = [exact.cast(points, headings[:, None] + RAYS, REACH) for _, exact, points, headings in places]
+    seen, true = np.concatenate(ranges), np.concatenate(exact_ranges)
     error = np.abs(seen - true)
     assert np.quantile(error, 0.5) <= 0.03
     assert np.quantile(error, 0.99) <= 0.2
     assert seen.min() >= 0.0
     assert seen.max() == REACH
     # A ray far off is one that grazes an edge: the road 10 cm narrower or wider explains it.
-    exact, inner = views[0].exact, np.flatnonzero(views[0].exact.clearance(views[0].points) > 0.15)[:1000]
-    low, high = (exact.widened(by).cast(views[0].points[inner], views[0].angles[inner], REACH) for by in (-0.1, 0.1))
-    assert ((views[0].seen[inner] < low - 0.2) | (views[0].seen[inner] > high + 0.2)).mean() < 0.003
+    _, exact, points, headings = places[0]
+    inner = np.flatnonzero(exact.clearance(points) > 0.15)[:1000]
+    angles = headings[inner, None] + RAYS
+    low, high = (exact.widened(by).cast(points[inner], angles, REACH) for by in (-0.1, 0.1))
+    assert ((ranges[0][inner] < low - 0.2) | (ranges[0][inner] > high + 0.2)).mean() < 0.003
 
 
 def test_the_first_ray_is_the_rightmost():
@@ -141,11 +134,12 @@ def test_an_empty_world_and_a_full_one():
 
 
 @pytest.mark.parametrize(("rays", "view"), [(2, 120.0), (32, 60.0), (33, 200.0), (64, 240.0)])
-def test_any_number_of_rays(scenario, views, rays, view):
+def test_any_number_of_rays(places, rays, view):
     k = constants(SimConfig(sensors=SensorConfig(rays=rays, field_of_view=view)))
-    points, headings = views[0].points[:300], views[0].headings[:300]
-    seen = look(scenario.road, points, headings, k, rays)
+    road, exact, points, headings = places[0]
+    points, headings = points[:300], headings[:300]
+    seen = look(road, points, headings, k, rays)
     angles = headings[:, None] + np.radians(np.linspace(-view / 2, view / 2, rays))
-    error = np.abs(seen - views[0].exact.cast(points, angles, REACH))
+    error = np.abs(seen - exact.cast(points, angles, REACH))
     assert np.quantile(error, 0.5) <= 0.03
     assert np.quantile(error, 0.97) <= 0.2
