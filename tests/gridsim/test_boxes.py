@@ -45,12 +45,6 @@ def _cast(k, rays, side, poses, worlds, ranges):
 
 
 @njit
-def _closing(k, rays, side, speed, world, ranges, closing):
-    velocity = speed, F(0.0)
-    cast_boxes(k, rays, side, side, F(10.0), F(10.0), F(1.0), F(0.0), velocity, world, ranges, closing)
-
-
-@njit
 def _hits(k, poses, worlds, hits):
     for i in range(len(poses)):
         x, y, cosine, sine = poses[i]
@@ -66,30 +60,6 @@ def cast(poses, worlds, reach=50.0):
 
 
 # --- Rays ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("heading", "speed", "expected"),
-    [
-        (math.pi, 7.0, 12.0),  # comes towards us
-        (0.0, 7.0, -2.0),  # drives away
-        (0.0, 0.0, 5.0),  # stands
-        (math.pi / 2, 7.0, 5.0),  # crosses
-    ],
-)
-def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(heading, speed, expected):
-    """Head on, at 5 m/s; along the ray, so that only the middle one has the speeds' plain sum."""
-    world = parked((21.0, 10.0, heading))
-    world[0, SPEED] = speed
-    ranges, closing = np.full(31, 50.0, dtype=F), np.full(31, 99.0, dtype=F)
-    _closing(K, RAYS, F(SIDE), F(5.0), world, ranges, closing)
-    assert closing[15] == pytest.approx(expected, abs=1e-5)
-    velocity = speed * np.array([math.cos(heading), math.sin(heading)])
-    rays = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
-    met = ranges < 50.0
-    assert 1 < met.sum() < 10
-    assert closing[met] == pytest.approx(((np.array([5.0, 0.0]) - velocity) @ rays[met].T), abs=1e-4)
-    assert (closing[~met] == 0.0).all(), "the road's edge has no motion"
 
 
 def test_rays_are_the_oracles():
@@ -226,19 +196,32 @@ def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
             assert -0.01 <= car[X] - meeting < 0.5
 
 
-@pytest.mark.parametrize(("speed", "steering"), [(8.0, 0.1), (8.0, -0.4), (20.0, 0.3), (-2.0, 0.4)])
-def test_closing_speeds_are_of_the_sensor_which_a_turning_car_moves_sideways(cross, speed, steering):
-    """Of a parked car: how far the middle of the front axle moves along each ray, by finite differences."""
+@pytest.mark.parametrize(("speed", "steering"), [(5.0, 0.0), (8.0, 0.1), (8.0, -0.4), (20.0, 0.3), (-2.0, 0.4)])
+@pytest.mark.parametrize(
+    ("heading", "pace"),
+    [
+        (math.pi, 7.0),  # comes towards us
+        (0.0, 7.0),  # drives away
+        (0.0, 0.0),  # stands
+        (math.pi / 2, 7.0),  # crosses
+    ],
+)
+def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, steering, heading, pace):
+    """By finite differences of the middle of the front axle, which a turning car moves sideways."""
     simulator = Simulator([cross], 1, CONFIG, traffic=1)
-    start = np.array([[100.0, 128.0, 0.0, speed, steering]], dtype=F)
-    ranges, _ = simulator.reset(start, worlds=on_lane(0, 140.0, 0.0, (SIDE - 140.0, 128.0, math.pi))[None])
+    world = parked((116.0, 128.0, heading))
+    world[0, SPEED] = pace
+    simulator.closing[:] = 99.0
+    ranges, _ = simulator.reset(np.array([[100.0, 128.0, 0.0, speed, steering]]), worlds=world[None])
     kappa, step = oracle.curvature(CONFIG, speed, steering), 1e-4
     poses = [oracle.on_arc(CONFIG, 0.0, 0.0, 0.0, kappa, way) for way in (-step * speed, step * speed)]
     before, after = (np.array([x + 1.25 * math.cos(turn), y + 1.25 * math.sin(turn)]) for x, y, turn in poses)
+    velocity = (after - before) / (2 * step) - pace * np.array([math.cos(heading), math.sin(heading)])
     rays = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
     met = (ranges[0] < 15.0) & (np.abs(ANGLES) < math.radians(9.0))
     assert met.sum() >= 3
-    assert simulator.closing[0][met] == pytest.approx(rays[met] @ (after - before) / (2 * step), abs=1e-3)
+    assert simulator.closing[0][met] == pytest.approx(rays[met] @ velocity, abs=1e-3)
+    assert (simulator.closing[0][~met] == 0.0).all(), "the road's edge has no motion"
 
 
 @pytest.mark.parametrize("offset", [-2.8, 0.0, 2.8])
