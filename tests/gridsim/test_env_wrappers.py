@@ -10,7 +10,6 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from driving import drive
 from gymnasium.wrappers import RecordVideo
 from gymnasium.wrappers import vector as wrappers
 
@@ -94,30 +93,6 @@ def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_pa
 
 
 # --- other wrappers
-
-
-def test_vector_wrappers_of_what_is_known_of_episodes() -> None:
-    """Statistics are right, infos become lists, and torch takes all of them."""
-    made: list[Any] = [gymnasium.make_vec("GridSim/City-v0", num_envs=3, maps=1, max_episode_steps=30) for _ in "12"]
-    env, plain = wrappers.DictInfoToList(wrappers.RecordEpisodeStatistics(made[0])), made[1]
-    env.reset(seed=3)
-    plain.reset(seed=3)
-    returns, lengths, counted = np.zeros(3), np.zeros(3, dtype=int), 0
-    over = np.zeros(3, dtype=bool)
-    for row in drive(plain.unwrapped, 150, seed=4):
-        *_, infos = env.step(row)
-        _, rewards, terminations, truncations, info = plain.step(row)
-        returns, lengths = np.where(over, 0.0, returns + rewards), np.where(over, 0, lengths + 1)
-        over = terminations | truncations
-        assert [each["distance_m"] for each in infos] == info["distance_m"].tolist()
-        assert [each["end"] for each in infos] == torch.from_numpy(info["end"]).tolist()
-        for k in range(3):
-            assert ("episode" in infos[k]) == over[k]
-            if over[k]:
-                assert infos[k]["episode"]["r"] == pytest.approx(returns[k], abs=1e-4)
-                assert infos[k]["episode"]["l"] == lengths[k]
-                counted += 1
-    assert counted > 9
 
 
 @pytest.mark.parametrize("observation", ["rays", "grid"])
