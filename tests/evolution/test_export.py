@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
 from cluster.runs.champion import Champion
 from evolution.networks.export import example, to_torch
 from evolution.networks.policy import CnnSpec, MlpSpec, PolicySpec
 from gridsim.config import SensorConfig, SimConfig, VehicleConfig
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
-
-torch = pytest.importorskip("torch")
 
 F = np.float32
 TEXTS = ["mlp:6,7", "mlp:9", "mlp:6,7+steering", "mlp:12,9,5+motion", "mlp:6,7+motion+steering", "cnn:8,16,32@1",
