@@ -117,24 +117,15 @@ def test_after_every_add_it_holds_what_the_textbook_holds(adds, capacity, spec):
                 break
 
 
-def filled():
-    """A replay whose ring has gone round: rows of four episodes, the oldest cut."""
+def test_draws_are_uniform_and_each_key_has_its_own():
+    """Of a ring that has gone round: rows of four episodes, the oldest cut."""
     replay, first = Replay(RAYS, 64, 0.9), 0
     for steps in (29, 1, 2, 54):
         replay.add(episode(np.arange(steps) % 5, End.TIME, first))
         first += steps + 1
-    return replay
-
-
-def test_draws_are_uniform():
-    replay = filled()
     counts = np.unique(numbers(replay.sample(11, 60_000).observations), return_counts=True)[1]
     assert len(counts) == replay.transitions < replay.capacity
     assert stats.chisquare(counts).pvalue > 0.001
-
-
-def test_other_keys_draw_others_and_the_same_key_the_same():
-    replay = filled()
     drawn = [numbers(replay.sample(key, 16).observations).tolist() for key in (0, 1, 2, 1, 2**64 - 1)]
     assert drawn[1] == drawn[3]
     assert len({tuple(rows) for rows in drawn}) == 4
