@@ -1,9 +1,9 @@
 """Collecting: the fused loop against `Simulator`, step by step; nothing lost, nothing mixed up."""
 
 import math
+from collections import namedtuple
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,7 +18,6 @@ from gridsim.car.ego import STEERING, End
 from gridsim.car.reward import reward
 from gridsim.config import SimConfig, constants
 from gridsim.envs.simulator import Simulator
-from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
 
@@ -29,25 +28,8 @@ LIMITS = Limits(120.0, 150)
 POLICIES = ["mlp:6,7", "mlp:9+motion", "mlp:5+steering", "mlp:5+motion+steering", "cnn:8,8,16@3"]
 
 
-class Asked(NamedTuple):
-    """The arguments of `collect`, in its order."""
-
-    spec: PolicySpec
-    weights: np.ndarray
-    scenarios: list[Map]
-    episodes: np.ndarray
-    epsilons: np.ndarray
-    keys: np.ndarray
-    limits: Limits
-    config: SimConfig
-    worlds: np.ndarray
-
-    def only(self, which: list[int]) -> "Asked":
-        """The same for some episodes."""
-        rows = np.array(which, dtype=int)
-        return self._replace(**{name: getattr(self, name)[rows] for name in ("episodes", "epsilons", "keys", "worlds")})
-
-
+# The arguments of `collect`, in its order.
+Asked = namedtuple("Asked", "spec weights scenarios episodes epsilons keys limits config worlds")
 Asking = Callable[[str, int, float, int], Asked]
 
 
@@ -66,6 +48,12 @@ def ask(root: Path) -> Asking:
         return Asked(spec, weights, scenarios, episodes, np.full(n, epsilon, F), keys, LIMITS, CONFIG, worlds)
 
     return make
+
+
+def only(of: Asked, which: list[int]) -> Asked:
+    """The same for some episodes."""
+    rows = np.array(which, dtype=int)
+    return of._replace(**{name: getattr(of, name)[rows] for name in ("episodes", "epsilons", "keys", "worlds")})
 
 
 def cut_up(experience: Experience) -> Iterator[Experience]:
@@ -166,17 +154,17 @@ def test_an_episode_depends_on_itself_alone(ask: Asking) -> None:
     of = ask("mlp:6,7", 12, 0.0, CARS)
     of.epsilons[:] = np.linspace(0.0, 1.0, 12)
     whole, results = collect(*of)
-    singles = [collect(*of.only([k])) for k in range(12)]
+    singles = [collect(*only(of, [k])) for k in range(12)]
     assert to_bytes(join([x for x, _ in singles])) == to_bytes(whole)
     assert np.concatenate([r for _, r in singles]).tobytes() == results.tobytes()
     order = np.random.default_rng(0).permutation(12).tolist()
-    turned, _ = collect(*of.only(order))
+    turned, _ = collect(*only(of, order))
     assert to_bytes(turned) == to_bytes(join([singles[k][0] for k in order]))
     others = collect(*of._replace(keys=of.keys + np.uint64(1)))[0]
     changed = [to_bytes(a) != to_bytes(b) for a, b in zip(cut_up(whole), cut_up(others), strict=True)]
     assert not changed[0], "nothing is drawn for epsilon 0"
     assert all(changed[3:])
-    assert [len(array) for array in (*collect(*of.only([]))[0], collect(*of.only([]))[1])] == [0] * 5
+    assert [len(array) for array in (*collect(*only(of, []))[0], collect(*only(of, []))[1])] == [0] * 5
 
 
 # --- What is refused -------------------------------------------------------------------------------------------------
