@@ -42,22 +42,17 @@ def test_cars_spawn_uniformly_over_the_lanes_outside_junctions(scenario):
 
 @pytest.mark.parametrize("scenario", REGISTRY)
 def test_spawned_cars_keep_their_distance(scenario):
-    network = build(scenario, 2).network
-    rng = np.random.default_rng(0)
+    road_map = build(scenario, 2)
+    network, rng = road_map.network, np.random.default_rng(0)
     starts = np.zeros((40, 5), dtype=F)
     starts[:, :2] = network.points[rng.integers(len(network.points), size=40)] % [network.width, network.height]
     worlds = spawn(network, starts, 12, np.arange(40, dtype=np.uint64), CONFIG).astype(float)
-    sides = np.array([network.width, network.height], dtype=float)
     for world, start in zip(worlds, starts, strict=True):
         here = world[world[:, LANE] >= 0][:, [X, Y]]
         assert len(here) >= 8
-
-        def apart(a, b):
-            return np.hypot(*(np.abs((a - b + sides / 2) % sides - sides / 2)).T)
-
-        assert apart(here, start[:2]).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
+        assert np.hypot(*road_map.shortest(here - start[:2]).T).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
         for k in range(1, len(here)):
-            assert apart(here[:k], here[k]).min() >= CONFIG.traffic.spawn_gap - 1e-3
+            assert np.hypot(*road_map.shortest(here[:k] - here[k]).T).min() >= CONFIG.traffic.spawn_gap - 1e-3
 
 
 def test_the_same_key_gives_the_same_world_in_any_company():
