@@ -128,9 +128,10 @@ def test_all_contacts_are_found(vehicle):
     other[:10_000, 2] = one[:10_000, 2]
     hits = np.zeros(n, dtype=bool)
     poses = np.column_stack([one[:, :2], np.cos(one[:, 2]), np.sin(one[:, 2])]).astype(F)
+    a, b = vehicle.length / 2, vehicle.width / 2
     _hits(constants(config), poses, parked(*np.column_stack([other[:, :2] % SIDE, other[:, 2]]))[:, None], hits)
     smaller, larger = (
-        outlines_meet(*(oracle.corners(config, pose.astype(float), margin) for pose in (one, other)))
+        outlines_meet(*(oracle.corners(pose.astype(float), a + margin, b + margin) for pose in (one, other)))
         for margin in (-1e-3, 1e-3)
     )
     assert hits[smaller].all()

@@ -131,7 +131,7 @@ class ExactRoad:
         Each side is a ray from one corner to the next: the outline is on the road if all four arrive.
         """
         poses = np.asarray(poses, dtype=np.float64)
-        on, corner = np.ones(len(poses), dtype=bool), _outline(poses, half_length, half_width)
+        on, corner = np.ones(len(poses), dtype=bool), corners(poses, half_length, half_width)
         for k in range(4):  # counter-clockwise, from the front right
             side = 2 * (half_width, half_length)[k % 2]
             angle = poses[:, 2] + (k + 1) * math.pi / 2
@@ -370,13 +370,8 @@ def drive(
 # --- Other cars ------------------------------------------------------------------------------------------------------
 
 
-def corners(config: SimConfig, poses: np.ndarray, margin: float = 0.0) -> np.ndarray:
-    """Corners [n, 4, 2], counter-clockwise, of cars at poses [n, 3] (x, y, heading), a margin (m) larger all round."""
-    return _outline(poses, config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin)
-
-
-def _outline(poses: np.ndarray, a: float, b: float) -> np.ndarray:
-    """Corners [n, 4, 2] of rectangles of half lengths a and half widths b (m)."""
+def corners(poses: np.ndarray, a: float, b: float) -> np.ndarray:
+    """Corners [n, 4, 2], counter-clockwise, at poses [n, 3] (x, y, heading); half length a, half width b (m)."""
     own = np.array([[a, -b], [a, b], [-a, b], [-a, -b]])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     turn = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
@@ -396,7 +391,8 @@ def rays_to_boxes(
     Each ray is intersected with each edge of each car, in this world and in those beside it; 0 from within a car.
     """
     shifts = np.array([[i * sides[0], j * sides[1], 0.0] for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    outlines = corners(config, (poses[:, None] + shifts).reshape(-1, 3), margin) - origin
+    a, b = config.vehicle.length / 2 + margin, config.vehicle.width / 2 + margin
+    outlines = corners((poses[:, None] + shifts).reshape(-1, 3), a, b) - origin
     first, edge = outlines, np.roll(outlines, -1, axis=1) - outlines
     if (_cross(edge, -first) > 0.0).all(axis=1).any():  # to the left of all four edges
         return np.zeros(len(angles))
