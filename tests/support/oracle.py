@@ -43,11 +43,9 @@ class ExactRoad:
         """A circle that holds each of lines, arcs and blocks, [3, n]: x, y, radius."""
         lines, arcs, blocks = self.lines.T, self.arcs.T, self.blocks.T
         length = np.hypot(lines[2] - lines[0], lines[3] - lines[1])
-        # A piece of a quarter turn at most lies in the circle about its middle that reaches its ends.
-        middle, size = arcs[3] + arcs[4] / 2, 2 * arcs[2] * np.sin(arcs[4] / 4) + arcs[5]
         return (
             np.stack([(lines[0] + lines[2]) / 2, (lines[1] + lines[3]) / 2, length / 2 + lines[4]]),
-            np.stack([arcs[0] + arcs[2] * np.cos(middle), arcs[1] + arcs[2] * np.sin(middle), size]),
+            np.stack([arcs[0], arcs[1], arcs[2] + arcs[5]]),
             np.stack([blocks[0], blocks[1], np.hypot(blocks[3], blocks[4])]),
         )
 
