@@ -30,10 +30,6 @@ class Driver:
         self.k, self.steering = k, F(steering)
         self.state: tuple[np.float32, ...] = (F(0.0), F(0.0), F(1.0), F(0.0), F(speed))
 
-    @property
-    def speed(self) -> float:
-        return float(self.state[4])
-
     def step(self, acceleration: float) -> None:
         kappa = path_curvature(self.k, self.state[4], self.steering)
         *state, _ = advance(self.k, *self.state, F(acceleration), kappa, self.k.dt)
@@ -56,7 +52,7 @@ def test_the_pedal_brakes_to_a_stand_and_not_further(pedal, speed):
         acceleration, _ = act_continuous(K, F(pedal), F(0.0), car.state[4], F(0.0))
         assert abs(acceleration) <= -8.0 * pedal * (1 + 1e-6)
         car.step(acceleration)
-    assert abs(car.speed) <= STILL
+    assert abs(car.state[4]) <= STILL
     assert car.state[0] * speed > 0.0
 
 
