@@ -17,7 +17,7 @@ from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.sensing.boxes import boxes_touch
+from gridsim.sensing.boxes import boxes_touch, hits_box
 from gridsim.traffic.behaviour import drivers, flow, idm
 from gridsim.traffic.world import (
     ALONG,
@@ -102,29 +102,24 @@ def ego(x, y, heading=0.0, speed=0.0):
 
 
 @njit(nogil=True)
-def _watch(network, drivers, constants, world, ego, steps, history):
-    """Let traffic flow; returns pairs that overlapped, over all steps. history [steps or 0, cars, FIELDS] is kept."""
+def _watch(network, drivers, constants, world, ego, history):
+    """Let traffic flow, kept in history [steps, cars, FIELDS]; returns how often a car overlapped another."""
     overlaps = 0
-    for step in range(steps):
+    for step in range(len(history)):
         flow(network, drivers, world, ego)
-        if len(history):
-            history[step] = world
+        history[step] = world
         for i in range(len(world)):
-            for j in range(i):
-                if world[i, LANE] >= 0.0 and world[j, LANE] >= 0.0:
-                    dx = wrapped(world[j, X] - world[i, X], network.width)
-                    dy = wrapped(world[j, Y] - world[i, Y], network.height)
-                    if dx * dx + dy * dy < constants.contact * constants.contact and boxes_touch(
-                        constants, dx, dy, world[i, COS], world[i, SIN], world[j, COS], world[j, SIN]
-                    ):
-                        overlaps += 1
+            x, y, cosine, sine = world[i, X], world[i, Y], world[i, COS], world[i, SIN]
+            width, height, dt = network.width, network.height, constants.dt
+            if world[i, LANE] >= 0.0 and hits_box(constants, world[:i], F(0.0), dt, width, height, x, y, cosine, sine):
+                overlaps += 1
     return overlaps
 
 
 def watch(network, world, seconds, ego=NOBODY, config=CONFIG):
     """States [steps, cars, FIELDS] of a world after each step; no two cars overlap in any of them."""
     history = np.zeros((round(seconds / DT), *world.shape), dtype=F)
-    assert _watch(network, drivers(config), constants(config), world.copy(), ego, len(history), history) == 0
+    assert _watch(network, drivers(config), constants(config), world.copy(), ego, history) == 0
     return history
 
 
