@@ -102,9 +102,6 @@ def test_without_exploring_it_is_evaluate(ask: Asking, policy: str, cars: int) -
     assert results["steps"].sum() > 100
 
 
-# --- Rows ------------------------------------------------------------------------------------------------------------
-
-
 def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask: Asking) -> None:
     of = ask("mlp:6,7", 60, 0.1, 0)
     of.epsilons[1::2] = 0.8
@@ -131,9 +128,6 @@ def test_a_network_without_numbers_leaves_whole_rows(ask: Asking, policy: str) -
     assert not experience.rewards.any()
     assert (results["end"] == End.IDLE).all()
     assert (results["distance"] == 0.0).all()
-
-
-# --- Exploring -------------------------------------------------------------------------------------------------------
 
 
 def test_random_actions_are_uniform_and_as_many_as_asked_for(ask: Asking) -> None:
@@ -165,9 +159,6 @@ def test_an_episode_depends_on_itself_alone(ask: Asking) -> None:
     assert not changed[0], "nothing is drawn for epsilon 0"
     assert all(changed[3:])
     assert [len(array) for array in (*collect(*only(of, []))[0], collect(*only(of, []))[1])] == [0] * 5
-
-
-# --- What is refused -------------------------------------------------------------------------------------------------
 
 
 def test_what_does_not_fit_is_refused(ask: Asking) -> None:

@@ -46,9 +46,6 @@ def replay_of_random_episodes():
     return replay
 
 
-# --- Networks --------------------------------------------------------------------------------------------------------
-
-
 def test_squash_has_the_gradient_of_tanh():
     x = torch.linspace(-6, 6, 200).reshape(20, 10)
     leaf = x.clone().requires_grad_()
@@ -56,9 +53,6 @@ def test_squash_has_the_gradient_of_tanh():
     (ours,), (theirs,) = torch.autograd.grad(y, leaf, x), torch.autograd.grad(torch.tanh(leaf), leaf, x)
     assert (ours - theirs).abs().max() < 2e-3
     assert torch.equal(tanh(x * 1.0), y)
-
-
-# --- Targets ---------------------------------------------------------------------------------------------------------
 
 
 def biased(values):
@@ -78,9 +72,6 @@ def test_targets_by_hand():
     loss, q = learner.loss(batch)
     assert q.tolist() == [0.5] * 3
     assert loss.item() == pytest.approx(np.mean([2 * (size - 1) for size in (2.5, 12.5, 7.5)]))  # Huber's
-
-
-# --- Gradients -------------------------------------------------------------------------------------------------------
 
 
 def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
@@ -104,9 +95,6 @@ def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
         assert learner.weights == pytest.approx(network.genome.numpy(), abs=1e-6)
         target = learner.weights if k == 2 else target
         assert np.array_equal(learner.state()["target"], target)
-
-
-# --- Learning --------------------------------------------------------------------------------------------------------
 
 
 def test_a_chain_of_two_states_is_learned():
@@ -164,9 +152,6 @@ def test_seeds_differ_and_repeat():
     state = torch.random.get_rng_state()
     learner_of().train(replay_of_random_episodes(), 2)
     assert torch.equal(state, torch.random.get_rng_state())
-
-
-# --- What is refused -------------------------------------------------------------------------------------------------
 
 
 def test_a_network_that_diverged_is_reported_and_left_as_it_was():

@@ -20,9 +20,6 @@ def scenario(maps):
     return maps["seamless"][0]
 
 
-# --- The oracle itself -----------------------------------------------------------------------------------------------
-
-
 def test_the_oracle_knows_a_ring_and_a_strip():
     _, ring = small_road(arcs=[[32, 32, 10, 1.0, 2 * math.pi, 3]])
     points = [[42, 32], [45, 32], [46, 32], [32, 39], [32, 38], [32, 24.5]]
@@ -37,8 +34,6 @@ def test_the_oracle_knows_a_ring_and_a_strip():
     on_road = strip.outline_on_road(np.array(poses, dtype=float), 2.0, 1.0)
     assert on_road.tolist() == [True, True, False, True, False]
 
-
-# --- The field -------------------------------------------------------------------------------------------------------
 
 inside, half_width = st.floats(0, SIDE), st.floats(0.5, 6.0)
 lines = st.tuples(inside, inside, inside, inside, half_width)
@@ -77,9 +72,6 @@ def test_the_world_is_a_torus(scenario, x, y, i, j):
 def test_sides_that_do_not_fit_are_refused(width, height):
     with pytest.raises(ValueError, match="powers of two"):
         clearance_nodes(Strips.of(), width, height)
-
-
-# --- What kernels read -----------------------------------------------------------------------------------------------
 
 
 def test_freeze_copies_only_what_it_must_and_the_callers_own_stays_writable():
