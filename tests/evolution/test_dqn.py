@@ -138,8 +138,7 @@ def test_training_may_be_cut_and_resumed_anywhere():
     resumed.restore(saved)
     resumed.train(replay, 50)
     assert resumed.updates == whole.updates == 100
-    for name, array in whole.state().items():
-        assert np.array_equal(array, resumed.state()[name]), name
+    np.testing.assert_equal(resumed.state(), whole.state())
     assert not np.array_equal(whole.weights, whole.state()["target"])
 
 
