@@ -23,11 +23,6 @@ def cnn(text):
     return spec
 
 
-def random_grids(n, rng):
-    """Grids of random ranges, uint8 [n, 80, 80]."""
-    return grids(grid_table(SimConfig()), np.minimum(rng.uniform(0, 70, (n, 31)), 50).astype(F))
-
-
 def in_torch(spec, genome, frames, speed):
     """The textbook: float64 in PyTorch's own layers. frames uint8 [frames, 80, 80]."""
     first, second, dense = spec.hidden
@@ -61,7 +56,8 @@ def test_forward_is_pytorchs(text):
     rng = np.random.default_rng(2)
     room = convnet.scratch(spec)
     for genome in new_genomes(spec, 4):
-        frames, speed = random_grids(spec.frames, rng), rng.uniform(-3, 30)
+        ranges = np.minimum(rng.uniform(0, 70, (spec.frames, 31)), 50).astype(F)
+        frames, speed = grids(grid_table(SimConfig()), ranges), rng.uniform(-3, 30)
         for frame in frames:
             convnet.push(frame.ravel(), False, room)
         convnet.forward(genome, spec.layers, F(speed), room)
