@@ -70,14 +70,9 @@ def test_rays_are_the_oracles():
     sensors[:300, 0] = rng.uniform(-3.0, 3.0, 300) % SIDE  # at the seam
     away = rng.gamma(2.0, 8.0, (n, cars))
     bearing = rng.uniform(-math.pi, math.pi, (n, cars))
-    boxes = np.stack(
-        [
-            (sensors[:, None, 0] + away * np.cos(bearing)) % SIDE,
-            (sensors[:, None, 1] + away * np.sin(bearing)) % SIDE,
-            rng.uniform(-math.pi, math.pi, (n, cars)),
-        ],
-        axis=-1,
-    )
+    offsets = np.stack([away * np.cos(bearing), away * np.sin(bearing)], axis=-1)
+    turns = rng.uniform(-math.pi, math.pi, (n, cars, 1))
+    boxes = np.concatenate([(sensors[:, None, :2] + offsets) % SIDE, turns], axis=-1)
     boxes[300:600, :, 2] = sensors[300:600, 2, None]  # rays that are parallel to two sides
     boxes, sensors = boxes.astype(F).astype(float), sensors.astype(F).astype(float)
     ranges = cast(sensors, np.stack([parked(*row) for row in boxes]))
