@@ -136,7 +136,8 @@ def test_a_run_that_mlflow_does_not_know_gets_every_row(uri, tmp_path, gone):
 
 QUIET = """
 import sys, time
-from tracked import check_uri, tracker
+from cluster.tracking.address import check_uri
+from tracked import tracker
 assert not [name for name in ("mlflow", "sqlalchemy", "requests") if name in sys.modules]
 started = time.perf_counter()
 logged = tracker(check_uri(sys.argv[1]), 20, key=str(started))

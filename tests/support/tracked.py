@@ -6,11 +6,12 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
+from commands import wait_until
+
 from cluster.tracking import mlflow_run
-from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking.address import server_problem
 from cluster.tracking.mlflow_run import Identity
 from cluster.tracking.tracker import Tracker
 from gridsim.car.ego import End
@@ -71,22 +72,17 @@ def free_port():
 
 @contextlib.contextmanager
 def mlflow_server(folder, port):
-    """MLflow's own, with a database and artifacts in `folder`; what is yielded kills it."""
+    """MLflow's own, with a database and artifacts in `folder`, until it is killed at the end."""
     command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1", "--port", str(port)]
     command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
     with open(folder / "server.log", "a") as log:
         quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
         server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)
     try:
-        for _ in range(300):
-            with contextlib.suppress(TrackingError):
-                check_uri(f"http://127.0.0.1:{port}")
-                break
-            time.sleep(0.2)
-        yield lambda: os.killpg(server.pid, signal.SIGKILL)
+        wait_until(lambda: not server_problem(f"http://127.0.0.1:{port}"), pause=0.2)
+        yield
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(server.pid, signal.SIGKILL)
+        os.killpg(server.pid, signal.SIGKILL)
         server.wait(10)
 
 
