@@ -9,6 +9,7 @@ import os
 import shutil
 import signal
 import tempfile
+from unittest.mock import Mock
 
 import psutil  # type: ignore[import-untyped]
 import pytest
@@ -24,6 +25,8 @@ from cluster.workers.pool import PoolError
 from gridsim import evolve
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
+UNTRACKED = Mock()  # in place of MLflow's parent run
+UNTRACKED.return_value.close.return_value = None
 
 
 def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
@@ -51,16 +54,6 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
     assert sorted(os.listdir(tmp_path)) == ["a", "comparison.json"]
 
 
-class Untracked:
-    """In place of MLflow's parent run."""
-
-    def __getattr__(self, name):
-        return lambda *_, **__: ""
-
-    def close(self, *_, **__):
-        return None
-
-
 def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, monkeypatch, capsys):
     trained: list[str] = []
     broken = {"seamless-evolution-s0"}
@@ -74,7 +67,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_is(tmp_path, mo
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(compare, "train", train)
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
-    monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
+    monkeypatch.setattr(compare, "Tracker", UNTRACKED)
     run = functools.partial(call, compare_main, monkeypatch, capsys)
     asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
     code, _, err = run(*asked, "--name", "c", "--seeds", 1)
@@ -108,7 +101,7 @@ def test_a_finished_run_that_is_damaged_counts_as_failed_and_stops_no_other(tmp_
     (damaged.path / "champion.npz").write_text("PK")
     monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
-    monkeypatch.setattr(compare, "Tracker", lambda *_: Untracked())
+    monkeypatch.setattr(compare, "Tracker", UNTRACKED)
     monkeypatch.chdir(tmp_path)
     code, out, err = call(compare_main, monkeypatch, capsys, "--resume", "c", "--workers", 0)
     assert code == 1
