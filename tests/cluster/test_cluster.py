@@ -9,7 +9,8 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterator
-from importlib.metadata import distribution, distributions, requires
+from importlib.metadata import distribution, requires
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -207,14 +208,6 @@ def drives(pid: int) -> bool:
     return False
 
 
-def lacking() -> list[str]:
-    """What is not installed of `ray[default]`."""
-    extra = [item for item in map(Requirement, requires("ray") or ()) if item.marker and "default" in str(item.marker)]
-    wanted = [item.name for item in extra if item.marker and item.marker.evaluate({"extra": "default"})]
-    installed = {distribution.name.lower().replace("_", "-") for distribution in distributions()}
-    return [name for name in wanted if name.lower().replace("_", "-") not in installed]
-
-
 def champion_sha256(generations: int) -> str:
     """Of the run with the flags `SMALL`, in this process."""
     settings = EvolveSettings("curved", traffic=2, population=48, seed=5, generations=generations)
@@ -223,8 +216,8 @@ def champion_sha256(generations: int) -> str:
 
 @pytest.mark.e2e
 def test_the_same_run_as_a_job(up: Machines) -> None:
-    if packages := lacking():
-        pytest.skip(f"needs pip install 'ray[default]' ({', '.join(packages)})")
+    if not find_spec("aiohttp_cors"):  # as all that its dashboard needs
+        pytest.skip("needs pip install 'ray[default]'")
     tunnel = up.laptop.start(RAY, "dashboard", up.config)
     try:
         wait_until(lambda: 8265 in up.laptop.listening() or tunnel.process.poll() is not None, UP_S, 0.5)
