@@ -45,7 +45,6 @@ def _ctrl_c_as_before() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def root() -> Path:
-    """The checkout's root folder."""
     return Path(__file__).resolve().parents[1]
 
 

@@ -31,7 +31,6 @@ REFERENCE = ("gridsim-evolve", *SMALL)
 
 
 def evolve(*arguments, cwd):
-    """gridsim-evolve, run to its end."""
     return finish("gridsim-evolve", *arguments, cwd=cwd)
 
 

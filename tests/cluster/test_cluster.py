@@ -191,7 +191,6 @@ def machines(tmp_path_factory: pytest.TempPathFactory, root: Path, empty_databas
 
 @pytest.fixture(scope="module")
 def up(machines: Machines, root: Path) -> Machines:
-    """The cluster, brought up with `ray up`."""
     laptop = machines.laptop
     laptop.run(RAY, "get-auth-token", "--generate")
     laptop.run(RAY, "up", "--yes", "--no-config-cache", machines.config, cwd=root, timeout=UP_S)

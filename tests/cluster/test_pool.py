@@ -67,8 +67,6 @@ class Answering(Worker):
 
 
 class Failing(Answering):
-    """Answers until it meets member or episode 300."""
-
     def answer(self, task, maps, recipes, first, stop):
         if 300 in (task.keys[first:stop] if isinstance(task, CollectTask) else recipes["seed"]):
             raise ValueError("300 is\nnot to be had")
@@ -325,8 +323,6 @@ def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
 
 
 class Megabyte:
-    """A map of so many bytes."""
-
     def arrays(self) -> dict[str, np.ndarray]:
         return {"field": np.zeros(1 << 20, dtype=np.uint8)}
 

@@ -41,7 +41,6 @@ def drawn(shown, width):
 
 
 def after(monkeypatch, seconds):
-    """Let so many seconds pass."""
     now = time.perf_counter()
     monkeypatch.setattr(progress.time, "perf_counter", lambda: now + seconds)
 

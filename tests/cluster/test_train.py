@@ -15,8 +15,6 @@ SETTINGS = EvolveSettings("curved", policy="mlp:4", population=8, generations=2)
 
 
 class Notes(train.Reporter):
-    """Keeps what it is shown."""
-
     def __init__(self):
         self.seen, self.told, self.resume = [], [], "again"
 

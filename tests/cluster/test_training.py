@@ -77,8 +77,6 @@ def stopped(halfway, tmp_path):
 
 
 class StopsAfterTwo(Reporter):
-    """Ctrl-C comes after two generations."""
-
     def row(self, steps, row):
         if steps == 2:
             raise KeyboardInterrupt
@@ -109,7 +107,6 @@ def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
 
 
 def state_of(evolution):
-    """All that a run saves, to be compared."""
     arrays, numbers = evolution.state()
     return {name: array.tobytes() for name, array in arrays.items()}, numbers
 
@@ -143,8 +140,6 @@ def test_a_run_may_begin_with_a_champion(maps):
 
 
 class Watching(SerialPool):
-    """Remembers what it was asked and what came of it."""
-
     def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
         outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
         self.seen = recipes, outcome

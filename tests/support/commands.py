@@ -19,7 +19,6 @@ PATH = os.pathsep.join(name for name in os.get_exec_path() if Path(name).resolve
 
 
 def start(*arguments, cwd, **env):
-    """A command, started."""
     return subprocess.Popen(
         [str(BIN / arguments[0]), *arguments[1:]],
         cwd=cwd,
@@ -107,7 +106,6 @@ def same_run(run, reference):
 
 
 def descendants(pid):
-    """Processes below a process."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return [child.pid for child in psutil.Process(pid).children(recursive=True)]
     return []
@@ -121,7 +119,6 @@ def command_line(pid):
 
 
 def ray_workers(pid):
-    """Actor processes that belong to a command."""
     return [child for child in descendants(pid) if command_line(child).startswith("ray::Actor")]
 
 

@@ -18,5 +18,4 @@ def drive(env: GridSimVectorEnv, steps: int, seed: int) -> np.ndarray:
 
 
 def to_bytes(experience: Experience) -> bytes:
-    """All bits of experience, to be compared."""
     return b"".join(array.tobytes() for array in experience)

@@ -77,8 +77,6 @@ def package_folders() -> set[str]:
 
 
 class Command:
-    """A command on a host."""
-
     def __init__(self, process: subprocess.Popen[bytes], log: Path):
         self.process, self.log = process, log
 
@@ -135,7 +133,6 @@ class Host:
         return {"HOME": str(HOME), "PATH": SEARCH, "LANG": "C.UTF-8", "TERM": "dumb", "RAY_USAGE_STATS_ENABLED": "0"}
 
     def start(self, *command: object, cwd: object = HOME, **environment: str) -> "Command":
-        """A command there, started."""
         self._logs += 1
         log = self.folder / "logs" / f"{self._logs}"
         shell = ["bash", "-c", 'cd "$1" && shift && exec "$@"', "shell", cwd, *command]

@@ -14,19 +14,16 @@ def told(search, score):
 
 
 def leader(search):
-    """The leader of a search that has one."""
     found = search.leader()
     assert found is not None
     return found
 
 
 def state_of(search):
-    """All that a search saves, to be compared."""
     return {name: array.tobytes() for name, array in search.state().items()}
 
 
 def first_gene(genomes):
-    """A score: the first gene of each genome."""
     return genomes[:, 0].astype(float)
 
 

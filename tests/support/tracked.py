@@ -28,7 +28,6 @@ def row(step):
 
 
 def client(uri):
-    """MLflow's own."""
     mlflow_run.quiet()
     from mlflow.tracking import MlflowClient
 
