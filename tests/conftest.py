@@ -9,14 +9,10 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from commands import BIN, answers, end, finish, wait_until
 from hypothesis import settings
-
-if TYPE_CHECKING:
-    from gridsim.maps.map import Map
 
 # Tests take nothing from the machine's home (a cluster's token) or shell (a cluster's or tracking server's address).
 # Caches stay where they are, as compiling all kernels takes minutes.
@@ -102,7 +98,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="session")
-def maps() -> dict[str, list[Map]]:
+def maps() -> dict[str, list]:
     """Two maps of each scenario."""
     from gridsim.maps.scenarios import REGISTRY, build
 

@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from pathlib import Path
 
 import pytest
 from browser import Browser, needs_chromium
@@ -102,4 +101,4 @@ def test_a_port_in_use_is_one_line(tmp_path):
         port = str(taken.getsockname()[1])
         done = finish("python", "-m", "cluster.commands.ui", port, cwd=tmp_path, code=1)
     assert done.stderr == f"make ui: port {port} is in use or not a port; choose another with make ui PORT=...\n"
-    assert not list(Path(tmp_path).iterdir())
+    assert not list(tmp_path.iterdir())
