@@ -186,7 +186,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
 
 
 def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
-    prog, step = kind.command, kind.counts[0]  # generation or evaluation
+    prog, step = kind.command, kind.step_name
     console = Console()
     flags, run = _prepare(kind, arguments)
     if run.saved and is_finished(run):
@@ -247,7 +247,7 @@ def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
 
 def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
-    summary, name, path = session.summary, session.learning.step_name, session.run.path
+    summary, name, path = session.summary, session.run.settings.step_name, session.run.path
     settings = session.run.settings
     where = "this map, from many starts" if is_map_file(settings.scenario) else "held-out drives"
     console.print(held_out_table(f"The champion on {where}", summary["held_out"]))

@@ -163,7 +163,7 @@ def elite(run: Path, generation: int | None) -> tuple[Champion, str]:
     """
     settings, _ = read_config(run / CONFIG)
     genomes = read_elites(run, settings.policy)
-    step = settings.counts[0]  # generation, or evaluation
+    step = settings.step_name
     number = len(genomes) - 1 if generation is None else generation
     if not 0 <= number < len(genomes):
         raise GridSimError(f"--generation {number}: the run has {step}s 0 to {len(genomes) - 1}")
@@ -185,7 +185,7 @@ def _driver(flags: WatchFlags) -> tuple[Champion, str]:
     if of_run and not (source / CONFIG).is_file():
         raise RunError(f"{source} is not a run's folder: it has no {CONFIG}")
     if flags.follow and not checkpoint_time(source):
-        print(f"waiting for the first {read_config(source / CONFIG)[0].counts[0]} ...", flush=True)
+        print(f"waiting for the first {read_config(source / CONFIG)[0].step_name} ...", flush=True)
         while not checkpoint_time(source):
             time.sleep(0.1)
     return elite(source, flags.generation) if of_run else (load_champion(source), "champion")

@@ -39,7 +39,7 @@ class RunSettings:
     command: ClassVar[str]  # that starts such a run
     default_policies: ClassVar[dict[Observation, str]]
     unbound: ClassVar[tuple[str, ...]]  # limits that may be raised when a run is resumed: it only ends later
-    counts: ClassVar[tuple[str, ...]]  # integers in a checkpoint that say how far a run has come
+    step_name: ClassVar[str]  # what a step of learning is called
 
     scenario: str = "seamless"
     """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
@@ -98,7 +98,7 @@ class RunSettings:
         return self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
-        """Whether a run that has come so far (`counts`, and `solved`) has nothing left to do."""
+        """Whether a run that has come so far (`Learning.counts`, and `solved`) has nothing left to do."""
         return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
 
     def check(self) -> None:
@@ -145,7 +145,7 @@ class EvolveSettings(RunSettings):
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64+steering", "grid": "cnn:8,16,32@1"}
     unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
-    counts: ClassVar[tuple[str, ...]] = ("generation", "car_steps")
+    step_name: ClassVar[str] = "generation"
 
     policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
@@ -234,7 +234,7 @@ class DqnSettings(RunSettings):
     command: ClassVar[str] = "gridsim-dqn"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
     unbound: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
-    counts: ClassVar[tuple[str, ...]] = ("evaluation", "car_steps", "episodes", "updates", "converged")
+    step_name: ClassVar[str] = "evaluation"
     #: What replaces 0 in these settings. An update on grids takes a hundred times as long as one on rays,
     #: so that half an hour is enough for 2 million car-steps, not 400 million.
     suited: ClassVar[dict[Observation, dict[str, Any]]] = {

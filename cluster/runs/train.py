@@ -272,7 +272,7 @@ class Session:
         If it is interrupted, it can be called again. Raises: CheckpointError; the previous files are kept.
         """
         learning, (arrays, meta), saved = self.learning, self._state, self._saved_steps
-        done, path = meta[learning.step_name], self.run.path
+        done, path = meta[self.run.settings.step_name], self.run.path
         if done > saved:
             new = steps.records(arrays["history"], [learning.elites[k] for k in range(saved, done)])
             steps.append(path / STEPS, saved, new)
@@ -312,7 +312,7 @@ class Session:
         road_map, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
         figures = learning.held_out()
         self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # meanwhile, in its thread
-        pictures.curves(learning.history, path / "curves.png", learning.step_name)
+        pictures.curves(learning.history, path / "curves.png", settings.step_name)
         drive = film.record(champion, road_map, start, learning.sim.episode.time_limit, world)
         where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"
         title = f"{label(settings.scenario)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
@@ -321,7 +321,7 @@ class Session:
         for k in (np.unique(np.geomspace(1, learning.steps, ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():
             elite = dataclasses.replace(champion, genome=elites[k])
             drive = film.record(elite, road_map, start, learning.sim.episode.time_limit, world)
-            shown.insert(0, page.Shown(f"elite of {learning.step_name} {k}", str(k), drive, stride=2))
+            shown.insert(0, page.Shown(f"elite of {settings.step_name} {k}", str(k), drive, stride=2))
         page.write_page(path / PAGE, f"GridSim: {self.run.name}, {title}", shown, learning.sim)
         wall = self._wall_s()
         best = learning.history[learning.champion.step]
@@ -331,12 +331,12 @@ class Session:
             "scenario": settings.scenario,
             "seed": settings.seed,
             "workers": workers,
-            f"{learning.step_name}s": learning.steps,
-            **{name: number for name, number in learning.counts().items() if name != learning.step_name},
+            f"{settings.step_name}s": learning.steps,
+            **{name: number for name, number in learning.counts().items() if name != settings.step_name},
             "wall_s": round(wall, 3),
             "car_steps_per_s": round(learning.car_steps / wall, 1),
             "champion_sha256": champion.sha256,
-            f"champion_{learning.step_name}": learning.champion.step,
+            f"champion_{settings.step_name}": learning.champion.step,
             "validation_success_rate": learning.champion.success_rate,
             "solved": learning.solved,
             "lost_chunks": learning.lost_chunks,

@@ -49,7 +49,6 @@ class Dqn(Learning):
     """One run of the DQN."""
 
     columns: ClassVar[tuple[str, ...]] = COLUMNS
-    step_name: ClassVar[str] = "evaluation"
     verb: ClassVar[str] = "training"
     kept: ClassVar[tuple[str, ...]] = (*Learning.kept, "batches", "episodes", "calm", "owed", "mean_steps")
 

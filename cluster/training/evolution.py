@@ -39,7 +39,6 @@ class Evolution(Learning):
     """One run of a search."""
 
     columns: ClassVar[tuple[str, ...]] = COLUMNS
-    step_name: ClassVar[str] = "generation"
     verb: ClassVar[str] = "evolving"
     save_every_s: ClassVar[float] = 1.0
 

@@ -113,7 +113,6 @@ class Learning(ABC):
     """
 
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number, and their names in MLflow
-    step_name: ClassVar[str]  # what a step is called
     verb: ClassVar[str]  # what is done to a network
     kept: ClassVar[tuple[str, ...]] = ("solved", "car_steps", "validation_steps", "lost_chunks")  # in checkpoints
     save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved as the next step begins, which changes it
@@ -151,7 +150,7 @@ class Learning(ABC):
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
-        """How far it has come: the settings' `counts`."""
+        """How far it has come: the number of its steps by their name, and what the settings' `ended` asks for."""
 
     @abstractmethod
     def progress(self) -> tuple[float, float, str]:
@@ -237,7 +236,7 @@ class Learning(ABC):
     def _report(self, stage: str, call: Call) -> None:
         self.lost_chunks += int(call.lost.sum())
         for text in call.warnings:
-            self.warn(f"{self.step_name} {self.steps}, {stage}: {text}")
+            self.warn(f"{self.settings.step_name} {self.steps}, {stage}: {text}")
 
     def drive(
         self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, meanwhile: Meanwhile | None = None
@@ -300,7 +299,7 @@ class Learning(ABC):
         """history.csv: a row for each of the first steps. Each is formatted only once: thousands take tens of ms."""
         for k in range(len(self._lines), steps):
             self._lines.append(",".join([str(k), *(repr(self.history[k][name]) for name in self.columns)]))
-        return "\n".join([",".join([self.step_name, *self.columns]), *self._lines[:steps], ""]).encode()
+        return "\n".join([",".join([self.settings.step_name, *self.columns]), *self._lines[:steps], ""]).encode()
 
 
 def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
