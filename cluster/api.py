@@ -99,9 +99,7 @@ def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness:
             learning.elites.clear()  # needed only for a run's folder
             if on_step:
                 on_step(learning.steps, row)
-        learning.choose_champion()
-        assert learning.champion is not None
-        genome = learning.champion.genome
+        genome = learning.choose_champion().genome
         champion = Champion(genome, settings.policy, settings.scenario, learning.sim, settings.traffic)
         return champion, learning.history
     finally:

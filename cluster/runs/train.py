@@ -299,11 +299,8 @@ class Session:
 
         self.reporter.note("measuring the champion on held-out drives")
         learning, path, settings = self.learning, self.run.path, self.run.settings
-        learning.choose_champion()
-        assert learning.champion is not None
-        champion = Champion(
-            learning.champion.genome, settings.policy, settings.scenario, learning.sim, settings.traffic
-        )
+        best = learning.choose_champion()
+        champion = Champion(best.genome, settings.policy, settings.scenario, learning.sim, settings.traffic)
         champion.save(path / CHAMPION)
         elites = steps.read_elites(path, settings.policy)
         checkpoint.save(path / ELITES, {"genomes": elites}, {"policy": settings.policy})
@@ -324,7 +321,7 @@ class Session:
             shown.insert(0, page.Shown(f"elite of {settings.step_name} {k}", str(k), drive, stride=2))
         page.write_page(path / PAGE, f"GridSim: {self.run.name}, {title}", shown, learning.sim)
         wall = self._wall_s()
-        best = learning.history[learning.champion.step]
+        row = learning.history[best.step]
         self.summary = {
             "name": self.run.name,
             "mlflow_run_id": self.tracker.run_id or "",
@@ -336,12 +333,12 @@ class Session:
             "wall_s": round(wall, 3),
             "car_steps_per_s": round(learning.car_steps / wall, 1),
             "champion_sha256": champion.sha256,
-            f"champion_{settings.step_name}": learning.champion.step,
-            "validation_success_rate": learning.champion.success_rate,
+            f"champion_{settings.step_name}": best.step,
+            "validation_success_rate": best.success_rate,
             "solved": learning.solved,
             "lost_chunks": learning.lost_chunks,
             "training_s": learning.history[-1]["wall_s"],
-            **{f"best_{name}": best[name] for name in ("car_steps", "wall_s")},
+            **{f"best_{name}": row[name] for name in ("car_steps", "wall_s")},
             "held_out": figures,
         }
         self._conclude()

@@ -173,8 +173,8 @@ class Learning(ABC):
     def candidate(self) -> np.ndarray | None:
         """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
-    def choose_champion(self) -> None:
-        """Choose between the champion and the last candidate when an unsolved run ends, on maps of their own.
+    def choose_champion(self) -> Champion:
+        """The champion of a run that ends: if it is unsolved, it or the last candidate, by drives on maps of their own.
 
         A champion is the best of many on the same maps, so that its score there is too high, in traffic by some
         percent, and later candidates that drive better do not reach it.
@@ -196,6 +196,7 @@ class Learning(ABC):
             self.car_steps, self.solved = car_steps, False
         if self.champion is None:
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
+        return self.champion
 
     def _is_tried(self, candidate: np.ndarray) -> bool:
         """Whether a candidate is the last one that was validated."""
