@@ -7,7 +7,7 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pictures import read, small_road
+from pictures import read, small_map
 
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, Strips, clearance_nodes, freeze
 
@@ -21,13 +21,13 @@ def scenario(maps):
 
 
 def test_the_oracle_knows_a_ring_and_a_strip():
-    _, ring = small_road(arcs=[[32, 32, 10, 1.0, 2 * math.pi, 3]])
+    _, ring = small_map(arcs=[[32, 32, 10, 1.0, 2 * math.pi, 3]])
     points = [[42, 32], [45, 32], [46, 32], [32, 39], [32, 38], [32, 24.5]]
     assert ring.clearance(np.array(points, dtype=float)) == pytest.approx([3, 0, -1, 0, -1, 0.5])
     # From the middle of the ring outwards, inwards, and along the tangent to the outer edge.
     ranges = ring.cast(np.array([[42.0, 32.0]]), np.array([[0.0, math.pi, math.pi / 2]]), 50.0)
     assert ranges[0] == pytest.approx([3.0, 3.0, math.sqrt(13**2 - 10**2)])
-    _, strip = small_road(lines=[[0, 32, 64, 32, 4]])  # goes round the torus
+    _, strip = small_map(lines=[[0, 32, 64, 32, 4]])  # goes round the torus
     ranges = strip.cast(np.array([[60.0, 33.0]]), np.array([[0.0, math.pi / 2, -math.pi / 6]]), 50.0)
     assert ranges[0] == pytest.approx([50.0, 3.0, 10.0])
     poses = [[60, 32, 0], [60, 35, 0], [60, 35.01, 0], [60, 33.9, math.pi / 2], [60, 34.1, math.pi / 2]]
@@ -52,11 +52,11 @@ def test_nodes_are_exact_for_any_strips_and_blocks(lines, arcs, blocks):
 
 
 def test_clearance_on_a_straight_edge_is_exact_to_rounding_and_saturates():
-    road, exact = small_road(lines=[[0, 30.3, 64, 30.3, 8.0]])
+    road_map, exact = small_map(lines=[[0, 30.3, 64, 30.3, 8.0]])
     y = np.concatenate([np.linspace(37.0, 39.9, 200), [30.3, 2.0]])  # from 1.3 m inside to 1.6 m outside; far off
     points = np.stack([np.linspace(0, 64, len(y)), y], axis=1)
     expected = np.clip(exact.clearance(points), FIELD_FLOOR, CEILING)
-    assert read(road, points) == pytest.approx(expected, abs=0.5 / FIELD_UNITS + 2e-4)
+    assert read(road_map.road, points) == pytest.approx(expected, abs=0.5 / FIELD_UNITS + 2e-4)
     assert expected[-2:].tolist() == [CEILING, FIELD_FLOOR]
 
 

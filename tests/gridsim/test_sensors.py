@@ -5,7 +5,7 @@ import math
 import numpy as np
 import oracle
 import pytest
-from pictures import small_road
+from pictures import small_map
 
 from gridsim.config import SensorConfig, SimConfig, constants
 from gridsim.maps.roads import THICK_WALL, Strips, clearance_nodes, make_road
@@ -68,7 +68,7 @@ def test_rays_are_those_of_the_exact_geometry(places):
 
 
 def test_the_first_ray_is_the_rightmost():
-    road, _ = small_road([[0, 32, 64, 32, 4.0]])
+    road = small_map([[0, 32, 64, 32, 4.0]])[0].road
     ranges = look(road, [(20.0, 34.0)], [0.0])[0]
     # 2 m of road to the left, 6 m to the right.
     assert ranges[30] == pytest.approx(2.0 / math.sin(math.radians(60.0)), abs=0.05)
@@ -88,7 +88,7 @@ def test_the_first_ray_is_the_rightmost():
 def test_no_ray_passes_a_wall(half, wall, thinnest):
     """Two roads side by side, a wall between them: rays from one never reach the other, from wherever they start."""
     strips = [[0, 20.2, 64, 20.2, half], [0, 20.2 + 2 * half + wall, 64, 20.2 + 2 * half + wall, half]]
-    road = small_road(strips)[0]._replace(thinnest=F(thinnest))
+    road = small_map(strips)[0].road._replace(thinnest=F(thinnest))
     rng = np.random.default_rng(3)
     points = np.stack([rng.uniform(0, 64, 1000), 20.2 + (half - 0.5) * rng.uniform(-1, 1, 1000)], axis=1).astype(F)
     headings = rng.uniform(0.1, math.pi - 0.1, 1000)
@@ -127,9 +127,9 @@ def test_rays_see_parked_cars():
 
 
 def test_an_empty_world_and_a_full_one():
-    road, _ = small_road([[0, 0, 64, 0, 40.0], [0, 32, 64, 32, 40.0]])
+    road = small_map([[0, 0, 64, 0, 40.0], [0, 32, 64, 32, 40.0]])[0].road
     assert (look(road, [(10.0, 10.0)], [1.0]) == REACH).all()
-    road, _ = small_road([[10, 10, 11, 10, 2.0]])
+    road = small_map([[10, 10, 11, 10, 2.0]])[0].road
     assert look(road, [(40.0, 40.0)], [1.0]).max() == 0.0  # far off the road everything is hidden
 
 

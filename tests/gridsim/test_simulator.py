@@ -1,50 +1,29 @@
-"""The order of events: kernel against oracle through whole episodes, and what must not earn distance."""
+"""The order of events: cars against the oracle through whole episodes, and what must not earn distance."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import oracle
 import pytest
-from pictures import crashes, small_road
+from pictures import crashes, small_map
 
-from gridsim.car.ego import (
-    COS,
-    DISTANCE,
-    FIELDS,
-    IDLE,
-    ODOMETER,
-    PACED,
-    SIN,
-    SPEED,
-    STEERING,
-    STEPS,
-    End,
-    X,
-    Y,
-    control,
-    look,
-    place,
-)
-from gridsim.car.vehicle import Action, act
-from gridsim.config import EpisodeConfig, SimConfig, constants
+from gridsim.car.ego import COS, DISTANCE, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y
+from gridsim.car.vehicle import Action
+from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
-from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.maps.scenarios import build
-from gridsim.sensing.rays import fan
 
 F = np.float32
 CONFIG = SimConfig()
-K = constants(CONFIG)
-RAYS = fan(31, K.ray_first, K.ray_step)
 SIDE = 256.0
 INTERVAL = (5.0, 12.0)  # m/s
+TARGET, MAX_STEPS = 150.0, 200  # of the episodes that are driven at random and by sight
 
 
-@dataclass
-class Run:
-    """An episode by the kernels: actions [n], states after each step [n, FIELDS], how it ended."""
+class Run(NamedTuple):
+    """An episode of one car: actions [n], states after each step [n, FIELDS], how it ended."""
 
     start: np.ndarray
     actions: np.ndarray
@@ -52,25 +31,17 @@ class Run:
     end: str
 
 
-TARGET, MAX_STEPS = 150.0, 200  # of the episodes that are driven at random and by sight
-
-
-def run(road, start, choose, target=2000.0, max_steps=4000, k=K):
+def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
     """Drive until the episode ends; `choose` is called with (step, ranges, car) and returns an action."""
     start = np.asarray(start, dtype=F)
-    car, visits = np.zeros(FIELDS, dtype=F), np.zeros(int(road.width) // 4 * int(road.height) // 4, dtype=F)
-    ranges = np.empty(31, dtype=F)
-    place(road, start, car, visits)
-    actions: list[int] = []
-    states: list[np.ndarray] = []
-    end = 0
-    while end == 0:
-        look(road, k, RAYS, car, None, ranges, None)
-        actions.append(int(choose(len(actions), ranges, car)))
-        pedal, wheel = map(F, act(k, actions[-1], car[SPEED], car[STEERING]))
-        end = control(road, k, car, visits, None, pedal, wheel, F(target), max_steps)
-        states.append(car.copy())
-    return Run(start, np.array(actions), np.array(states), End(end).name)
+    simulator = Simulator([road_map], 1, config, target, max_steps)
+    ranges, _ = simulator.reset(start[None])
+    actions, states = [], []
+    while simulator.state.ends[0] == End.RUNNING:
+        actions.append(int(choose(len(actions), ranges[0], simulator.state.cars[0])))
+        ranges, *_ = simulator.step(np.array(actions[-1:]))
+        states.append(simulator.state.cars[0].copy())
+    return Run(start, np.array(actions), np.array(states), End(simulator.state.ends[0]).name)
 
 
 def at_random(rng):
@@ -127,7 +98,7 @@ def episodes(scenarios):
         start = sample_starts(scenarios[m], 1, rng)[0]
         start[3] = rng.uniform(-3.0, 12.0)
         choose = at_random(rng) if k < 80 else by_sight(rng)
-        found.append((m, run(scenarios[m].road, start, choose, target=TARGET, max_steps=MAX_STEPS)))
+        found.append((m, run(scenarios[m], start, choose, target=TARGET, max_steps=MAX_STEPS)))
     # They are worth comparing.
     states = np.concatenate([r.states for _, r in found])
     assert {"COLLISION", "IDLE", "SUCCESS", "TIME"} == {r.end for _, r in found}
@@ -188,7 +159,7 @@ def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
 
 
 def test_a_batch_is_its_cars(scenarios, episodes):
-    """`Simulator` and the bare kernels are bit-identical, whatever the other cars of the batch do."""
+    """Bit for bit as alone, whatever the other cars of the batch do."""
     chosen = [(m, r) for m, r in episodes if len(r.actions) > 20][:12]
     batch = Simulator(scenarios, len(chosen), CONFIG, target=TARGET, max_steps=MAX_STEPS)
     batch.reset(np.stack([r.start for _, r in chosen]), np.array([m for m, _ in chosen]))
@@ -203,14 +174,13 @@ def test_a_batch_is_its_cars(scenarios, episodes):
 @pytest.fixture(scope="module")
 def plain():
     """Road everywhere: a torus of 128 m without an edge."""
-    return small_road([[0, y, 128, y, 40.0] for y in (0, 40, 80)], side=128.0)[0]
+    return small_map([[0, y, 128, y, 40.0] for y in (0, 40, 80)], width=128.0, height=128.0)[0]
 
 
 @pytest.fixture(scope="module")
 def straight():
     """A road of 8 m round a torus of 1,024 m, along x."""
-    strips = Strips.of([[0, 32.0, 1024, 32.0, 4.0]])
-    return make_road(clearance_nodes(strips, 1024.0, 64.0), INTERVAL, 1.0)
+    return small_map([[0, 32.0, 1024, 32.0, 4.0]], width=1024.0)[0]
 
 
 @pytest.mark.parametrize(
@@ -245,8 +215,8 @@ def test_back_and_forth_earns_the_furthest_point(straight):
     def choose(step, ranges, car):
         return plan[step % len(plan)]
 
-    patient = constants(SimConfig(episode=EpisodeConfig(patience=100)))
-    r = run(straight, [100, 32, 0, 0, 0], choose, max_steps=10 * len(plan), k=patient)
+    patient = SimConfig(episode=EpisodeConfig(patience=100))
+    r = run(straight, [100, 32, 0, 0, 0], choose, max_steps=10 * len(plan), config=patient)
     assert r.end == "TIME"
     furthest = np.maximum.accumulate(r.states[:, X].astype(float)) - 100
     assert (np.diff(r.states[:, X]) < -0.01).sum() > 30
@@ -257,11 +227,12 @@ def test_back_and_forth_earns_the_furthest_point(straight):
 @pytest.mark.parametrize("heading", [0.0, 0.02, math.pi])
 def test_nothing_tunnels_through_a_thin_wall(wall, heading):
     """30 m/s at a wall across the road, from starts 10 cm apart: 3 m a step, and never beyond it."""
-    road, _ = small_road([[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]], side=128.0)
+    lines = [[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]]
+    road_map, _ = small_map(lines, width=128.0, height=128.0)
     backwards = heading > 1.0
     for k in range(32):
         x = 40 + 0.1 * k if not backwards else 120 - 0.1 * k
-        r = run(road, [x, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)
+        r = run(road_map, [x, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)
         assert r.end == "COLLISION"
         front = r.states[-1, X] + 2.0 * (-1 if backwards else 1)
         edge = 80.0 if not backwards else 80 + wall
@@ -270,8 +241,11 @@ def test_nothing_tunnels_through_a_thin_wall(wall, heading):
 
 
 def test_a_start_is_taken_onto_the_torus(straight):
-    car, visits = np.ones(FIELDS, dtype=F), np.ones(1024 * 64 // 16, dtype=F)
-    place(straight, np.array([-4.0, 32.0 + 128.0, math.pi / 2, 7.0, 0.1], dtype=F), car, visits)
+    simulator = Simulator([straight], 1)
+    for _ in range(2):  # the second time after a step
+        simulator.reset(np.array([[-4.0, 32.0 + 128.0, math.pi / 2, 7.0, 0.1]]))
+        car = simulator.state.cars[0].copy()
+        simulator.step(np.array([Action.ACCELERATE_LEFT]))
     assert (car[X], car[Y]) == (1020.0, 32.0)
     assert (car[COS], car[SIN]) == pytest.approx((0.0, 1.0), abs=1e-6)
     assert (car[SPEED], car[STEERING]) == (7.0, F(0.1))

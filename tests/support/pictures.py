@@ -11,7 +11,8 @@ from PIL import Image
 from gridsim.car.ego import End, collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
-from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze, make_road
+from gridsim.maps.map import without_lanes
+from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze
 from gridsim.view.drive import Recorder, manual, poses_of
 
 PPM = 16
@@ -72,10 +73,12 @@ def read(road, points):
     return clearances(road, freeze(np.asarray(points, dtype=np.float32)))
 
 
-def small_road(lines=(), arcs=(), side=64.0):
-    """A road on a torus of so many metres, for 5 to 12 m/s and rays of 50 m; and the same for the oracle."""
+def small_map(lines=(), arcs=(), width=64.0, height=64.0):
+    """A map of a road on a torus with these sides (m), for 5 to 12 m/s, without lanes; and the same for the oracle."""
     strips = Strips.of(lines, arcs)
-    return make_road(clearance_nodes(strips, side, side), (5.0, 12.0), 1.0), oracle.ExactRoad(strips, side, side)
+    nodes, starts = clearance_nodes(strips, width, height), np.zeros((0, 5), dtype=np.float32)
+    road_map = without_lanes("small", nodes, (5.0, 12.0), 1.0, SimConfig(), starts)
+    return road_map, oracle.ExactRoad(strips, width, height)
 
 
 def straight_road(width, height, limit, half_width=0.0):
