@@ -158,19 +158,6 @@ def test_a_collision_is_the_outline_off_the_road(scenarios, exact, seed):
     assert not (~hit & ~on_road(0.4)).any()
 
 
-def test_a_batch_is_its_cars(scenarios, episodes):
-    """Bit for bit as alone, whatever the other cars of the batch do."""
-    chosen = [(m, r) for m, r in episodes if len(r.actions) > 20][:12]
-    batch = Simulator(scenarios, len(chosen), CONFIG, target=TARGET, max_steps=MAX_STEPS)
-    batch.reset(np.stack([r.start for _, r in chosen]), np.array([m for m, _ in chosen]))
-    for step in range(max(len(r.actions) for _, r in chosen)):
-        actions = np.array([r.actions[min(step, len(r.actions) - 1)] for _, r in chosen])
-        batch.step(actions)
-        for k, (_, r) in enumerate(chosen):
-            assert batch.state.cars[k].tobytes() == r.states[min(step, len(r.states) - 1)].tobytes()
-    assert [End(e).name for e in batch.state.ends] == [r.end for _, r in chosen]
-
-
 @pytest.fixture(scope="module")
 def plain():
     """Road everywhere: a torus of 128 m without an edge."""
