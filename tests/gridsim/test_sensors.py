@@ -67,15 +67,6 @@ def test_rays_are_those_of_the_exact_geometry(places):
     assert ((ranges[0][inner] < low - 0.2) | (ranges[0][inner] > high + 0.2)).mean() < 0.003
 
 
-def test_the_first_ray_is_the_rightmost():
-    road = small_map([[0, 32, 64, 32, 4.0]])[0].road
-    ranges = look(road, [(20.0, 34.0)], [0.0])[0]
-    # 2 m of road to the left, 6 m to the right.
-    assert ranges[30] == pytest.approx(2.0 / math.sin(math.radians(60.0)), abs=0.05)
-    assert ranges[0] == pytest.approx(6.0 / math.sin(math.radians(60.0)), abs=0.05)
-    assert ranges[15] == REACH
-
-
 @pytest.mark.parametrize(
     ("half", "wall", "thinnest"),
     [
