@@ -12,7 +12,7 @@ from gridsim.car.ego import End, collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.map import without_lanes
-from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze
+from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze, make_road
 from gridsim.view.drive import Recorder, manual, poses_of
 
 PPM = 16
@@ -77,7 +77,7 @@ def small_map(lines=(), arcs=(), width=64.0, height=64.0):
     """A map of a road on a torus with these sides (m), for 5 to 12 m/s, without lanes; and the same for the oracle."""
     strips = Strips.of(lines, arcs)
     nodes, starts = clearance_nodes(strips, width, height), np.zeros((0, 5), dtype=np.float32)
-    road_map = without_lanes("small", nodes, (5.0, 12.0), 1.0, SimConfig(), starts)
+    road_map = without_lanes("small", nodes, (5.0, 12.0), 1.0, starts)
     return road_map, oracle.ExactRoad(strips, width, height)
 
 
