@@ -1,6 +1,5 @@
 """The command gridsim-compare: wrong use, what is never trained again, a kill and Ctrl-C."""
 
-import contextlib
 import csv
 import dataclasses
 import functools
@@ -14,7 +13,7 @@ from unittest.mock import Mock
 import psutil  # type: ignore[import-untyped]
 import pytest
 import tracked
-from commands import call, finish, refused, start, summary, wait_until
+from commands import call, command_line, finish, refused, running, summary, wait_until
 from finished_runs import make_run
 
 from cluster.commands import compare
@@ -133,20 +132,16 @@ SMALL = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds"
 def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_what_is_finished(tmp_path):
     folder = tmp_path / "runs" / "c"
     first, second = folder / "curved-evolution-s0", folder / "curved-random-s0"
-    process = start("gridsim-compare", *SMALL, "--budget", "1h", "--generations", "3", cwd=tmp_path)
-    try:
+    with running("gridsim-compare", *SMALL, "--budget", "1h", "--generations", "3", cwd=tmp_path) as process:
         wait_until(lambda: second.exists() or process.poll() is not None, 240)
         process.send_signal(signal.SIGINT)
         errors = process.communicate(timeout=120)[1]
-        assert process.returncode == 130, errors
-        assert "gridsim-compare --resume runs/c" in errors
-        assert "| curved | random search | missing |" in (folder / "table.md").read_text()
-        assert "| curved | evolution | 1 |" in (folder / "table.md").read_text()
-        process = start("gridsim-compare", "--resume", "runs/c", "--workers", "0", cwd=tmp_path)
+    assert process.returncode == 130, errors
+    assert "gridsim-compare --resume runs/c" in errors
+    assert "| curved | random search | missing |" in (folder / "table.md").read_text()
+    assert "| curved | evolution | 1 |" in (folder / "table.md").read_text()
+    with running("gridsim-compare", "--resume", "runs/c", "--workers", "0", cwd=tmp_path) as process:
         wait_until(lambda: (second / "checkpoint.npz").exists() or process.poll() is not None, 240)
-    finally:
-        process.kill()
-        process.communicate()
     before = {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in first.rglob("*") if path.is_file()}
     assert "summary.json" in before
 
@@ -178,19 +173,15 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
     at_once = ["--workers", "0", "--jobs", "2"]
 
     def processes():
-        jobs = []
-        for child in psutil.Process(process.pid).children():
-            with contextlib.suppress(psutil.NoSuchProcess):  # another child, which has just ended
-                jobs += child.children() if "forkserver" in str(child.cmdline()) else []
-        return jobs
+        servers = [each for each in psutil.Process(process.pid).children() if "forkserver" in command_line(each.pid)]
+        return [child for server in servers for child in server.children()]
 
     def both_saved():
         return all((cell.path / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None
 
     short = tempfile.mkdtemp(prefix="gs-", dir="/tmp")  # the path of a socket in it must be short
-    process = start("gridsim-compare", *asked, "--budget", "1G", "--generations", "12", *at_once, "--name", "c",
-                    cwd=tmp_path, TMPDIR=short)  # fmt: skip
-    try:
+    begun = ("gridsim-compare", *asked, "--budget", "1G", "--generations", "12", *at_once, "--name", "c")
+    with running(*begun, cwd=tmp_path, TMPDIR=short) as process:
         wait_until(both_saved, 240)
         children = processes()
         os.killpg(process.pid, signal.SIGTERM)
@@ -198,18 +189,15 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
         assert process.returncode == 130, errors
         assert len(children) == 2
         assert not any(child.is_running() for child in children), "it has waited until they were saved"
-        process = start("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path)
+    with running("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path) as process:
         wait_until(lambda: len(processes()) == 2, 60)
         for child in processes():
             child.kill()
         errors = process.communicate(timeout=240)[1]
-        assert process.returncode == 1, errors
-        assert "failed: its process ended with exit code -9" in errors
-        assert "gridsim-compare: error: 2 of 4 runs failed" in errors
-        assert [(cell.path / "summary.json").exists() for cell in cells] == [False, False, True, True]
-    finally:
-        process.kill()
-        process.communicate()
+    assert process.returncode == 1, errors
+    assert "failed: its process ended with exit code -9" in errors
+    assert "gridsim-compare: error: 2 of 4 runs failed" in errors
+    assert [(cell.path / "summary.json").exists() for cell in cells] == [False, False, True, True]
     done = finish("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path, TMPDIR=short)
     assert (done.returncode, done.stderr) == (0, "")
     assert not [name for name in os.listdir(short) if name.startswith("pymp-")], "the folder of a socket"
