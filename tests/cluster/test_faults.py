@@ -1,7 +1,6 @@
 """What a run survives, with real processes: killed and stopped workers, hosts that come and go, a killed coordinator.
 
-Each ends with the same champion as the run that nobody disturbed. `GRIDSIM_KILLS=20` makes the last test as long as the
-issue asks for; it then takes some minutes.
+Each ends with the same champion as the run that nobody disturbed. `benchmarks/faults.py` does more of it.
 """
 
 import contextlib
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import BIN, answers, end, finish, ray_workers, rows, running, same_run, start, wait_until
+from commands import BIN, answers, end, finish, ray_workers, rows, running, same_run, wait_until
 from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
 
 from cluster.workers.pool import SerialPool
@@ -30,7 +29,6 @@ pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 
 LONG_S = 300.0  # what takes seconds where nothing else runs
 PATIENCE_S = 45  # a host and its worker take 10 to 30 to come up
-KILLS = int(os.environ.get("GRIDSIM_KILLS", "2"))
 SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "10", "--seed", "5"]
 REFERENCE = ("gridsim-evolve", *SMALL)
 
@@ -141,18 +139,17 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
 @pytest.mark.usefixtures("database")
 def test_a_coordinator_killed_at_random_moments_and_resumed_each_time(reference: Path, tmp_path: Path) -> None:
     run, rng = tmp_path / "runs/c", random.Random(1)
-    process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
-    for killed in range(KILLS):
-        if not killed:
+    flags: list[str] = ["--name", "c", *SMALL]
+    for most_s in (1.0, 6.0):
+        with running("gridsim-evolve", "--workers", "2", *flags, cwd=tmp_path) as process:
             wait_until(lambda: (run / "checkpoint.npz").exists(), LONG_S)
-        time.sleep(rng.uniform(0.0, 1.0 if not killed else 6.0))
-        working = [child for name in ("ray::Actor", "raylet", "gcs_server") for child in below(process, name)]
-        process.kill()
-        _, err = process.communicate()
+            time.sleep(rng.uniform(0.0, most_s))
+            working = [child for name in ("ray::Actor", "raylet", "gcs_server") for child in below(process, name)]
+            process.kill()
+            _, err = process.communicate()
         assert err == ""
         # Idle helpers of Ray's look for it for another minute; they do nothing and hold no port that is needed.
         assert psutil.wait_procs(working, 10)[1] == []
-        process = start("gridsim-evolve", "--workers", "2", "--resume", "runs/c", cwd=tmp_path)
-    _, err = process.communicate(timeout=LONG_S)
-    assert (process.returncode, err) == (0, "")
+        flags = ["--resume", "runs/c"]
+    assert finish("gridsim-evolve", "--workers", "2", *flags, cwd=tmp_path, timeout=LONG_S).stderr == ""
     assert same_run(run, reference)
