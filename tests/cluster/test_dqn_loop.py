@@ -1,4 +1,4 @@
-"""The DQN's loop in this process: when it learns, converges, diverges and ends, and what it refuses."""
+"""The DQN's loop in this process: when it learns, converges, diverges and ends."""
 
 from typing import Any
 
@@ -12,7 +12,6 @@ from cluster.training.trainer import Maps
 from cluster.workers.pool import Chunk, Collected, PoolError, SerialPool
 from cluster.workers.worker import Worker
 from gridsim.config import SimConfig
-from gridsim.errors import GridSimError
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -110,25 +109,6 @@ def test_no_batch_is_begun_beyond_a_bound(loop, bound):
     assert learning.done()
     assert len(begun) > 1
     assert max(begun) < most
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"discount": 1.5}, "--discount must be 0 to 1, not 1.5"),
-        ({"batch": -1}, "--batch must be 1 to"),
-        ({"replay": 10}, r"--replay must be 256 \(the batch\) to 10,000,000, not 10"),
-        ({"learning_rate": float("nan")}, "--learning-rate must be above 0, not nan"),
-        ({"policy": "cnn"}, "policy cnn sees the grid"),
-        ({"device": "abacus"}, "--device must be auto, cpu or cuda, not abacus"),
-        ({"updates": 1e308}, "--updates must be 0 to 1,000,000"),
-        ({"anneal": 10**400}, "--anneal must be 1 to 1,000,000,000,000,000"),
-        ({"car_steps": 10**400}, "--car-steps must be 0 to 1,000,000,000,000,000"),
-    ],
-)
-def test_settings_that_no_run_can_have(changes, words):
-    with pytest.raises(GridSimError, match=f"^{words}"):
-        DqnSettings(**changes).check()
 
 
 class Losing(SerialPool):

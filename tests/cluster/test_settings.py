@@ -90,19 +90,28 @@ def test_there_are_no_more_groups_than_members_for_them(population, groups):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("kind", "wrong", "said"),
     [
-        ({"observation": "grid", "policy": "mlp:6,7"}, "policy mlp:6,7 sees the rays.*--observation rays"),
-        ({"elites": 4}, "--elites is for --recombination two"),
-        ({"recombination": "two", "elites": -1}, "--elites must be"),
-        ({"recombination": "two", "elites": 10_001, "population": 20_000}, "--elites must be"),
-        ({"recombination": "two", "mutation_rate": 1.5}, "--mutation-rate must be 0 to 1"),
-        ({"population": 1_000_001}, "--population must be 4 to 1,000,000"),
-        ({"tournament": 0}, "--tournament must be 1 to"),
-        ({"sigma": float("nan")}, "--sigma must be above 0"),
-        ({"generations": -1}, "--generations"),
+        (EvolveSettings, {"observation": "grid", "policy": "mlp:5"}, "policy mlp:5 sees the rays.*--observation rays"),
+        (EvolveSettings, {"elites": 4}, "--elites is for --recombination two"),
+        (EvolveSettings, {"recombination": "two", "elites": -1}, "--elites must be"),
+        (EvolveSettings, {"recombination": "two", "elites": 10_001, "population": 20_000}, "--elites must be"),
+        (EvolveSettings, {"recombination": "two", "mutation_rate": 1.5}, "--mutation-rate must be 0 to 1"),
+        (EvolveSettings, {"population": 1_000_001}, "--population must be 4 to 1,000,000"),
+        (EvolveSettings, {"tournament": 0}, "--tournament must be 1 to"),
+        (EvolveSettings, {"sigma": float("nan")}, "--sigma must be above 0"),
+        (EvolveSettings, {"generations": -1}, "--generations"),
+        (DqnSettings, {"discount": 1.5}, "--discount must be 0 to 1, not 1.5"),
+        (DqnSettings, {"batch": -1}, "--batch must be 1 to"),
+        (DqnSettings, {"replay": 10}, r"--replay must be 256 \(the batch\) to 10,000,000, not 10"),
+        (DqnSettings, {"learning_rate": float("nan")}, "--learning-rate must be above 0, not nan"),
+        (DqnSettings, {"policy": "cnn"}, "policy cnn sees the grid"),
+        (DqnSettings, {"device": "abacus"}, "--device must be auto, cpu or cuda, not abacus"),
+        (DqnSettings, {"updates": 1e308}, "--updates must be 0 to 1,000,000"),
+        (DqnSettings, {"anneal": 10**400}, "--anneal must be 1 to 1,000,000,000,000,000"),
+        (DqnSettings, {"car_steps": 10**400}, "--car-steps must be 0 to 1,000,000,000,000,000"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused_in_one_line(wrong, said):
+def test_settings_that_make_no_sense_are_refused_in_one_line(kind, wrong, said):
     with pytest.raises(GridSimError, match=rf"^[^\n]*{said}[^\n]*$"):
-        EvolveSettings(**wrong).check()
+        kind(**wrong).check()
