@@ -141,7 +141,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.scenario = scenario
         self.traffic = default_traffic(scenario) if traffic is None else traffic
         self.simulator = Simulator([], num_envs, self.config, max_steps=max_episode_steps, traffic=self.traffic)
-        self._episodes = Episodes(num_envs, scenario, maps, map_seed, self.config)
+        self._episodes = Episodes(num_envs, scenario, maps, map_seed, self.traffic, self.config)
         self.simulator.scenarios = self._episodes.maps
         self.render_mode = render_mode
         self._views: dict[int, Renderer] = {}  # by map
@@ -256,8 +256,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """Begin the current episodes of cars `which`. Returns: ranges [k, rays] and speeds [k]."""
-        maps, starts, keys = self._episodes.draw(which, map_seed, start)
-        ranges, speeds = self.simulator.reset(starts, maps, which, keys)
+        maps, starts, worlds = self._episodes.draw(which, map_seed, start)
+        ranges, speeds = self.simulator.reset(starts, maps, which, worlds)
         self._fastest[which] = [self._episodes.maps[m].road.speed_high for m in maps]
         return ranges, speeds
 

@@ -14,6 +14,7 @@ from gridsim.jit import njit
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build, is_map_file, seed_of_map
+from gridsim.traffic.world import FIELDS, spawn
 
 _U = np.uint64
 #: The maps of this process's environments, kept while one of them uses them.
@@ -40,12 +41,14 @@ class Episodes:
         numbers: uint64 [n], each car's current episode, counted from its seeding.
     """
 
-    def __init__(self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, config: SimConfig):
+    def __init__(
+        self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, traffic: int, config: SimConfig
+    ):
         """Episodes on these `maps`, or on that many from `map_seed` on, which are built when first needed.
 
         Raises: ValueError with one line if there is no map.
         """
-        self.scenario, self.config = scenario, config
+        self.scenario, self.traffic, self.config = scenario, traffic, config
         if isinstance(maps, int) and is_map_file(scenario):
             maps = [build(scenario, map_seed, config)] * min(maps, 1)
         self.maps: list[Map] = [] if isinstance(maps, int) else list(maps)
@@ -59,7 +62,7 @@ class Episodes:
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and traffic's keys [k] of the current episodes of cars `which`, drawn or given."""
+        """Maps [k], starts [k, 5] and worlds [k, traffic, FIELDS] of the current episodes of `which`, unless given."""
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
@@ -71,13 +74,16 @@ class Episodes:
             seeds = np.broadcast_to(given, every)[which].tolist()
         maps = np.array([self._map(seed) for seed in seeds])
         starts = np.empty((len(which), 5), dtype=np.float32)
-        if start is None:
-            for m in np.unique(maps):
-                of = np.flatnonzero(maps == m)
-                starts[of] = starts_at(self.maps[m], numbers[of, 1])
-        else:
+        if start is not None:
             starts[:] = self._checked_start(start, which, maps)
-        return maps, starts, keys
+        worlds = np.empty((len(which), self.traffic, FIELDS), dtype=np.float32)
+        for m in np.unique(maps):
+            of = np.flatnonzero(maps == m)
+            if start is None:
+                starts[of] = starts_at(self.maps[m], numbers[of, 1])
+            if self.traffic:
+                worlds[of] = spawn(self.maps[m].network, starts[of], self.traffic, keys[of], self.config)
+        return maps, starts, worlds
 
     def keep_own_maps(self) -> None:
         """Forget maps that a reset asked for, unless episodes are drawn from them."""

@@ -19,7 +19,6 @@ from gridsim.maps.map import Map
 from gridsim.sensing.rays import fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
-from gridsim.traffic.world import spawn
 
 ACTIONS = len(Action)
 
@@ -130,7 +129,7 @@ class Simulator:
             visits=np.zeros((cars, 0), dtype=np.float32),
             maps=np.full(cars, -1, dtype=np.int32),  # -1 before a car's first reset
             ends=np.zeros(cars, dtype=np.uint8),
-            worlds=np.zeros((cars, traffic, TRAFFIC_FIELDS), dtype=np.float32),
+            worlds=np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32),  # all are absent
         )
         #: float32 [n, rays], m/s: closing speeds at the last step or reset, as in `boxes.cast_boxes`.
         self.closing = np.zeros((cars, rays), dtype=np.float32)
@@ -150,7 +149,6 @@ class Simulator:
         starts: np.ndarray,
         maps: np.ndarray | int = 0,
         cars: np.ndarray | None = None,
-        keys: np.ndarray | int = 0,
         worlds: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Begin episodes.
@@ -159,8 +157,7 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
-            keys: uint64 [k], or one for all, from which the traffic around each car is spawned.
-            worlds: float32 [k, traffic, world.FIELDS], the traffic itself in place of keys; only the shape is checked.
+            worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`), if there is any.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
         Raises: ValueError with one line for a wrong shape, a number that is not finite, or a missing map. Nothing is
@@ -179,8 +176,8 @@ class Simulator:
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
         if not len(cars):
             return ranges, starts[:, 3]
-        if self.state.worlds.shape[1]:
-            self.state.worlds[cars] = self._traffic(starts, maps, keys, worlds)
+        if worlds is not None:
+            self.state.worlds[cars] = worlds
         rows = self._chart(maps)
         cells = max(visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
@@ -204,23 +201,6 @@ class Simulator:
             atlas = make_atlas([each.road for each in self._charted], [each.network for each in self._charted])
             self._physics = Physics(atlas, k, drivers(self.config), fan(rays, k.ray_first, k.ray_step))
         return self._physics
-
-    def _traffic(
-        self, starts: np.ndarray, maps: np.ndarray, keys: np.ndarray | int, worlds: np.ndarray | None
-    ) -> np.ndarray:
-        """The traffic [k, traffic, FIELDS] that episodes begin with."""
-        shape = (len(starts), *self.state.worlds.shape[1:])
-        if worlds is not None:
-            worlds = np.asarray(worlds, dtype=np.float32)
-            if worlds.shape != shape:
-                raise ValueError(f"traffic must be {shape[0]} worlds of {shape[1]} cars, not {worlds.shape}")
-            return worlds
-        keys = np.broadcast_to(np.asarray(keys, dtype=np.uint64), maps.shape)
-        spawned = np.empty(shape, dtype=np.float32)
-        for m in np.unique(maps):
-            of = np.flatnonzero(maps == m)
-            spawned[of] = spawn(self.scenarios[m].network, starts[of], shape[1], keys[of], self.config)
-        return spawned
 
     def _chart(self, maps: np.ndarray) -> np.ndarray:
         """Rows of maps [k] in the atlas, which has all scenarios; for one car alone its map, which is not copied."""

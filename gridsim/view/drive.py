@@ -21,7 +21,7 @@ from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import check_name
-from gridsim.traffic.world import LANE
+from gridsim.traffic.world import LANE, spawn
 from gridsim.view.render import Renderer, Window, interpolate
 
 COLUMNS = (
@@ -65,9 +65,12 @@ def manual(road_map: Map, traffic: int = 0) -> Simulator:
     return Simulator([road_map], 1, config, target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
-def _key(road_map: Map, episode: int) -> int:
-    """The key from which an episode's traffic is spawned."""
-    return int(np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)[0])
+def _begin(simulator: Simulator, start: np.ndarray, episode: int) -> np.ndarray:
+    """Begin an episode at start float32 [5], among its traffic. Returns: ranges float32 [1, rays], m."""
+    (road_map,), traffic = simulator.scenarios, simulator.state.worlds.shape[1]
+    key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
+    worlds = spawn(road_map.network, start[None], traffic, key, simulator.config)
+    return simulator.reset(start[None], worlds=worlds)[0]
 
 
 def poses_of(states: np.ndarray) -> np.ndarray:
@@ -187,7 +190,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     rows = []
     for k in range(n):
         if begins[k]:
-            ranges, _ = simulator.reset(drive.poses[k : k + 1], keys=_key(road_map, int(drive.episodes[k])))
+            ranges = _begin(simulator, drive.poses[k], int(drive.episodes[k]))
         else:
             ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
             if ends[0] != End.RUNNING:
@@ -223,7 +226,7 @@ def drive(
     start = np.asarray(start, dtype=np.float32)
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
-    ranges, _ = simulator.reset(start[None], keys=_key(road_map, 0))
+    ranges = _begin(simulator, start, 0)
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
@@ -232,7 +235,7 @@ def drive(
         if "r" in pressed:
             if simulator.state.cars[0, STEPS] > 0:
                 episode += 1
-            ranges, _ = simulator.reset(start[None], keys=_key(road_map, episode))
+            ranges = _begin(simulator, start, episode)
             path = [start[:2].copy()]
         before, view, there = simulator.state.cars[0].copy(), ranges[0], _present(simulator.state.worlds[0])
         ended = simulator.state.ends[0] != End.RUNNING
