@@ -221,7 +221,7 @@ class Simulator:
         n, state = len(self), self.state
         if state.maps.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
-        actions = checked_actions(actions, n)
+        actions = checked_actions(actions)
         ranges = np.empty_like(self.closing)
         speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)
         physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
@@ -246,21 +246,19 @@ def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
     return ranges, closing
 
 
-def checked_actions(actions: np.ndarray, n: int) -> np.ndarray:
-    """Actions int64 [n], or continuous ones float32 [n, 2] clipped to [-1, 1]; C-contiguous.
+def checked_actions(actions: np.ndarray) -> np.ndarray:
+    """Actions [n] as int64, or continuous ones [n, 2] as float32 clipped to [-1, 1]; C-contiguous.
 
-    Raises: ValueError with one line unless they are n whole numbers that name actions, or n pairs of numbers.
+    Raises: ValueError with one line unless they are whole numbers that name actions, or pairs of numbers.
     """
     array = np.asarray(actions)
-    if array.shape == (n, 2):
+    if array.ndim == 2:
         if array.dtype.kind not in "fiu":
             raise ValueError(f"continuous actions must be numbers, not {array.dtype}")
         if np.isnan(array).any():
             raise ValueError("continuous actions must be numbers, not nan")
         return np.ascontiguousarray(np.clip(array, -1.0, 1.0), dtype=np.float32)
-    if array.shape != (n,):
-        raise ValueError(f"there are {n} cars, not actions of shape {array.shape}")
-    wrong = (array < 0) | (array >= ACTIONS) if array.dtype.kind in "iu" else np.ones(n, dtype=np.bool_)
+    wrong = (array < 0) | (array >= ACTIONS) if array.dtype.kind in "iu" else np.ones(len(array), dtype=np.bool_)
     if wrong.any():
         raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {array[wrong][0]}")
     return np.ascontiguousarray(array, dtype=np.int64)
