@@ -43,18 +43,13 @@ class GridTable(NamedTuple):
     reach: np.float32  # m, the rays' full range
 
 
-def centres() -> tuple[np.ndarray, np.ndarray]:
-    """Centres of the cells in the car's frame: float64 [80, 80] m ahead of the front axle, and m to the left."""
-    at = (np.arange(CELLS) + 0.5) * CELL
-    ahead, left = np.meshgrid(CELLS * CELL - at, CELLS * CELL / 2 - at, indexing="ij")
-    return ahead, left
-
-
 @cache
 def grid_table(config: SimConfig) -> GridTable:
     """The table for a configuration's rays. Raises: ValueError as `config.constants`."""
     k, sensors = constants(config), config.sensors
-    ahead, left = centres()
+    at = (np.arange(CELLS) + 0.5) * CELL
+    # Centres of the cells, float64 [80, 80]: m ahead of the front axle, and m to the left.
+    ahead, left = np.meshgrid(CELLS * CELL - at, CELLS * CELL / 2 - at, indexing="ij")
     angle, radius = np.arctan2(left, ahead), np.hypot(left, ahead)
     view = math.radians(sensors.field_of_view)
     ray = np.rint((angle + view / 2) / (view / (sensors.rays - 1))).astype(np.int64)
