@@ -87,13 +87,9 @@ def fill_grid(table, ranges, grid):
 
 
 @njit(nogil=True)
-def _fill_grids(table, ranges, grids):
-    for n in range(ranges.shape[0]):
-        fill_grid(table, ranges[n], grids[n])
-
-
-def grids(table: GridTable, ranges: np.ndarray) -> np.ndarray:
+def grids(table, ranges):
     """Grids uint8 [n, 80, 80] of ranges float32 [n, rays] in m."""
-    made = np.empty((len(ranges), CELLS, CELLS), dtype=np.uint8)
-    _fill_grids(table, np.ascontiguousarray(ranges, dtype=np.float32), made.reshape(len(ranges), CELLS * CELLS))
-    return made
+    made = np.empty((ranges.shape[0], CELLS * CELLS), dtype=np.uint8)
+    for n in range(ranges.shape[0]):
+        fill_grid(table, ranges[n], made[n])
+    return made.reshape((ranges.shape[0], CELLS, CELLS))

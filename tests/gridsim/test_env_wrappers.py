@@ -23,7 +23,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.sensing import grid
 
-KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing.rewards_of, grid._fill_grids]
+KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing.rewards_of, grid.grids]
 KERNELS += [episodes._draw, map._starts_at]
 
 
