@@ -247,7 +247,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             episodes.numbers[which] += _U(1)
         else:
             episodes.keys[:] = _U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
-            episodes.numbers[:] = 0
             self._seeded = True
         for i in which:
             given = seeds[i]
@@ -280,13 +279,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Record what cars `which` sense now; `begun` [n]: whose episode has just begun."""
-        self._observer.take(self.ranges[which], begun[which], which)
-        if self.render_mode is not None:
-            self._remember(begun)
+        """Record what cars `which` sense now, and for pictures all cars' positions; update the window.
 
-    def _remember(self, begun: np.ndarray) -> None:
-        """Append the cars' positions to their paths, first cleared where an episode has `begun`; update the window."""
+        Args: begun bool [n]: whose episode has just begun.
+        """
+        self._observer.take(self.ranges[which], begun[which], which)
+        if self.render_mode is None:
+            return
         for path, car, new in zip(self._paths, self.simulator.state.cars, begun, strict=True):
             if new:
                 path.clear()
