@@ -309,12 +309,10 @@ def drive_main() -> None:
 def _drive() -> int:
     flags = parse(DriveFlags, DRIVE, sys.argv[1:])
     size, seconds = _size_and_seconds(flags.size, flags.seconds, flags.traffic)
-    config = SimConfig()
-    scenario, start = _map(flags.scenario, flags.seed, config)
+    scenario, start = _map(flags.scenario, flags.seed, SimConfig())
     traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic
     with contextlib.closing(Window(size, f"GridSim: {flags.scenario}")) as window:
-        period = config.episode.control_period
-        recorder = Recorder(flags.record, scenario, period, traffic) if flags.record else None
+        recorder = Recorder(flags.record, scenario, traffic) if flags.record else None
         try:
             done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
             print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")

@@ -34,6 +34,7 @@ COLUMNS = (
 """The columns of a recorded drive."""
 MAX_TRAFFIC = 1000  # of a drive that is read
 MAX_BYTES = 1 << 28  # of a file that is read
+PERIOD = EpisodeConfig.control_period  # s, of a control step
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
 _ENDLESS = 10_000_000  # control steps
@@ -98,10 +99,9 @@ def action_for(keys: set[str], speed: float) -> Action:
 class Recorder:
     """Writes a drive to a new file row by row, so that an interrupted drive is kept too."""
 
-    def __init__(self, path: str | os.PathLike[str], road_map: Map, period: float, traffic: int = 0):
+    def __init__(self, path: str | os.PathLike[str], road_map: Map, traffic: int = 0):
         """Create the file. Raises: GridSimError with one line if it exists or cannot be created."""
         self._map = (traffic, road_map.name, road_map.seed)
-        self._period = period
         self.path, self.rows = Path(path), 0
         try:
             self._file = open(path, "x", newline="", encoding="utf-8", buffering=1)  # noqa: SIM115, closed by close()
@@ -115,7 +115,7 @@ class Recorder:
     def write(self, step: int, pose: np.ndarray, action: int, episode: int) -> None:
         """Write one row: control steps since the episode's start; pose float32 [5]. Raises GridSimError."""
         # Nine digits represent a float32 exactly.
-        numbers = [f"{value:.9g}" for value in (round(step * self._period, 6), *pose.tolist())]
+        numbers = [f"{value:.9g}" for value in (round(step * PERIOD, 6), *pose.tolist())]
         try:
             self._writer.writerow([*numbers, int(action), episode, *self._map])
         except OSError as error:
@@ -221,17 +221,15 @@ def drive(
     Raises: GridSimError with one line if the recording cannot be written.
     """
     simulator = manual(road_map, traffic)
-    period = simulator.config.episode.control_period
-    pictures = max(1, round(period * FPS))
-    start = np.asarray(start, dtype=np.float32)
+    pictures = round(PERIOD * FPS)  # a control step
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
     ranges = _begin(simulator, start, 0)
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
-        if window.closed or pressed & {"escape", "q"} or steps * period >= seconds:
-            return {"seconds": steps * period, "episodes": episode + 1, "distance_m": best}
+        if window.closed or pressed & {"escape", "q"} or steps * PERIOD >= seconds:
+            return {"seconds": steps * PERIOD, "episodes": episode + 1, "distance_m": best}
         if "r" in pressed:
             if simulator.state.cars[0, STEPS] > 0:
                 episode += 1
@@ -251,7 +249,7 @@ def drive(
         for k in range(1, pictures + 1):
             part = k / pictures
             car = interpolate(before, after, part, road_map)
-            text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {car[STEPS] * period:.1f} s"
+            text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m    {car[STEPS] * PERIOD:.1f} s"
             if ended:
                 text += "    collision: R restarts"
             trace = np.array([*path, car[[X, Y]]])
@@ -259,5 +257,5 @@ def drive(
                 car, boxes=interpolate(there, then, part, road_map) if len(then) else None,
                 ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title),
             )  # fmt: skip
-            window.show(image, pictures / period)
+            window.show(image, FPS)
         path.append(after[[X, Y]].copy())

@@ -91,7 +91,7 @@ def straight_road(width, height, limit, half_width=0.0):
 def record_drive(path, scenario, start, episodes):
     """Record a person's drive: episodes from one start, of these actions, until they end; the states in the file."""
     simulator, states = manual(scenario), []
-    with closing(Recorder(path, scenario, 0.1)) as recorder:
+    with closing(Recorder(path, scenario)) as recorder:
         for episode, actions in enumerate(episodes):
             simulator.reset(start[None])
             for step, action in enumerate(actions):
