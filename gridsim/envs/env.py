@@ -317,7 +317,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             boxes=others,
             ranges=self.ranges[i],
             path=np.array(self._paths[i]),
-            text=f"{speed:.1f} m/s    {distance:,.0f} m",
+            text=(f"{speed:.1f} m/s    {distance:,.0f} m",),
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:

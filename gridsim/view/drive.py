@@ -254,7 +254,7 @@ def drive(
                 text += "    collision: R restarts"
             trace = np.array([*path, car[[X, Y]]])
             image = renderer.draw(
-                car, boxes=interpolate(there, then, part, road_map) if len(then) else None,
+                car, boxes=interpolate(there, then, part, road_map),
                 ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title),
             )  # fmt: skip
             window.show(image, FPS)

@@ -76,7 +76,7 @@ class Renderer:
         boxes: np.ndarray | None = None,
         ranges: np.ndarray | None = None,
         path: np.ndarray | None = None,
-        text: str | Sequence[str] = (),
+        text: Sequence[str] = (),
     ) -> np.ndarray:
         """Draw a state: uint8 [h, w, 3].
 
@@ -85,7 +85,7 @@ class Renderer:
             boxes: other cars [n, 4 or more]: x, y (m), heading (cosine, sine).
             ranges: ranges of the car's rays [rays], m.
             path: the car's past positions [n, 2], m.
-            text: a line at the lower left, or a pair of lines at the lower left and the upper left.
+            text: a line for the lower left, and one for the upper left.
         """
         width, height = self.size
         position, heading = np.asarray(car[[X, Y]], np.float64), np.asarray(car[[COS, SIN]], np.float64)
@@ -101,14 +101,13 @@ class Renderer:
             shapes.append(self._path_shapes(np.asarray(path, dtype=np.float64)))
         if ranges is not None:
             shapes.append(self._ray_shapes(position, heading, np.asarray(ranges, dtype=np.float64)))
-        if boxes is not None and len(boxes):
+        if boxes is not None:
             boxes = np.asarray(boxes, dtype=np.float64)
             shapes.append(self._placed(self._other, boxes[:, :2], boxes[:, 2:4]))
         own = paint.car_parts(*self._outline, float(car[STEERING]), paint.EGO)
         shapes.append(self._placed(own, position[None], heading[None]))
         paint.draw_shapes(freeze(np.concatenate(shapes)), image)
-        lines = (text,) if isinstance(text, str) else text
-        for line, corner in zip(lines, ("lower", "upper"), strict=False):
+        for line, corner in zip(text, ("lower", "upper"), strict=False):
             if line:
                 self._write(image, line, corner)
         return image
