@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridsim.jit import leaf
-from gridsim.maps.roads import CELLS_PER_M, THICK_WALL
+from gridsim.maps.roads import CELLS_PER_M, THICK_WALL, freeze
 from gridsim.sensing.simd import LEAP, MARGIN, SIMD_RAYS, vector_march
 
 _SCALE = np.float32(CELLS_PER_M)
@@ -27,9 +27,7 @@ def fan(count: int, first: float | np.float32, step: float | np.float32) -> np.n
     """
     ray = np.minimum(np.arange(-(-count // SIMD_RAYS) * SIMD_RAYS), count - 1)
     angle = first + step * ray
-    table = np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32)
-    table.setflags(write=False)
-    return table
+    return freeze(np.stack([np.cos(angle), np.sin(angle)]).astype(np.float32))
 
 
 @leaf
