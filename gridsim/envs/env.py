@@ -138,10 +138,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if render_mode == "human" or has_display():
             self.metadata["render_modes"].append("human")
         self.config = config or SimConfig()
-        self.scenario = scenario
-        self.traffic = default_traffic(scenario) if traffic is None else traffic
-        self.simulator = Simulator([], num_envs, self.config, max_steps=max_episode_steps, traffic=self.traffic)
-        self._episodes = Episodes(num_envs, scenario, maps, map_seed, self.traffic, self.config)
+        traffic = default_traffic(scenario) if traffic is None else traffic
+        self.simulator = Simulator([], num_envs, self.config, max_steps=max_episode_steps, traffic=traffic)
+        self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
         self.simulator.scenarios = self._episodes.maps
         self.render_mode = render_mode
         self._views: dict[int, Renderer] = {}  # by map
