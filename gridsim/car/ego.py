@@ -1,9 +1,4 @@
-"""The ego car: its state, and its control step.
-
-`control` is one control step of one car: advance in sub-steps with collision checks, count new ground, check for the
-end. The batched `envs.simulator` and `evolution.episodes.rollout` both call it. The state is float32 [FIELDS], with the
-fields below.
-"""
+"""The ego car: its state, float32 [FIELDS] with the fields below, and its control step."""
 
 from __future__ import annotations
 
@@ -135,8 +130,9 @@ def look(road, constants, fan, car, world, ranges, closing):
 
 @leaf
 def control(road, constants, car, visits, world, acceleration, steering, target, max_steps):
-    """One control step of a car. The traffic in `world` must already have moved.
+    """One control step of a car: advance in sub-steps with collision checks, count new ground, check for the end.
 
+    The traffic in `world` must already have moved.
     Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits, m of new ground and control steps.
     Returns: an End as a number.
     """

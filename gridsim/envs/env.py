@@ -1,7 +1,5 @@
 """Gymnasium environments: the native vector environment, and a single environment that wraps it with one car.
 
-`import gridsim` registers an id for each scenario, `GridSim/Seamless-v0` and so on.
-
 Observation:
 
 * `rays`, float32 [rays + 1]: the rays' ranges as shares of 50 m and the speed as a share of 30 m/s; `motion` inserts

@@ -1,7 +1,4 @@
-"""Batches of cars: state, reset and step, arrays in and arrays out.
-
-What one car does in a control period is in `ego.py`.
-"""
+"""Batches of cars; what one car does in a control period is in `car.ego`."""
 
 from __future__ import annotations
 
