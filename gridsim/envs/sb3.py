@@ -31,12 +31,11 @@ class SB3VecEnv(VecEnv):
 
         Returns: observations. Raises: ValueError with one line for invalid options, or if only some cars have them.
         """
-        seeds = self._seeds if any(seed is not None for seed in self._seeds) else None
         names = self._options[0].keys()
         if any(own.keys() != names for own in self._options):
             raise ValueError("set_options must name the same options for every car")
         options = {name: [own[name] for own in self._options] for name in names}
-        observations, _ = self.cars.reset(seed=seeds, options=options)
+        observations, _ = self.cars.reset(seed=self._seeds, options=options)
         self._reset_seeds()
         self._reset_options()
         self._rewards, self._steps = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=int)
