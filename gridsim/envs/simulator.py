@@ -17,8 +17,6 @@ from gridsim.sensing.rays import fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
-ACTIONS = len(Action)
-
 
 class Physics(NamedTuple):
     """What all cars share, as kernels read it; arrays are read-only."""
@@ -255,7 +253,7 @@ def checked_actions(actions: np.ndarray) -> np.ndarray:
         if np.isnan(array).any():
             raise ValueError("continuous actions must be numbers, not nan")
         return np.ascontiguousarray(np.clip(array, -1.0, 1.0), dtype=np.float32)
-    wrong = (array < 0) | (array >= ACTIONS) if array.dtype.kind in "iu" else np.ones(len(array), dtype=np.bool_)
+    wrong = (array < 0) | (array >= len(Action)) if array.dtype.kind in "iu" else np.ones(len(array), dtype=np.bool_)
     if wrong.any():
-        raise ValueError(f"actions must be whole numbers from 0 to {ACTIONS - 1}, not {array[wrong][0]}")
+        raise ValueError(f"actions must be whole numbers from 0 to {len(Action) - 1}, not {array[wrong][0]}")
     return np.ascontiguousarray(array, dtype=np.int64)

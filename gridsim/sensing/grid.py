@@ -24,7 +24,7 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.roads import freeze
 
-_F, _I, _N = np.float32, np.int32, np.uint64
+_F, _N = np.float32, np.uint64
 
 CELLS = 80  # along each side
 CELL = 0.5  # m
