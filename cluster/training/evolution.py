@@ -102,7 +102,7 @@ class Evolution(Learning):
         if candidate is not None and not driven.lost[trial.rows][0]:
             self._judge(candidate, driven.results[trial], self.steps - 1)
         if self.champion is not None:
-            self.search.keep_champion(self.champion.genome)
+            self.search.champion = self.champion.genome
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         row = {
             "fitness/best": led_score if np.isfinite(led_score) else -1.0,
@@ -170,7 +170,7 @@ class Evolution(Learning):
         self.search.restore(named(arrays, "search_"))
         self.search.generation = meta["generation"]
         if self.champion is not None:
-            self.search.keep_champion(self.champion.genome)
+            self.search.champion = self.champion.genome
         curriculum = self.curriculum
         for name in CRASHES:
             setattr(curriculum, name, arrays[name])

@@ -55,13 +55,11 @@ class Search(ABC):
         self.spec, self.config, self.seed = spec, config, seed
         self.generation = 0  # completed generations
         self.asked: Generation | None = None
+        self.champion: np.ndarray | None = None  # the run's, float32 [genes], for searches with it as an elite
 
     @abstractmethod
     def start_from(self, genome: np.ndarray) -> None:
         """Start from a genome float32 [genes] in place of random ones."""
-
-    def keep_champion(self, champion: np.ndarray) -> None:  # noqa: B027
-        """Use the run's champion float32 [genes] as an elite, if the search does so."""
 
     @abstractmethod
     def leader(self) -> np.ndarray | None:

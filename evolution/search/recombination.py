@@ -36,7 +36,6 @@ class Recombination(Search):
         path: float64 [free genes], the evolution path; each initially N(0, 1), as under random selection.
         sigma: the step size.
         average: float64 [genes], exponential moving average of the centres.
-        champion: float32 [genes], the run's champion, or None.
     """
 
     kept = ("centre", "average", "path", "sigma")
@@ -49,13 +48,9 @@ class Recombination(Search):
         self.path = self._rng(1).standard_normal(len(self._free))
         self.average = np.zeros(0)
         self.sigma = config.sigma
-        self.champion: np.ndarray | None = None
 
     def start_from(self, genome: np.ndarray) -> None:
         self.centre = self.average = genome.astype(np.float64)
-
-    def keep_champion(self, champion: np.ndarray) -> None:
-        self.champion = champion
 
     def leader(self) -> np.ndarray | None:
         """The average of centres, which drives better than any one of them."""

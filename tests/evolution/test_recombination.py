@@ -33,7 +33,7 @@ def test_the_champion_is_the_second_member_bit_for_bit():
     search = begun(SearchConfig(population=16, groups=2))
     champion = np.random.default_rng(3).normal(size=GENES).astype(F)
     champion[:2] = -0.0, 1e-42
-    search.keep_champion(champion)
+    search.champion = champion
     asked = search.ask()
     members = search.genomes(np.arange(16))
     assert members[0].tobytes() == search.centre.astype(F).tobytes()
