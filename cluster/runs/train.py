@@ -14,11 +14,11 @@ import hashlib
 import json
 import math
 import signal
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from time import perf_counter, time
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from cluster.tracking.address import TrackingError, check_uri, shown, with_passw
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
-from cluster.training.trainer import Learning, Maps, State, held_out_episodes, now
+from cluster.training.trainer import Learning, Maps, State, held_out_episodes
 from cluster.workers import kernels
 from cluster.workers.pool import SerialPool, WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
@@ -124,8 +124,8 @@ def train(
     warming = kernels.Warming(settings)
     try:
         session = Session(
-            run, workers.open(maps), maps, uri, experiment, reporter, now() if started is None else started, initial,
-            parent_id, wall_limit_s,
+            run, workers.open(maps), maps, uri, experiment, reporter, perf_counter() if started is None else started,
+            initial, parent_id, wall_limit_s,
         )  # fmt: skip
         if warming.processes:
             with reporter.compiling():
@@ -136,7 +136,7 @@ def train(
         lock(run.path)
         run.write_config()
         if started is None:
-            session.started = now()
+            session.started = perf_counter()
         with reporter.learning(session):
             session.learn()
             session.finish(workers.number)
@@ -192,7 +192,7 @@ class Session:
     uri: str  # MLflow's address
     experiment: str
     reporter: Reporter = field(default_factory=Reporter)
-    started: float = field(default_factory=now)  # time.perf_counter() from which the run's time counts
+    started: float = field(default_factory=perf_counter)  # from which the run's time counts
     initial: np.ndarray | None = None  # a genome to start from, float32 [genes]
     parent_id: str = ""  # MLflow's run that this one belongs to
     wall_limit_s: float = math.inf  # of learning, also before it was resumed, after which only a first step begins
@@ -222,7 +222,7 @@ class Session:
                 raise RunError(f"{path} was written by another version of GridSim; start a new run") from error
             self._sha256.update(saved.tobytes())
         self.tracker = make_tracker(
-            self.run, self.uri, self.experiment, self.parent_id, started=time.time() - self._wall_s()
+            self.run, self.uri, self.experiment, self.parent_id, started=time() - self._wall_s()
         )
 
     def learn(self) -> None:
@@ -257,13 +257,13 @@ class Session:
 
     def _wall_s(self) -> float:
         """Seconds that the run has taken, in this process and before."""
-        return self.learning.wall_before_s + now() - self.started
+        return self.learning.wall_before_s + perf_counter() - self.started
 
     def _out_of_time(self) -> bool:
         return self._wall_s() >= self.wall_limit_s
 
     def _save_now_and_then(self) -> None:
-        if self._saved_steps < self.learning.steps and now() - self._saved_at >= self.learning.save_every_s:
+        if self._saved_steps < self.learning.steps and perf_counter() - self._saved_at >= self.learning.save_every_s:
             self.save()
 
     def save(self) -> None:
@@ -283,7 +283,7 @@ class Session:
             meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, "tracking": tracking}
             meta |= {"steps": done, "steps_sha256": sha256.hexdigest()}
             checkpoint.save(path / CHECKPOINT, {k: v for k, v in arrays.items() if k != "history"}, meta)
-            self._saved_steps, self._sha256, self._saved_at = done, sha256, now()
+            self._saved_steps, self._sha256, self._saved_at = done, sha256, perf_counter()
             for k in range(saved, done):
                 del learning.elites[k]
             self._write_history()

@@ -8,7 +8,6 @@ returned what.
 from __future__ import annotations
 
 import threading
-import time
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -334,8 +333,3 @@ def mean_speed(results: np.ndarray, period_s: float) -> float:
     """Mean over episodes of new ground over time, in m/s."""
     seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
     return float((results["distance"] / seconds).mean())
-
-
-def now() -> float:
-    """The clock by which durations are measured; nothing that is learned depends on it."""
-    return time.perf_counter()
