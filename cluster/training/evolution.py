@@ -135,7 +135,7 @@ class Evolution(Learning):
         candidate = self.candidate()
         return (
             candidate is not None
-            and not self._is_tried(candidate)
+            and (self.tried is None or self.tried.tobytes() != candidate.tobytes())
             and sum(latest) >= least * config.latest
             and self.validation_steps <= config.validation_share * self.car_steps
         )

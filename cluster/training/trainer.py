@@ -197,10 +197,6 @@ class Learning(ABC):
             raise PoolError("there is no champion: each network that was to be validated killed its workers")
         return self.champion
 
-    def _is_tried(self, candidate: np.ndarray) -> bool:
-        """Whether a candidate is the last one that was validated."""
-        return self.tried is not None and self.tried.tobytes() == candidate.tobytes()
-
     def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
         """Make a step's candidate champion if its validation, RESULT [1, episodes], is better than the champion's."""
         self.tried = candidate
