@@ -115,7 +115,7 @@ class Dqn(Learning):
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         weights = finite(self.learner.weights, self.learner.updates)
         limits = Limits(self.curriculum.goal, EPISODE_STEPS)
-        task = self._task(CollectTask, episodes, limits, weights=weights, epsilons=self._epsilons(n), keys=keys)
+        task = CollectTask(*self._base(episodes, limits), weights, self._epsilons(n), keys)
         brought = self.pool.collect(task, partial(self.on_progress, "collect"), self._train)
         self._report("collect", brought)
         check_any_left(brought.lost, "collect")

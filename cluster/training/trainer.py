@@ -14,13 +14,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from cluster.runs.settings import RunSettings
 from cluster.workers.pool import Call, Chunk, Meanwhile, Outcome, PoolError, WorkerPool
-from cluster.workers.worker import CollectTask, Task
+from cluster.workers.worker import Task
 from evolution.episodes.curriculum import (
     FINAL_SEEDS,
     HELD_OUT_EPISODES,
@@ -39,8 +39,8 @@ from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build, seed_of_map
 
-T = TypeVar("T", Task, CollectTask)
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
+Names = tuple[tuple[str, int], ...]  # of maps, as pools know them
 
 
 class Maps:
@@ -212,20 +212,17 @@ class Learning(ABC):
         self, stage: str, members: Generation, episodes: Episodes, limits: Limits,
         asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
     ) -> Outcome:  # fmt: skip
-        own = {"parents": members.parents, "key": members.key, "mutation": members.mutation}
-        task = self._task(Task, episodes, limits, **own)
+        task = Task(*self._base(episodes, limits), members.parents, members.key, members.mutation)
         outcome = self.pool.evaluate(task, members.recipes, partial(self.on_progress, stage), asked, meanwhile)
         self.car_steps += int(outcome.results["steps"].sum())
         self._report(stage, outcome)
         return outcome
 
-    def _task(self, kind: Callable[..., T], episodes: Episodes, limits: Limits, **own: Any) -> T:
-        """A task of a kind, with what only this kind has."""
-        names = self._names(episodes.maps)
-        return kind(self.settings.policy, episodes.rows, episodes.worlds, names, limits, self.sim, **own)
+    def _base(self, episodes: Episodes, limits: Limits) -> tuple[str, np.ndarray, np.ndarray, Names, Limits, SimConfig]:
+        """The first fields of a task, which both kinds have."""
+        return self.settings.policy, episodes.rows, episodes.worlds, self._names(episodes.maps), limits, self.sim
 
-    def _names(self, seeds: Sequence[int]) -> tuple[tuple[str, int], ...]:
-        """Maps as pools know them."""
+    def _names(self, seeds: Sequence[int]) -> Names:
         scenario = self.settings.scenario
         return tuple((scenario, seed_of_map(scenario, seed)) for seed in seeds)
 
