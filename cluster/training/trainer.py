@@ -1,7 +1,6 @@
 """What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
 
-A learner is a loop of steps between a pool and a run's files: `evolution` has the searches' loop, `dqn` the DQN's. All
-its decisions follow from the seed and from what the workers return; none depends on the clock or on which worker
+All decisions follow from the seed and from what the workers return; none depends on the clock or on which worker
 returned what.
 """
 
@@ -78,38 +77,18 @@ class Maps:
 
 @dataclass
 class Champion:
-    """The best member found so far, by validation.
+    """The best member found so far, and its figures in the validation episodes."""
 
-    Attributes:
-        genome: float32 [genes].
-        score: of all validation episodes (`Curriculum.validation_score`).
-        success_rate: of the same.
-        distance_m: its mean distance there.
-        step: in which it was found.
-    """
-
-    genome: np.ndarray
-    score: float = 0.0
+    genome: np.ndarray  # float32 [genes]
+    score: float = 0.0  # `Curriculum.validation_score`
     success_rate: float = 0.0
-    distance_m: float = 0.0
-    step: int = -1
+    distance_m: float = 0.0  # mean
+    step: int = -1  # in which it was found
 
 
 @dataclass
 class Learning(ABC):
-    """One run of a learner, between pool and files.
-
-    Attributes:
-        settings: what the run was asked to do.
-        pool: evaluates members and collects experience.
-        maps: builds maps.
-        initial: a genome to start from, float32 [genes].
-        history: a row of figures for each step (`columns`).
-        elites: the network of each step that is not saved yet, by the step, float32 [genes].
-        validation_steps: how many of the car-steps validation took.
-        lost_chunks: members of an evaluation, and episodes of experience, that killed every worker that tried them.
-        warn: called with one line for each of those, and for each worker that is replaced because it is silent.
-    """
+    """One run of a learner, between pool and files."""
 
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number, and their names in MLflow
     verb: ClassVar[str]  # what is done to a network
@@ -119,16 +98,17 @@ class Learning(ABC):
     settings: RunSettings
     pool: WorkerPool
     maps: Maps
-    initial: np.ndarray | None = None
+    initial: np.ndarray | None = None  # a genome to start from, float32 [genes]
     champion: Champion | None = None
     tried: np.ndarray | None = None  # the last candidate that was validated, float32 [genes]
     solved: bool = False
-    history: list[dict[str, float]] = field(default_factory=list)
-    elites: dict[int, np.ndarray] = field(default_factory=dict)
+    history: list[dict[str, float]] = field(default_factory=list)  # a row of figures for each step (`columns`)
+    elites: dict[int, np.ndarray] = field(default_factory=dict)  # the network of each unsaved step, float32 [genes]
     car_steps: int = 0
-    validation_steps: int = 0
-    lost_chunks: int = 0
+    validation_steps: int = 0  # how many of these validation took
+    lost_chunks: int = 0  # members, and episodes of experience, that killed every worker that tried them
     wall_before_s: float = 0.0
+    # Called with one line for each of the lost, and for each worker that is replaced because it is silent.
     warn: Callable[[str], None] = warnings.warn
     on_progress: Callable[[str, int, int], None] = lambda *_: None
     meanwhile: Callable[[], None] = lambda: None  # called in each step while the workers are busy
@@ -175,10 +155,9 @@ class Learning(ABC):
     def choose_champion(self) -> Champion:
         """The champion of a run that ends: if it is unsolved, it or the last candidate, by drives on maps of their own.
 
-        A champion is the best of many on the same maps, so that its score there is too high, in traffic by some
-        percent, and later candidates that drive better do not reach it.
+        A champion is the best of many on the same maps, so later candidates that drive better may not reach its score.
         This is not in the checkpoint: a run that is extended goes on as if it had never ended. Its car-steps do not
-        count, as those of the held-out drives do not.
+        count.
         """
         candidate, before, car_steps = self.candidate(), self.champion, self.car_steps
         if candidate is not None and not self.solved and not (before and np.array_equal(candidate, before.genome)):
