@@ -122,8 +122,7 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
             learner.step()
         taken, leader = learner.car_steps, learner.candidate()
         assert leader is not None
-        goal = learner.curriculum.goal_limits()
-        driven = learner.drive("validate", leader[None], learner.curriculum.validation(), goal)
+        driven = learner.drive("validate", leader[None], learner.curriculum.validation())
         learner.car_steps = taken
         found.append(float(success_rate(driven.results)[0]))
     return found

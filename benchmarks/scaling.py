@@ -120,7 +120,7 @@ def last_generations(
     restore()
     coming = [curriculum.episodes(learning.steps + k) for k in range(LAST + 1)]
     for episodes in (curriculum.validation(), *coming):
-        while len(learning.drive("warm", nobody, episodes, curriculum.goal_limits()).busy_s) < workers:
+        while len(learning.drive("warm", nobody, episodes).busy_s) < workers:
             pass
     restore()
     figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}

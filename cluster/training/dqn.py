@@ -154,9 +154,7 @@ class Dqn(Learning):
         """Validate the averaged network. Returns its figures."""
         network = finite(self.learner.average, self.learner.updates)
         self.elites[self.steps] = network
-        driven = self.drive(
-            "validate", network[None], self.curriculum.validation(), self.curriculum.goal_limits(), self._train
-        )
+        driven = self.drive("validate", network[None], self.curriculum.validation(), self._train)
         check_any_left(driven.lost, "validate")
         self._judge(network, driven.results, self.steps)
         results = driven.results[0]

@@ -165,7 +165,7 @@ class Learning(ABC):
             finalists.append((candidate, self.steps - 1))
             episodes = self.curriculum.validation(FINAL_SEEDS if before else VALIDATION_SEEDS)
             genomes = np.stack([genome for genome, _ in finalists])
-            driven = self.drive("validate", genomes, episodes, self.curriculum.goal_limits())
+            driven = self.drive("validate", genomes, episodes)
             self.champion = None
             for k, (genome, step) in enumerate(finalists):
                 if not driven.lost[k]:
@@ -210,12 +210,10 @@ class Learning(ABC):
         for text in call.warnings:
             self.warn(f"{self.settings.step_name} {self.steps}, {stage}: {text}")
 
-    def drive(
-        self, stage: str, genomes: np.ndarray, episodes: Episodes, limits: Limits, meanwhile: Meanwhile | None = None
-    ) -> Outcome:
-        """Results [n, e] of given genomes [n, genes], which are sent as plain copies."""
+    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, meanwhile: Meanwhile | None = None) -> Outcome:
+        """Results [n, e] of given genomes [n, genes], sent as plain copies, in full episodes if these say no less."""
         copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
-        return self._evaluate(stage, copies, episodes, limits, meanwhile=meanwhile)
+        return self._evaluate(stage, copies, episodes, self.curriculum.goal_limits(), meanwhile=meanwhile)
 
     def add_wall_clock(self, wall_s: float) -> None:
         """Add the wall clock's columns to the last row."""
@@ -228,7 +226,7 @@ class Learning(ABC):
         assert self.champion is not None
         before = self.car_steps
         episodes = held_out_episodes(self.maps, self.settings.traffic)
-        driven = self.drive("held out", self.champion.genome[None], episodes, self.curriculum.goal_limits())
+        driven = self.drive("held out", self.champion.genome[None], episodes)
         check_any_left(driven.lost, "held out")
         self.car_steps = before  # not part of learning
         return summarise(driven.results[0], self.sim.episode.control_period)
@@ -256,7 +254,6 @@ class Learning(ABC):
         for name in self.kept:
             setattr(self, name, meta[name])
         self.history = [dict(zip(self.columns, row, strict=True)) for row in arrays["history"].tolist()]
-        self.elites, self._lines = {}, []
         self.tried = arrays["tried"] if arrays["tried"].size else None
         if meta["champion"]:
             self.champion = Champion(arrays["champion"], *meta["champion"])

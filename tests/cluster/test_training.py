@@ -173,7 +173,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     score = np.zeros(50)
     for g, group in enumerate(groups):
         own = Episodes(episodes.maps, episodes.rows[g * e : g * e + e], episodes.worlds[g * e : g * e + e])
-        alone = evolution.drive("alone", genomes[group], own, limits)
+        alone = evolution.drive("alone", genomes[group], own.with_limits(limits))
         assert alone.results.tobytes() == outcome.results[group, g * e : g * e + e].tobytes()
         score[group] = evolution._score(alone.results, targets(own.rows, limits))
     assert told["score"].tobytes() == score.tobytes()
@@ -186,7 +186,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert row["fitness/best"] == score.max()
     else:
         first = len(episodes.rows)
-        alone = evolution.drive("alone", leader[None], followed, long)
+        alone = evolution.drive("alone", leader[None], followed)
         led = outcome.results[50, first : first + len(followed.rows)]
         assert len(led) == config.leader_episodes
         assert alone.results[0].tobytes() == led.tobytes()
@@ -197,7 +197,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert row["fitness/best"] == evolution._score(alone.results, long.target)[0]
         assert row["fitness/mean"] == score.mean()
         assert len(recipes) == 52
-        validation = evolution.drive("alone", candidate[None], curriculum.validation(), curriculum.goal_limits())
+        validation = evolution.drive("alone", candidate[None], curriculum.validation())
         assert validation.results[0].tobytes() == outcome.results[51, -config.validation :].tobytes()
         assert evolution.champion.success_rate == (validation.results["end"] == End.SUCCESS).mean()
     assert outcome.done == outcome.total
@@ -231,7 +231,7 @@ def test_a_run_that_ends_chooses_between_champion_and_last_candidate_on_other_ma
     curriculum = evolution.curriculum
     finals = curriculum.validation(FINAL_SEEDS)
     assert not set(finals.maps) & {*curriculum.validation().maps, *HELD_OUT_SEEDS}
-    metres = evolution.drive("alone", two, finals, curriculum.goal_limits()).results["distance"].mean(axis=1)
+    metres = evolution.drive("alone", two, finals).results["distance"].mean(axis=1)
     assert metres[0] != metres[1]
     for champion, candidate in (two, two[::-1]):
         evolution.champion = Champion(champion, 0.9, 0.9, 1000.0, 0)
