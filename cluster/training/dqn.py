@@ -39,7 +39,6 @@ WARM_UP = 20_000  # rows of replay before the first update
 SLICE = 8  # updates between two looks at the workers
 RANDOM_SHARE = 0.02  # share of --anneal over which exploration falls from random driving
 SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
-LAST_SHARE = 0.05  # share of the learning rate that is left after --anneal
 PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
 CALM = 3  # evaluations in a row with little change of these, after which the run has converged
 
@@ -63,8 +62,8 @@ class Dqn(Learning):
         super().__post_init__()
         s = self.settings
         config = DqnConfig(
-            batch=s.batch, learning_rate=s.learning_rate, final_learning_rate=LAST_SHARE,
-            learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1), target_period=s.target_period,
+            batch=s.batch, learning_rate=s.learning_rate, target_period=s.target_period,
+            learning_rate_updates=max(int(s.anneal * s.updates / 1000), 1),
         )  # fmt: skip
         self.learner = DqnLearner(self.spec, config, s.seed, s.device)
         self.replay = Replay(self.spec, s.replay, s.discount)

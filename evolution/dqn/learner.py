@@ -45,7 +45,7 @@ class DqnConfig:
 
     batch: int = 256  # transitions of an update
     learning_rate: float = 1e-3  # Adam's, at the beginning
-    final_learning_rate: float = 0.1  # its final value, relative to that
+    final_learning_rate: float = 0.05  # its final value, relative to that
     learning_rate_updates: int = 50_000  # over which it falls linearly
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates between copies of the network to the target

@@ -89,7 +89,7 @@ def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
         network.genome.grad = torch.cat([part.flatten() for part in gradients])
         norm = torch.nn.utils.clip_grad_norm_([network.genome], 0.05)
         assert (norm > 0.05) == (k % 2 == 0)
-        adam.param_groups[0]["lr"] = 0.01 * [1, 0.775, 0.55, 0.325, 0.1][k]
+        adam.param_groups[0]["lr"] = 0.01 * [1, 0.7625, 0.525, 0.2875, 0.05][k]
         adam.step()
         learner.update(batch)
         assert learner.weights == pytest.approx(network.genome.numpy(), abs=1e-6)
@@ -118,7 +118,8 @@ def test_a_chain_of_two_states_is_learned():
         rewards = np.append(np.array(ends) == End.SUCCESS, 0).astype(F)
         columns = (np.array([*actions, NO_ACTION], dtype=np.uint8), rewards, np.array([*ends, 0], dtype=np.uint8))
         replay.add(Experience(observations, *columns))
-    learner = learner_of(batch=64, learning_rate=0.01, target_period=40, learning_rate_updates=1_000)
+    rates = {"learning_rate": 0.01, "learning_rate_updates": 1_000, "final_learning_rate": 0.1}
+    learner = learner_of(batch=64, target_period=40, **rates)
     learner.train(replay, 1_200)
     q = learner.q_values(np.eye(32, dtype=F)[:2])
     wanted = np.full((2, 8), discount**2)
