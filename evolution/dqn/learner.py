@@ -1,19 +1,17 @@
 """The DQN learner: a Q network, its target network, and their updates. The only file with gradients.
 
-The Q network is a policy: it has the shape of a `PolicySpec`, its parameters are a genome, and its 8 outputs are the
-actions' values. So it can drive wherever a policy can.
+The Q network is a policy whose 8 outputs are the actions' values. So it can drive wherever a policy can.
 
 An update (Mnih et al. 2015, "Human-level control through deep reinforcement learning") takes a batch from the replay
 and moves Q(s_t, a_t) towards
 
     y = r_t + discount Q_target(s_{t+1}, argmax_a Q(s_{t+1}, a))
 
-with the action chosen by the network and valued by the target: Double DQN (van Hasselt et al. 2016, "Deep
-Reinforcement Learning with Double Q-learning"). The loss is Huber's, the optimiser Adam (Kingma and Ba 2015).
+which is Double DQN (van Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning"). The loss is
+Huber's, the optimiser Adam (Kingma and Ba 2015).
 
-The result depends only on the seed, the parameters and the replay's contents. The random numbers of update u depend on
-(seed, u), so training may be split into blocks of any size. On the CPU, results are bit-identical in all processes on
-one type of machine.
+The result depends only on the seed, the parameters and the replay's contents. On the CPU it is bit-identical in all
+processes on one type of machine.
 """
 
 from __future__ import annotations
@@ -116,10 +114,7 @@ def tanh(x: torch.Tensor) -> torch.Tensor:
 
 
 class QNetwork:
-    """A policy's network in PyTorch. Its parameters are one genome; the layers are views of it.
-
-    So the optimiser's step, a copy to the target and a conversion to a policy are one operation each.
-    """
+    """A policy's network in PyTorch. Its parameters are one genome, of which the layers are views."""
 
     def __init__(self, spec: PolicySpec, device: torch.device):
         self.spec = spec
@@ -139,13 +134,7 @@ def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
 
 
 class DqnLearner:
-    """A Q network in training.
-
-    Args:
-        seed: of the initial weights and of the samples from the replay.
-        device: as for `device_of`.
-    Raises: ValueError with one line for a missing device.
-    """
+    """A Q network in training on a `device_of`. The seed is that of its initial weights and its samples."""
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):
         # For the whole process: results depend on the number of threads, and the workers use the other cores.
@@ -169,10 +158,7 @@ class DqnLearner:
 
     @property
     def average(self) -> np.ndarray:
-        """The average of the network over its latest updates, as a genome: float32 [genes], a copy.
-
-        It drives better than the network itself, which fluctuates from update to update.
-        """
+        """The average over the latest updates, which drives better than the network itself: float32 [genes], a copy."""
         return self._average.cpu().numpy().copy()
 
     def load_weights(self, genome: np.ndarray) -> None:
@@ -181,10 +167,7 @@ class DqnLearner:
             tensor.copy_(torch.from_numpy(genome))
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        """A copy on the device, in memory allocated by PyTorch.
-
-        The alignment of NumPy's memory differs between processes, and the rounding of matrix products depends on it.
-        """
+        """A copy on the device; PyTorch's memory is aligned alike in all processes, which rounding depends on."""
         return torch.from_numpy(array).to(self.device, copy=True)
 
     def targets(self, batch: Batch) -> torch.Tensor:
@@ -227,9 +210,8 @@ class DqnLearner:
         return loss.item(), q.mean().item()
 
     def train(self, replay: Replay, updates: int) -> tuple[float, float]:
-        """Make `updates` updates from a replay. Splitting them over several calls gives the same result.
+        """Make updates from a replay; several calls give the same result as one. Returns: mean loss and mean value.
 
-        Returns: the means of their losses and values.
         Raises: ValueError if the replay has no transitions; FloatingPointError as `update`.
         """
         made = []
