@@ -30,7 +30,6 @@ _F = np.float32
 
 NO_ACTION = 255  # of an episode's last row
 UNITS = _F(4096.0)  # fixed-point units per 1
-OLDEST = 255  # largest age; greater ones are clipped to it
 _AREA = CELLS * CELLS
 _FRAME = _AREA // 4  # bytes
 _LEAST, _GREATEST = _F(-32768.0), _F(32767.0)
@@ -65,11 +64,11 @@ def join(parts: Sequence[Experience]) -> Experience:
 
 
 def ages(experience: Experience) -> np.ndarray:
-    """Number of rows before each row in its episode, at most OLDEST: uint8 [rows]."""
+    """Number of rows before each row in its episode: int64 [rows]."""
     row = np.arange(len(experience.actions))
     begins = np.zeros(len(row), dtype=np.intp)
     begins[1:] = np.where(experience.actions[:-1] == NO_ACTION, row[1:], 0)
-    return np.minimum(row - np.maximum.accumulate(begins), OLDEST).astype(np.uint8)
+    return row - np.maximum.accumulate(begins)
 
 
 @leaf

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from evolution.dqn.experience import (
     NO_ACTION,
-    OLDEST,
     UNITS,
     Experience,
     ages,
@@ -66,5 +65,5 @@ def test_frames_are_stacked_as_the_network_stacks_them(frames: int, turn: int) -
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=6))
 def test_ages_count_from_each_episodes_first_row(lengths: list[int]) -> None:
-    wanted = [min(k, OLDEST) for steps in lengths for k in range(steps + 1)]
+    wanted = [k for steps in lengths for k in range(steps + 1)]
     assert ages(made(MlpSpec((5,)), lengths)).tolist() == wanted
