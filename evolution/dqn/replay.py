@@ -1,10 +1,7 @@
 """The replay buffer: a ring of the latest rows of experience, from which transitions are drawn uniformly.
 
 A row of `Experience` is a row of the ring, so that each observation is stored once. A transition is a row with an
-action and the row after it. The value after it is multiplied by the discount, or by 0 if the step ended in COLLISION,
-IDLE or SUCCESS. After TIME it is estimated from the episode's last row.
-
-The oldest rows are overwritten first. Rows of grids that have lost earlier frames of their stack are no longer drawn.
+action and the row after it. Rows of grids that have lost earlier frames of their stack are no longer drawn.
 """
 
 from __future__ import annotations
@@ -48,12 +45,7 @@ def _draw(drawable, size, key, rows):
 
 
 class Replay:
-    """The last `capacity` rows of experience; an episode of T steps has T + 1 of them.
-
-    Args:
-        spec: the network that uses the observations.
-        discount: of a control step.
-    """
+    """The last `capacity` rows of experience for a network, and the discount of a control step."""
 
     def __init__(self, spec: PolicySpec, capacity: int, discount: float):
         self.spec, self.capacity, self.discount = spec, capacity, discount
@@ -69,10 +61,7 @@ class Replay:
         return min(self.added, self.capacity)
 
     def add(self, experience: Experience) -> None:
-        """Append whole episodes, overwriting the oldest rows of a full ring.
-
-        If there are more rows than the capacity, the last ones are kept.
-        """
+        """Append whole episodes over the oldest rows; of more rows than the capacity, the last ones are kept."""
         rows = len(experience.actions)
         kept = min(rows, self.capacity)
         first = (self.added + rows - kept) % self.capacity
@@ -91,12 +80,9 @@ class Replay:
         self.transitions = int(np.count_nonzero(self._drawable[: len(self)]))
 
     def sample(self, key: int, batch: int) -> Batch:
-        """Draw transitions, with replacement.
+        """Draw transitions with replacement, which depend only on the key, in [0, 2^64), and the replay's contents.
 
-        Args:
-            key: in [0, 2^64); the sample depends only on it and on the replay's contents.
-            batch: number of transitions.
-        Raises: ValueError if there are no transitions.
+        Raises: ValueError if there are none.
         """
         if not self.transitions:
             raise ValueError("the replay holds no transition yet; add experience first")
