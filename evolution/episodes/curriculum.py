@@ -1,10 +1,9 @@
 """The curriculum: the episodes of each generation, and validation, which chooses the champion.
 
-Distance and speed alone are deceptive under limited grip: at first, the best members drive into the first bend at full
-speed. So episodes begin short, and their length doubles when the leader (the best genome known before a generation)
-succeeds. Half of them start shortly before a crash of a recent leader, mostly where half of the members crash again:
-there is most to learn. The groups of a generation have different episodes, so that selection uses many although
-each member drives few. The champion is chosen on validation maps, which are not used in training.
+Episodes begin short, since at first the best members drive into the first bend at full speed, and their length doubles
+when the leader (the best genome known before a generation) succeeds. Half of them start shortly before a crash of a
+recent leader, mostly where half of the members crash again: there is most to learn. Each group of a generation has its
+own, so that selection uses many although each member drives few.
 
 The state is arrays and numbers; random numbers depend only on (seed, generation).
 """
@@ -94,7 +93,7 @@ class Curriculum:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
 
     def maps_in_use(self, generation: int) -> int:
-        """Number of training maps in use; it grows one by one."""
+        """Number of training maps in use."""
         return min(self.config.maps, self.config.first_maps + generation)
 
     def limits(self) -> Limits:
@@ -102,7 +101,7 @@ class Curriculum:
         return self._limits(self.target)
 
     def leader_limits(self) -> Limits:
-        """Limits of the leader's episodes, which are longer than the members'."""
+        """Limits of the leader's episodes."""
         return self._limits(min(self.config.leader_stretch * self.target, self.goal))
 
     def _limits(self, target: float) -> Limits:
@@ -125,10 +124,7 @@ class Curriculum:
         return Episodes(seeds, *lane_starts([self.build(seed) for seed in seeds], local, rng, self.crowd))
 
     def episodes(self, generation: int) -> Episodes:
-        """A generation's episodes, group by group: first new starts, then crash starts.
-
-        All groups have the same number of each.
-        """
+        """A generation's episodes, group by group: first new starts, then crash starts, as many in each group."""
         config, rng = self.config, self._rng(generation, 0)
         maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
         fresh = self._new_starts(np.concatenate(maps), rng)

@@ -1,9 +1,8 @@
 """The fitness by which members are ranked.
 
 It has two elements: the distance travelled, and the paced distance, travelled at a forward speed within the scenario's
-interval. If 80 % of the distance is paced, all of it counts as paced, so that braking for other cars costs nothing. The
-weighted mean of both is relative to the episode's target, on a scale that is mostly logarithmic (the first bend is
-worth as much as the last kilometre) and partly linear (so that the last kilometre still counts).
+interval. Their weighted mean is relative to the episode's target, on a scale that is mostly logarithmic (the first bend
+is worth as much as the last kilometre) and partly linear.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import numpy as np
 
 LINEAR_SHARE = 0.4  # of the value; without it, a slow last kilometre would cost almost nothing
 PACED_SHARE = 0.7  # weight of the paced distance in the scalar; the rest is for the distance
-PACED_ENOUGH = 0.8  # share of the distance that has to be paced for all of it to count as paced
+PACED_ENOUGH = 0.8  # share of the distance which, if paced, counts as all: braking for other cars costs nothing
 
 
 def scalar(results: np.ndarray, target: np.ndarray | float) -> np.ndarray:
