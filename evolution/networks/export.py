@@ -3,11 +3,10 @@
 The input of the module is the environment's observation, float32 [n, inputs]:
 
 * rays: the observation unchanged (`policy.act_on`);
-* grid: the cells of all frames, 0 to 255, the newest frame last, each row by row; then the speed in m/s,
-  `info["speed_mps"]`.
+* grid: the cells of all frames, 0 to 255, the newest frame last, each row by row; then the speed in m/s.
 
 It returns the outputs, float32 [n, 8]; the action is the largest one, the first of ties. They equal the kernels'
-outputs up to float32 rounding, so the action is the same unless two outputs almost tie.
+outputs up to float32 rounding.
 
 PyTorch, which takes seconds to import, is imported inside functions.
 """
