@@ -37,17 +37,12 @@ Observation = Literal["rays", "grid"]
 
 @dataclass(frozen=True)
 class PolicySpec(ABC):
-    """A network's shape. Two kinds: `MlpSpec` on the rays, `CnnSpec` on the occupancy grid.
-
-    Attributes:
-        hidden: units, or channels, of the hidden layers.
-        outputs: one for each action; the largest one is chosen.
-    """
+    """A network's shape. Two kinds: `MlpSpec` on the rays, `CnnSpec` on the occupancy grid."""
 
     observation: ClassVar[Observation]
+    outputs: ClassVar[int] = ACTIONS  # one for each action; the largest one is chosen
 
-    hidden: tuple[int, ...]
-    outputs: int = ACTIONS
+    hidden: tuple[int, ...]  # units, or channels, of the hidden layers
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
@@ -104,7 +99,6 @@ class MlpSpec(PolicySpec):
 
     observation = "rays"
 
-    hidden: tuple[int, ...] = (6, 7)
     motion: bool = False
     steering: bool = False
 
