@@ -1,7 +1,4 @@
-"""The base class of searches: ask for a generation's recipes, tell their scores. Also tournament selection.
-
-`recombination` is the default search; `two_parents` has the classic one and random search.
-"""
+"""The base class of searches: ask for a generation's recipes, tell their scores. Also tournament selection."""
 
 from __future__ import annotations
 
@@ -88,9 +85,8 @@ class Search(ABC):
         return self.asked
 
     def tell(self, scores: np.ndarray) -> None:
-        """Take the members' scores float64 [population]; higher is better. They are compared only within groups.
+        """Take the members' scores float64 [population], to be compared within groups; higher is better, NaN the worst.
 
-        NaN counts as the worst score.
         Raises: RuntimeError if no generation was asked for; ValueError for a wrong number of scores.
         """
         if self.asked is None:
@@ -121,10 +117,7 @@ def split(members: int, groups: int, first: int = 0) -> list[slice]:
 
 
 def ranks(scores: np.ndarray, groups: Sequence[slice]) -> np.ndarray:
-    """Rank of each member in its group, float64 [n] in (0, 1): the share of lower scores plus half the share of ties.
-
-    Ranks of members can be compared even if their groups had easier or harder episodes.
-    """
+    """Rank of each member in its group, float64 [n] in (0, 1): share of lower scores plus half the share of ties."""
     standing = np.empty(len(scores))
     for group in groups:
         _, place, count = np.unique(scores[group], return_inverse=True, return_counts=True)

@@ -2,9 +2,8 @@
 
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
 adaptation (Hansen and Ostermeier 2001). Noise is left-right symmetric (`symmetry`). Children come in mirrored pairs
-(Brockhoff et al. 2010), the centre plus and minus the same noise, which drive the same episodes. The elites are the
-centre and the champion (before the first champion, the average of centres). They are evaluated unmodified, and can win
-like other members.
+(Brockhoff et al. 2010), the centre plus and minus the same noise, which drive the same episodes. The elites are
+evaluated unmodified, and can win like other members.
 """
 
 from __future__ import annotations
@@ -29,25 +28,18 @@ _MAX_GROWTH = 2.0
 
 
 class Recombination(Search):
-    """Children are centre + sigma * scales * N(0, 1), see `gene_scales`; the first generation is random.
-
-    Attributes:
-        centre: float64 [genes], or [0] before the first generation.
-        path: float64 [free genes], the evolution path; each initially N(0, 1), as under random selection.
-        sigma: the step size.
-        average: float64 [genes], exponential moving average of the centres.
-    """
+    """Children are centre + sigma * scales * N(0, 1), see `gene_scales`; the first generation is random."""
 
     kept = ("centre", "average", "path", "sigma")
 
     def __init__(self, spec: PolicySpec, config: SearchConfig, seed: int):
         super().__init__(spec, config, seed)
-        self.centre = np.zeros(0)
+        self.centre = np.zeros(0)  # float64 [genes], or [0] before the first generation
+        self.average = np.zeros(0)  # exponential moving average of the centres
         self._free = symmetry(spec).free
-        # From 0, the step size would shrink until the path has grown to its expected length.
+        # The evolution path, N(0, 1) as under random selection: from 0, the step size would shrink until it has grown.
         self.path = self._rng(1).standard_normal(len(self._free))
-        self.average = np.zeros(0)
-        self.sigma = config.sigma
+        self.sigma = config.sigma  # the step size
 
     def start_from(self, genome: np.ndarray) -> None:
         self.centre = self.average = genome.astype(np.float64)
