@@ -31,7 +31,7 @@ from cluster.workers import ray_pool
 from cluster.workers.pool import Chunk, Outcome, WorkerPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import Task, Worker
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, no_traffic, targets
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, targets
 from evolution.networks.policy import PolicySpec
 from evolution.search import fitness
 from evolution.search.base import recipes as some_recipes
@@ -41,6 +41,7 @@ from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.traffic.world import FIELDS
 
 POLICY = "mlp:6,7"  # 311 genes
 CHILDREN = 100_000  # members that the coordinator alone is timed with
@@ -100,7 +101,8 @@ def make_task(parents: np.ndarray, key: int = 1, count: int = EPISODES) -> Task:
     """A generation's task without maps; each episode is marked by its number."""
     episodes = np.zeros(count, EPISODE)
     episodes["start"][:, 4] = np.arange(count)
-    return Task(POLICY, episodes, no_traffic(count), (), Limits(150.0, 245), SimConfig(), parents, key, Mutation())
+    worlds = np.zeros((count, 0, FIELDS), dtype=np.float32)
+    return Task(POLICY, episodes, worlds, (), Limits(150.0, 245), SimConfig(), parents, key, Mutation())
 
 
 def rows(count: int) -> np.ndarray:
@@ -236,10 +238,11 @@ def step_s(policy: str, members: int = 64) -> float:
     genomes = (rng.normal(size=(members, spec.size)) * 0.3).astype(np.float32)
     episodes = np.zeros(4, EPISODE)
     episodes["start"] = sample_starts(scenario, 4, rng)
+    worlds = np.zeros((4, 0, FIELDS), dtype=np.float32)
     times = []
     for _ in range(4):
         begun = time.perf_counter()
-        results, _, _ = evaluate(spec, genomes, [scenario], episodes, Limits(150.0, 245), SimConfig())
+        results, _, _ = evaluate(spec, genomes, [scenario], episodes, Limits(150.0, 245), SimConfig(), worlds)
         times.append((time.perf_counter() - begun) / results["steps"].sum())
     return statistics.median(times[1:])
 

@@ -23,9 +23,10 @@ import numpy as np
 from cluster.workers.pool import Chunk, Parcel, cut, metres
 from cluster.workers.pool import size as episodes_in
 from cluster.workers.worker import Task
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, no_traffic
+from evolution.episodes.rollout import EPISODE, RESULT, Limits
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.config import SimConfig
+from gridsim.traffic.world import FIELDS
 
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POPULATION = 10_000
@@ -87,10 +88,10 @@ class Call:
     def parcels(self) -> list[Parcel]:
         """What is asked for as the pool cuts it, knowing from the last generation how long a metre takes."""
         n, e = self.drives.shape
-        episodes = np.zeros(e, dtype=EPISODE)
+        episodes, worlds = np.zeros(e, dtype=EPISODE), np.zeros((e, 0, FIELDS), dtype=np.float32)
         episodes["target"] = self.targets
         task = Task(
-            "mlp:6,7", episodes, no_traffic(e), (), Limits(1.0, 1), SimConfig(), np.zeros((1, 1), np.float32), 0,
+            "mlp:6,7", episodes, worlds, (), Limits(1.0, 1), SimConfig(), np.zeros((1, 1), np.float32), 0,
             Mutation(),
         )  # fmt: skip
         asked = self.asked or [Chunk(slice(0, n), slice(0, e))]

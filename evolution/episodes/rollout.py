@@ -302,18 +302,12 @@ def with_limits(episodes: np.ndarray, limits: Limits) -> np.ndarray:
     return episodes
 
 
-def checked_worlds(episodes: np.ndarray, limits: Limits, worlds: np.ndarray | None) -> np.ndarray:
-    """The traffic float32 [e, cars, world.FIELDS] of episodes; None becomes traffic without cars.
-
-    Raises: ValueError if its shape does not fit or the time limit is out of range.
-    """
+def _check(episodes: np.ndarray, limits: Limits, worlds: np.ndarray) -> None:
+    """Raises: ValueError if the traffic's shape does not fit or the time limit is out of range."""
     if not 0 < limits.steps <= MAX_STEPS:
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
-    if worlds is None:
-        worlds = no_traffic(len(episodes))
     if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
         raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
-    return worlds
 
 
 def evaluate(
@@ -323,15 +317,12 @@ def evaluate(
     episodes: np.ndarray,
     limits: Limits,
     config: SimConfig,
-    worlds: np.ndarray | None = None,
+    worlds: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive every genome through every episode.
 
-    Args:
-        genomes: float32 [n, spec.size].
-        road_maps: the maps that the episodes index.
-        episodes: EPISODE [e].
-        worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
+    Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
+    with, float32 [e, cars, world.FIELDS].
 
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
     start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, world.FIELDS]).
@@ -339,7 +330,8 @@ def evaluate(
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
-    buffers, worlds = policy_buffers(spec, config), checked_worlds(episodes, limits, worlds)
+    _check(episodes, limits, worlds)
+    buffers = policy_buffers(spec, config)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     # Transposed, because the kernel fills one episode at a time.
     results = np.zeros((len(episodes), len(genomes)), dtype=RESULT)
@@ -373,24 +365,20 @@ def collect(
     keys: np.ndarray,
     limits: Limits,
     config: SimConfig,
-    worlds: np.ndarray | None = None,
+    worlds: np.ndarray,
 ) -> tuple[Experience, np.ndarray]:
     """Drive one policy through every episode, with some random actions, and record its experience.
 
-    Args:
-        weights: float32 [spec.size].
-        road_maps: the maps that the episodes index.
-        episodes: EPISODE [e].
-        epsilons: float32 [e], each episode's share of random actions, which are uniform over all actions.
-        keys: uint64 [e], seeds of each episode's random numbers.
-        worlds: the traffic that each episode begins with, float32 [e, cars, world.FIELDS]; None is no traffic.
+    Args: as `evaluate`'s; weights float32 [spec.size]; each episode's share of random actions, which are uniform over
+    all actions, float32 [e], and the seed of its random numbers, uint64 [e].
 
     Returns: (the experience, in the order of the episodes; RESULT [e]).
     Raises: ValueError with one line if the weights or worlds do not fit.
     """
     if weights.shape != (spec.size,):
         raise ValueError(f"the weights of {spec} are [{spec.size}], not {weights.shape}")
-    worlds, episodes = checked_worlds(episodes, limits, worlds), with_limits(episodes, limits)
+    _check(episodes, limits, worlds)
+    episodes = with_limits(episodes, limits)
     buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config)
     weights = freeze(weights.astype(np.float32, copy=False))
     setups = freeze(episodes["start"]), freeze(episodes["target"]), freeze(episodes["steps"].astype(np.int64))
@@ -406,11 +394,6 @@ def collect(
         )
     driven = np.arange(experience.actions.shape[1]) <= results["steps"][:, None]
     return Experience(*(array[driven] for array in experience)), results
-
-
-def no_traffic(episodes: int) -> np.ndarray:
-    """Worlds float32 [episodes, 0, fields] without cars."""
-    return np.zeros((episodes, 0, TRAFFIC_FIELDS), dtype=np.float32)
 
 
 def trajectory(

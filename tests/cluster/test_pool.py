@@ -29,7 +29,7 @@ from cluster.workers.pool import (
 )
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.dqn.experience import Experience
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, _rollout, no_traffic
+from evolution.episodes.rollout import EPISODE, RESULT, Limits, _rollout
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation, _breed
@@ -78,7 +78,7 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
     if episodes is None:
         episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
         episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
-    worlds = no_traffic(len(episodes))
+    worlds = np.zeros((len(episodes), 0, FIELDS), dtype=np.float32)
     return Task("mlp:6,7", episodes, worlds, maps, Limits(150.0, 300), SimConfig(), parents, 12345, Mutation())
 
 
@@ -87,7 +87,8 @@ def make_collect_task(n: int) -> CollectTask:
     policy, keys = "mlp:6,7", np.arange(n, dtype=np.uint64)
     weights, epsilons = np.zeros(PolicySpec.parse(policy).size, dtype=np.float32), np.zeros(n, dtype=np.float32)
     episodes = np.zeros(n, dtype=EPISODE)
-    return CollectTask(policy, episodes, no_traffic(n), (), Limits(150.0, 300), SimConfig(), weights, epsilons, keys)
+    worlds = np.zeros((n, 0, FIELDS), dtype=np.float32)
+    return CollectTask(policy, episodes, worlds, (), Limits(150.0, 300), SimConfig(), weights, epsilons, keys)
 
 
 def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:

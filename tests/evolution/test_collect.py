@@ -11,7 +11,7 @@ from driving import to_bytes
 
 from cluster.runs.champion import load_champion
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
-from evolution.episodes.rollout import Limits, collect, evaluate, no_traffic
+from evolution.episodes.rollout import Limits, collect, evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode
 from gridsim.car.ego import STEERING, End
@@ -165,7 +165,7 @@ def test_what_does_not_fit_is_refused(ask: Asking) -> None:
     of = ask("mlp:6,7", 4, 0.5, 0)
     for change, text in (
         ({"weights": of.weights[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
-        ({"worlds": no_traffic(3)}, "traffic of 4 episodes is"),
+        ({"worlds": of.worlds[:3]}, "traffic of 4 episodes is"),
         ({"limits": Limits(100.0, 0)}, "1 to 65535 steps, not 0"),
     ):
         with pytest.raises(ValueError, match=text):

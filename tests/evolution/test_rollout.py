@@ -146,6 +146,6 @@ def test_without_room_for_anybody_there_is_no_traffic(among):
     spec, genome, maps, episodes, _, _ = among
     absent = np.zeros((9, CARS, TRAFFIC_FIELDS), dtype=F)
     absent[..., LANE] = -1.0
-    alone, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG)
+    alone, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, absent[:, :0])
     results, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, worlds=absent)
     assert results.tobytes() == alone.tobytes()
