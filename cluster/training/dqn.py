@@ -22,16 +22,6 @@ from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
 from evolution.episodes.rollout import Limits
 
-COLUMNS = (
-    "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean", "network/success_rate",
-    "validation/success_rate", "reward/mean", "loss", "q/mean", "q/change", "exploration", "learning_rate", "episodes",
-    "updates", "car_steps", "wall_s", "car_steps_per_s",
-)  # fmt: skip
-"""Columns of history.csv after `evaluation`, and their names in MLflow.
-
-`mean` is over the training episodes since the previous evaluation, `best` is the network's in validation.
-"""
-
 EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there
 BATCH_STEPS = 32_768  # car-steps of a batch, about
 EPISODES = (64, 2048)  # of a batch, at least and at most
@@ -47,7 +37,12 @@ CALM = 3  # evaluations in a row with little change of these, after which the ru
 class Dqn(Learning):
     """One run of the DQN."""
 
-    columns: ClassVar[tuple[str, ...]] = COLUMNS
+    # `mean` is over the training episodes since the previous evaluation, `best` is the network's in validation.
+    columns: ClassVar[tuple[str, ...]] = (
+        "distance_m/best", "distance_m/mean", "speed_mps/best", "speed_mps/mean", "network/success_rate",
+        "validation/success_rate", "reward/mean", "loss", "q/mean", "q/change", "exploration", "learning_rate",
+        "episodes", "updates", "car_steps", "wall_s", "car_steps_per_s",
+    )  # fmt: skip
     verb: ClassVar[str] = "training"
     kept: ClassVar[tuple[str, ...]] = (*Learning.kept, "batches", "episodes", "calm", "owed", "mean_steps")
 
@@ -73,7 +68,7 @@ class Dqn(Learning):
         self.probe_q = np.zeros((0, self.spec.outputs), dtype=np.float32)
 
     def step(self) -> dict[str, float]:
-        """Train until the next evaluation is due, and evaluate. Returns its row of the history (COLUMNS)."""
+        """Train until the next evaluation is due, and evaluate."""
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
         steps, rewards = 0, 0.0
         results: list[np.ndarray] = []

@@ -23,13 +23,6 @@ from evolution.search.base import Generation, Search
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
 
-COLUMNS = (
-    "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
-    "speed_mps/mean", "target_m", "leader/success_rate", "validation/success_rate", "car_steps", "wall_s",
-    "car_steps_per_s",
-)  # fmt: skip
-"""Columns of history.csv after `generation`, and their names in MLflow. `best` is the leader's."""
-
 CRASHES = ("crashes", "crash_worlds", "failures")  # the curriculum's arrays in a checkpoint
 AHEAD = 8  # generations for which training maps are built
 
@@ -38,7 +31,11 @@ AHEAD = 8  # generations for which training maps are built
 class Evolution(Learning):
     """One run of a search."""
 
-    columns: ClassVar[tuple[str, ...]] = COLUMNS
+    columns: ClassVar[tuple[str, ...]] = (  # `best` is the leader's
+        "fitness/best", "fitness/mean", "fitness/std", "distance_m/best", "distance_m/mean", "speed_mps/best",
+        "speed_mps/mean", "target_m", "leader/success_rate", "validation/success_rate", "car_steps", "wall_s",
+        "car_steps_per_s",
+    )  # fmt: skip
     verb: ClassVar[str] = "evolving"
     save_every_s: ClassVar[float] = 1.0
 
@@ -66,7 +63,7 @@ class Evolution(Learning):
     # ------------------------------------------------------------------------------------------------ a generation
 
     def step(self) -> dict[str, float]:
-        """Evolve one generation. Returns its row of the history (COLUMNS), without the wall clock's columns."""
+        """Evolve one generation."""
         curriculum, limits, period = self.curriculum, self.curriculum.limits(), self.sim.episode.control_period
         leader = self.search.leader()
         candidate = leader if self._promising() else None

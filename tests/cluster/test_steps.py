@@ -11,7 +11,7 @@ from cluster.runs.run import ELITES, RunError, is_finished, new_run, open_run
 from cluster.runs.settings import EvolveSettings
 from cluster.runs.steps import read_elites
 from cluster.tracking.address import check_uri
-from cluster.training.evolution import COLUMNS, Evolution
+from cluster.training.evolution import Evolution
 from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool
 from gridsim.config import SimConfig
@@ -56,7 +56,7 @@ def session(run, maps, uri=""):
 def found(session):
     """All that a run has found, but for the clock."""
     arrays, meta = session.learning.state()
-    rows = [{name: row[name] for name in COLUMNS if name not in CLOCK} for row in session.learning.history]
+    rows = [{name: row[name] for name in Evolution.columns if name not in CLOCK} for row in session.learning.history]
     state = {name: array.tobytes() for name, array in arrays.items() if name != "history"}
     return rows, state, meta, read_elites(session.run.path, SETTINGS.policy).tobytes()
 
@@ -109,7 +109,7 @@ def test_a_checkpoint_is_as_small_after_many_steps(maps, tmp_path):
             assert not learning.elites, "those that are saved are not kept in memory"
         learning.elites[learning.steps] = genome + learning.steps
         learning.search.generation += 1
-        learning.history.append(dict.fromkeys(COLUMNS, 0.1 + learning.steps))
+        learning.history.append(dict.fromkeys(Evolution.columns, 0.1 + learning.steps))
         return learning.history[-1]
 
     learning.step = step

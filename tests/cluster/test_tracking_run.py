@@ -7,8 +7,8 @@ from cluster.runs.run import new_run
 from cluster.runs.settings import DqnSettings, EvolveSettings
 from cluster.runs.train import NOT_LOGGED
 from cluster.tracking.description import describe, group, held_out_metrics, model_name, params, tags
-from cluster.training.dqn import COLUMNS as DQN_COLUMNS
-from cluster.training.evolution import COLUMNS
+from cluster.training.dqn import Dqn
+from cluster.training.evolution import Evolution
 
 HELD_OUT = {"episodes": 64, "success_rate": 0.984, "distance_m": 2000.2, "speed_mps": 7.61, "collision_rate": 0.016}
 SUMMARY = {"generations": 48, "car_steps": 96_300_000, "wall_s": 57.2, "solved": True, "held_out": HELD_OUT}
@@ -45,7 +45,7 @@ def test_tags_and_params_are_what_runs_are_compared_by():
 
 def test_every_metric_is_explained(root):
     explained = set(re.findall(r"^\| `([^`]+)`", (root / "docs/mlflow.md").read_text(), re.MULTILINE))
-    logged = {*COLUMNS, *DQN_COLUMNS, *held_out_metrics(HELD_OUT)} - {*NOT_LOGGED}
+    logged = {*Evolution.columns, *Dqn.columns, *held_out_metrics(HELD_OUT)} - {*NOT_LOGGED}
     assert logged <= explained
 
 
