@@ -36,7 +36,8 @@ def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
     start = np.asarray(start, dtype=F)
     simulator = Simulator([road_map], 1, config, target, max_steps)
     ranges, _ = simulator.reset(start[None])
-    actions, states = [], []
+    actions: list[int] = []
+    states = []
     while simulator.state.ends[0] == End.RUNNING:
         actions.append(int(choose(len(actions), ranges[0], simulator.state.cars[0])))
         ranges, *_ = simulator.step(np.array(actions[-1:]))
