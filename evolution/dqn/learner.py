@@ -134,7 +134,10 @@ def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
 
 
 class DqnLearner:
-    """A Q network in training on a `device_of`. The seed is that of its initial weights and its samples."""
+    """A Q network in training; `seed` is that of its initial weights and its samples.
+
+    Raises: ValueError with one line for a missing device (`device_of`).
+    """
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):
         # For the whole process: results depend on the number of threads, and the workers use the other cores.

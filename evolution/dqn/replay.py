@@ -1,7 +1,8 @@
 """The replay buffer: a ring of the latest rows of experience, from which transitions are drawn uniformly.
 
 A row of `Experience` is a row of the ring, so that each observation is stored once. A transition is a row with an
-action and the row after it. Rows of grids that have lost earlier frames of their stack are no longer drawn.
+action and the row after it. The value after it counts unless the step ended in COLLISION, IDLE or SUCCESS: TIME only
+truncates an episode. Rows of grids that have lost earlier frames of their stack are no longer drawn.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A (mu/mu, lambda) evolution strategy (Beyer 2001) whose weights are shares of won tournaments, with cumulative step-size
 adaptation (Hansen and Ostermeier 2001). Noise is left-right symmetric (`symmetry`). Children come in mirrored pairs
 (Brockhoff et al. 2010), the centre plus and minus the same noise, which drive the same episodes. The elites are
-evaluated unmodified, and can win like other members.
+the centre and the champion (at first, the average of centres). They are evaluated unmodified, and can win like others.
 """
 
 from __future__ import annotations
