@@ -25,6 +25,9 @@ Name = tuple[str, int]
 Work = tuple[bytes, int, int]
 """A chunk: its members' recipes, its first episode and the one after its last."""
 
+MOST_MAPS = 256
+"""In the store, of at most 2 MiB each: more than one run needs, so that runs one after another do not fill it."""
+
 INLINE = 1 << 16
 """Bytes of a task up to which each worker is sent its own copy: through the object store it takes 1 ms longer."""
 
@@ -86,7 +89,7 @@ class Shared:
 
     def __init__(self, put: Callable[[Any], Any], build_map: BuildMap):
         self._put, self._build_map = put, build_map
-        self._maps: dict[Name, Any] = {}  # references
+        self._maps: dict[Name, Any] = {}  # references; the latest used ones last
         self._sent = 0  # bytes of maps since the last task
         self._names: tuple[Name, ...] = ()  # of the latest task's maps
         self._task: Any = None  # the latest one, pickled, or a reference to that
@@ -96,6 +99,7 @@ class Shared:
         scenarios = {scenario for scenario, _ in task.maps}
         self._maps = {name: ref for name, ref in self._maps.items() if name[0] in scenarios}
         self.put_maps(task.maps)
+        self._maps = dict(list(self._maps.items())[-MOST_MAPS:])
         sent, self._sent = self._sent, 0
         data = pickle.dumps(task, protocol=5)
         self._names, self._task = task.maps, data if len(data) <= INLINE else self._put(data)
@@ -104,7 +108,9 @@ class Shared:
     def put_maps(self, names: Sequence[Name]) -> None:
         """Put those of these maps that are new."""
         for name in names:
-            if name not in self._maps:
+            if name in self._maps:
+                self._maps[name] = self._maps.pop(name)
+            else:
                 arrays = self._build_map(*name).arrays()
                 self._maps[name] = self._put(arrays)
                 self._sent += sum(array.nbytes for array in arrays.values())

@@ -360,6 +360,15 @@ def test_the_store_keeps_one_scenarios_maps_and_a_worker_gets_each_once() -> Non
     assert lacking == [("seamless", 7)]
 
 
+def test_the_store_forgets_the_maps_that_were_not_used_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cluster.workers.actor.MOST_MAPS", 4)
+    shared = Shared(lambda value: value, lambda *_: Megabyte())  # type: ignore[arg-type]
+    known: set[tuple[str, int]] = set()
+    for seeds, gone in (([0, 1, 2, 3], []), ([0, 4], [1]), ([0, 1, 2], [3]), ([5, 6, 7], [0, 1, 4])):
+        shared.put(make_task(tuple(("city", seed) for seed in seeds)))
+        assert {seed for _, seed in shared.update(known)[1]} == set(gone)
+
+
 def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_are_gone() -> None:
     task, maps = drive_task()
     recipes = make_recipes(20)
