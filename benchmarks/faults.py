@@ -7,8 +7,8 @@ are over, no process of theirs may be left, and no file that is no result. 20 fa
 after another. The same seed draws the same faults, but not at the same steps of a run.
 
 A disk, and the shared memory in which Ray keeps its objects, are mounted for the campaign alone, so that they can be
-filled; where that is not allowed, these two faults are left out. libfaketime sets the runs' clocks; where it is not
-installed, this fault is left out. Hosts and their links fail in tests/cluster/test_cluster.py and test_faults.py.
+filled; where that is not allowed, these two faults are left out. Hosts and their links fail in
+tests/cluster/test_cluster.py and test_faults.py.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ MARK = "GRIDSIM_FAULTS"  # variable by which the processes of a campaign are fou
 DISK_MIB, SHARED_MIB = 256, 6144  # each run's Ray looks for 768 MiB of shared memory
 SHARED_MEMORY = Path("/dev/shm")
 MOUNTS = "GRIDSIM_FAULTS_MOUNTS"  # variable that is set where mounts are this campaign's own
-CLOCK = next(iter(sorted(Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1"))), None)
 LONG_S = 300.0  # that anything may take
 SAME = ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate")  # columns of the history
 
@@ -120,13 +119,11 @@ class Campaign:
         self._numbers, self._stopped = count(), False
         self.disk = folder / "disk"
         self.disk.mkdir()
-        missing = set() if CLOCK else {"clock set back"}
+        full = {"disk full", "shared memory full"}
         if MOUNTS in os.environ:
             for place, mib in (self.disk, DISK_MIB), (SHARED_MEMORY, SHARED_MIB):
                 subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", str(place)], check=True)
-        else:
-            missing |= {"disk full", "shared memory full"}
-        self.faults = [name for name in FAULTS if name not in missing]
+        self.faults = [name for name in FAULTS if name not in full or MOUNTS in os.environ]
         self.folder = folder
         self.environment = {**os.environ, MARK: str(folder), "RAY_TMPDIR": str(folder / "ray")}
         (folder / "ray").mkdir()
@@ -262,22 +259,14 @@ class Run:
     def __init__(self, campaign: Campaign, name: str):
         self.campaign, self.name, self._first = campaign, name, name
         self.rng = random.Random(f"{campaign.seed} {name}")
-        self.clock = campaign.folder / f"clock-{name}"
-        self.clock.write_text("+0")
-        self._environment = dict(campaign.environment)
-        if CLOCK:
-            self._environment |= {
-                "LD_PRELOAD": str(CLOCK), "FAKETIME_TIMESTAMP_FILE": str(self.clock), "FAKETIME_CACHE_DURATION": "1",
-                "FAKETIME_DONT_FAKE_MONOTONIC": "1", "FAKETIME_DISABLE_SHM": "1",
-            }  # fmt: skip
         self._said = campaign.folder / f"said-{name}.log"
 
     def start(self, *flags: str) -> subprocess.Popen:
         """`gridsim-evolve` with these flags, in a process group of its own."""
-        command = [str(BIN / "gridsim-evolve"), *flags]
+        command, campaign = [str(BIN / "gridsim-evolve"), *flags], self.campaign
         with open(self._said, "a") as said:
             return subprocess.Popen(
-                command, cwd=self.campaign.disk, env=self._environment, stdout=subprocess.DEVNULL, stderr=said,
+                command, cwd=campaign.disk, env=campaign.environment, stdout=subprocess.DEVNULL, stderr=said,
                 process_group=0,
             )  # fmt: skip
 
@@ -305,7 +294,13 @@ class Run:
             if process.returncode == 0:
                 break
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
-            if "Traceback" in self.said() or not (refused or process.returncode in (-signal.SIGKILL, 130, 1)):
+            ends_known = (
+                -signal.SIGKILL,
+                -signal.SIGBUS,
+                130,
+                1,
+            )  # SIGBUS: who writes to a full shared memory is killed
+            if "Traceback" in self.said() or not (refused or process.returncode in ends_known):
                 raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
         with campaign.shared:
             unsent = re.search("not logged to MLflow|what MLflow lacks is not sent", self.said())
@@ -361,10 +356,6 @@ def _fill(folder: Path, run: Run, process: subprocess.Popen) -> None:
             ballast.unlink(missing_ok=True)
 
 
-def _set_clock_back(run: Run) -> None:
-    run.clock.write_text(f"-{run.rng.randint(1, 100)}m")
-
-
 FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
     "worker killed": lambda run, process: _signal_a_worker(run, process, signal.SIGKILL),
     "worker stopped": lambda run, process: _signal_a_worker(run, process, signal.SIGSTOP),
@@ -377,7 +368,6 @@ FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
     "MLflow full": lambda run, _: _mlflow("full", run),
     "disk full": lambda run, process: _fill(run.campaign.disk, run, process),
     "shared memory full": lambda run, process: _fill(SHARED_MEMORY, run, process),
-    "clock set back": lambda run, _: _set_clock_back(run),
 }
 
 
