@@ -300,7 +300,7 @@ class Run:
                 130,
                 1,
             )  # SIGBUS: who writes to a full shared memory is killed
-            if "Traceback" in self.said() or not (refused or process.returncode in ends_known):
+            if "Traceback" in self.said() or not (refused or known):
                 raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
         with campaign.shared:
             unsent = re.search("not logged to MLflow|what MLflow lacks is not sent", self.said())
