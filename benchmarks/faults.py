@@ -294,12 +294,8 @@ class Run:
             if process.returncode == 0:
                 break
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
-            ends_known = (
-                -signal.SIGKILL,
-                -signal.SIGBUS,
-                130,
-                1,
-            )  # SIGBUS: who writes to a full shared memory is killed
+            # SIGBUS ends a process that writes to a full shared memory.
+            known = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, 130, 1)
             if "Traceback" in self.said() or not (refused or known):
                 raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
         with campaign.shared:
