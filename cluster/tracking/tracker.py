@@ -114,7 +114,7 @@ class Tracker:
             self._thread.start()
 
     def _work(self) -> None:
-        """Sync now and then, which is no request if nothing is new, and once or twice when closed."""
+        """Sync every FLUSH_S seconds, without a request if nothing is new, and once or twice when closed."""
         while not self._closed.is_set():
             synced = self._sync()
             if synced and self._preload.ident is None:

@@ -26,7 +26,7 @@ Work = tuple[bytes, int, int]
 """A chunk: its members' recipes, its first episode and the one after its last."""
 
 MOST_MAPS = 256
-"""In the store, of at most 2 MiB each: more than one run needs, so that runs one after another do not fill it."""
+"""Maps kept in the object store, of 2 MiB at most. A run uses fewer; several runs one after another would fill it."""
 
 INLINE = 1 << 16
 """Bytes of a task up to which each worker is sent its own copy: through the object store it takes 1 ms longer."""

@@ -52,7 +52,7 @@ PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
-CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1  # of this machine, for us
+CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1  # that this process may use
 FROM_QUEUE: Parcel = ()  # tells a worker to take its parcels from the queue
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 
@@ -347,7 +347,7 @@ class RayPool(WorkerPool):
         self._closed.wait()
 
     def _remove_abandoned(self) -> None:
-        """Remove the logs of runs of ours that were killed."""
+        """Remove the Ray session folders that killed runs have left on this machine."""
         for tickets in Path(self._session or "").parent.glob("session_*/tickets"):
             if abandoned(tickets):
                 shutil.rmtree(tickets.parent, ignore_errors=True)
