@@ -6,6 +6,7 @@ Only this file and `ray_pool` import Ray.
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
 import json
 import logging
@@ -113,7 +114,9 @@ def leave() -> None:
     """Leave Ray, and restore the environment: with our token, a cluster that is joined next could not call us."""
     import ray
 
+    gc.disable()  # a reference to Ray that another thread's collection frees while Ray stops ends this process
     ray.shutdown(wait_for_processes=True)
+    gc.enable()
     if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
         del os.environ["RAY_AUTH_TOKEN"]
         os.environ.pop("RAY_AUTH_MODE", None)  # set by Ray

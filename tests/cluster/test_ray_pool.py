@@ -8,6 +8,7 @@ import pickle
 import re
 import signal
 import socket
+import subprocess
 import sys
 import tempfile
 import threading
@@ -363,6 +364,41 @@ def test_any_number_of_workers_gives_the_serial_pools_bits(workers: int) -> None
         killer.join()
         processes = psutil.Process().children(recursive=True)
     assert psutil.wait_procs(processes, timeout=10.0)[1] == [], "some are still there"
+
+
+LITTER = """
+import gc, threading, ray
+from cluster.workers import ray_session
+
+ray_session.start_own(1)
+one, shutdown = ray.put(0), ray.shutdown
+cycle = [ray.ObjectRef(one.binary()) for _ in range(100_000)]
+cycle.append(cycle)
+gc.collect()
+stopping, stopped = threading.Event(), threading.Event()
+
+def litter():
+    global cycle
+    stopping.wait()
+    del cycle
+    while not stopped.is_set():
+        [[] for _ in range(1000)]  # so that garbage is collected, here
+
+def stop(**how):
+    stopping.set()
+    shutdown(**how)
+
+threading.Thread(target=litter).start()
+ray.shutdown = stop
+ray_session.leave()
+stopped.set()
+print("collected" if gc.isenabled() else "not any more")
+"""
+
+
+def test_garbage_in_another_thread_does_not_end_the_process_while_ray_stops() -> None:
+    done = subprocess.run([sys.executable, "-c", LITTER], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "collected\n", done.stderr
 
 
 @pytest.mark.usefixtures("no_pool")
