@@ -78,7 +78,7 @@ class _CellReporter(Reporter):
         self._send("warning", text)
 
     def compiling(self) -> AbstractContextManager[object]:
-        self.note("compiling the simulator for this machine, once")
+        self.note("compiling the simulator for runs of this kind, once")
         return nullcontext()
 
     def learning(self, session: Session) -> AbstractContextManager[object]:
@@ -147,7 +147,7 @@ def _compile(cells: Sequence[Cell], on_event: OnEvent) -> None:
         warming = kernels.Warming(cell.settings)
         try:
             if warming.processes:
-                on_event(cells[0], "note", "compiling the simulator for this machine, once")
+                on_event(cells[0], "note", "compiling the simulator for runs of this kind, once")
                 warming.wait()
         finally:
             warming.stop()

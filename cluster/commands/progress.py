@@ -67,7 +67,7 @@ class Progress(Line, Reporter):
         print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
 
     def compiling(self) -> AbstractContextManager[object]:
-        text = "compiling the simulator for this machine, once (some 20 s)"
+        text = "compiling the simulator for runs of this kind, once (some 20 s)"
         if not self.console.is_terminal:
             self.console.print(text)
         return self.console.status(text)

@@ -114,7 +114,7 @@ def _map(name: str, seed: int, config: SimConfig) -> tuple[Map, np.ndarray]:
 def watch_main() -> None:
     """Entry point of `gridsim-watch`."""
     hints: dict = {
-        NoDisplayError: "to write a film in place of a window: --output film.mp4",
+        NoDisplayError: "to write a page or a film in place of a window: --output drive.html, or film.mp4",
         UnfinishedError: "to watch it as it stands: --follow, or --generation N",
         CheckpointError: "give a run's folder, a champion.npz or a recorded drive.csv",
     }

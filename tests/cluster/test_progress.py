@@ -72,7 +72,7 @@ def test_compiling_is_told_with_and_without_a_terminal(terminal):
     shown, console = begun(learning(), 80, terminal)
     with shown.compiling():
         pass
-    assert console.file.getvalue().count("compiling the simulator for this machine, once (some 20 s)") >= 1
+    assert console.file.getvalue().count("compiling the simulator for runs of this kind, once (some 20 s)") >= 1
 
 
 def test_there_is_no_eta_before_it_means_something(monkeypatch):
