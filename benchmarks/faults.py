@@ -7,8 +7,9 @@ are over, no process of theirs may be left, and no file that is no result. 20 fa
 after another. The same seed draws the same faults, but not at the same steps of a run.
 
 A disk, and the shared memory in which Ray keeps its objects, are mounted for the campaign alone, so that they can be
-filled; where that is not allowed, these two faults are left out. Hosts and their links fail in
-tests/cluster/test_cluster.py and test_faults.py.
+filled; where that is not allowed, these two faults are left out. A clock that is set back is what `time.time` says in
+all Python processes of a run; Ray's own waiting, like all of the system's, goes by clocks that cannot be set. Hosts
+and their links fail in tests/cluster/test_cluster.py and test_faults.py.
 """
 
 from __future__ import annotations
@@ -46,6 +47,15 @@ PATIENCE_S = 10  # after which a silent worker is replaced
 MARK = "GRIDSIM_FAULTS"  # variable by which the processes of a campaign are found
 DISK_MIB, SHARED_MIB = 256, 6144  # each run's Ray looks for 768 MiB of shared memory
 SHARED_MEMORY = Path("/dev/shm")
+CLOCK = """
+import os, time
+def seconds_back():
+    with open(os.environ["CLOCK_FILE"]) as file:
+        return int(file.read())
+system, system_ns = time.time, time.time_ns
+time.time = lambda: system() - seconds_back()
+time.time_ns = lambda: system_ns() - 10**9 * seconds_back()
+"""  # of a run's processes
 MOUNTS = "GRIDSIM_FAULTS_MOUNTS"  # variable that is set where mounts are this campaign's own
 LONG_S = 300.0  # that anything may take
 SAME = ("fitness/best", "fitness/mean", "distance_m/mean", "car_steps", "leader/success_rate")  # columns of the history
@@ -125,7 +135,10 @@ class Campaign:
                 subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", str(place)], check=True)
         self.faults = [name for name in FAULTS if name not in full or MOUNTS in os.environ]
         self.folder = folder
-        self.environment = {**os.environ, MARK: str(folder), "RAY_TMPDIR": str(folder / "ray")}
+        (folder / "sitecustomize.py").write_text(CLOCK)
+        self.environment = {
+            **os.environ, MARK: str(folder), "RAY_TMPDIR": str(folder / "ray"), "PYTHONPATH": str(folder),
+        }  # fmt: skip
         (folder / "ray").mkdir()
         self._shared_memory = set(os.listdir(SHARED_MEMORY))
         with socket.create_server(("127.0.0.1", 0)) as free:
@@ -260,14 +273,23 @@ class Run:
         self.campaign, self.name, self._first = campaign, name, name
         self.rng = random.Random(f"{campaign.seed} {name}")
         self._said = campaign.folder / f"said-{name}.log"
+        self._clock, self._seconds_back = campaign.folder / f"clock-{name}", 0
+        self.set_clock_back(0)
+
+    def set_clock_back(self, seconds: int) -> None:
+        """For good, also for the run when it is resumed."""
+        self._seconds_back += seconds
+        new = self._clock.with_suffix(".new")
+        new.write_text(str(self._seconds_back))
+        new.rename(self._clock)
 
     def start(self, *flags: str) -> subprocess.Popen:
         """`gridsim-evolve` with these flags, in a process group of its own."""
         command, campaign = [str(BIN / "gridsim-evolve"), *flags], self.campaign
         with open(self._said, "a") as said:
             return subprocess.Popen(
-                command, cwd=campaign.disk, env=campaign.environment, stdout=subprocess.DEVNULL, stderr=said,
-                process_group=0,
+                command, cwd=campaign.disk, env={**campaign.environment, "CLOCK_FILE": str(self._clock)},
+                stdout=subprocess.DEVNULL, stderr=said, process_group=0,
             )  # fmt: skip
 
     def drive(self, faults: int) -> None:
@@ -364,6 +386,7 @@ FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
     "MLflow full": lambda run, _: _mlflow("full", run),
     "disk full": lambda run, process: _fill(run.campaign.disk, run, process),
     "shared memory full": lambda run, process: _fill(SHARED_MEMORY, run, process),
+    "clock set back": lambda run, _: run.set_clock_back(run.rng.randint(1, 86_400)),
 }
 
 
