@@ -1,4 +1,4 @@
-"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--jobs N] [--json]
+"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--jobs N] [--cluster] [--json]
 
 A small evolution with two workers runs again and again, several of them at once, beside an MLflow server of their own.
 At random moments one of FAULTS happens; a run that ended before its time is resumed. A run that came to its end must
@@ -8,8 +8,10 @@ after another. The same seed draws the same faults, but not at the same steps of
 
 A disk, and the shared memory in which Ray keeps its objects, are mounted for the campaign alone, so that they can be
 filled; where that is not allowed, these two faults are left out. A clock that is set back is what `time.time` says in
-all Python processes of a run; Ray's own waiting, like all of the system's, goes by clocks that cannot be set. Hosts
-and their links fail in tests/cluster/test_cluster.py and test_faults.py.
+all Python processes of a run; Ray's own waiting, like all of the system's, goes by clocks that cannot be set.
+
+With --cluster the runs share a Ray cluster of two hosts with a core each, this one and one with a network of its own.
+That one and the link to it fail, too; shared memory does not, as the cluster's first host would go with it.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from itertools import count
 from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
+from two_hosts import Cluster  # beside this file
 
 BIN = Path(sys.executable).parent
 SMALL = (
@@ -44,6 +47,7 @@ SMALL = (
     "--seed", "5",
 )  # fmt: skip
 PATIENCE_S = 10  # after which a silent worker is replaced
+WORKER = "ray::Actor"  # how the names of workers' processes begin
 MARK = "GRIDSIM_FAULTS"  # variable by which the processes of a campaign are found
 DISK_MIB, SHARED_MIB = 256, 6144  # each run's Ray looks for 768 MiB of shared memory
 SHARED_MEMORY = Path("/dev/shm")
@@ -123,17 +127,19 @@ class Gate:
 class Campaign:
     """The runs, their server, and what happens to them. `folder` is a new one, of a short path."""
 
-    def __init__(self, folder: Path, seed: int):
+    def __init__(self, folder: Path, seed: int, clustered: bool):
         self.seed, self.counts, self.finished, self.champions = seed, Counter[str](), 0, set[str]()
         self.shared = threading.Lock()  # held while the server or the disk, which all runs share, is disturbed
         self._numbers, self._stopped = count(), False
         self.disk = folder / "disk"
         self.disk.mkdir()
-        full = {"disk full", "shared memory full"}
+        missing = {"shared memory full"} if clustered else {"host gone", "link down"}
         if MOUNTS in os.environ:
             for place, mib in (self.disk, DISK_MIB), (SHARED_MEMORY, SHARED_MIB):
                 subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", str(place)], check=True)
-        self.faults = [name for name in FAULTS if name not in full or MOUNTS in os.environ]
+        else:
+            missing |= {"disk full", "shared memory full"}
+        self.faults = [name for name in FAULTS if name not in missing]
         self.folder = folder
         (folder / "sitecustomize.py").write_text(CLOCK)
         self.environment = {
@@ -145,6 +151,7 @@ class Campaign:
             port = free.getsockname()[1]
         self._server = self._start_server(port)
         self.gate = Gate(port)
+        self.cluster = Cluster(folder / "nodes", dict(os.environ)) if clustered else None
 
     def _start_server(self, port: int) -> subprocess.Popen:
         command = [
@@ -174,7 +181,9 @@ class Campaign:
         raise Wrong(f"the MLflow server does not come up: see {self.folder}/server.log")
 
     def close(self) -> None:
-        """End the server."""
+        """End the server and the cluster."""
+        if self.cluster:
+            self.cluster.close()
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._server.pid, signal.SIGKILL)
         self._server.wait()
@@ -240,11 +249,20 @@ class Campaign:
     # ----------------------------------------------------------------------------------------------------- leftovers
 
     def processes(self) -> list[psutil.Process]:
-        """Processes that runs of this campaign have started."""
+        """Processes that runs of this campaign have started, and their workers on the cluster."""
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error, OSError):
                 if process.environ().get(MARK) == str(self.folder) and process.status() != psutil.STATUS_ZOMBIE:
+                    found.append(process)
+        return found + self.workers_on_cluster()
+
+    def workers_on_cluster(self) -> list[psutil.Process]:
+        """The cluster's workers, of all runs."""
+        found = []
+        for process in self.cluster.processes() if self.cluster else ():
+            with contextlib.suppress(psutil.Error):
+                if process.name().startswith(WORKER):
                     found.append(process)
         return found
 
@@ -301,6 +319,9 @@ class Run:
                 begun += 1
                 self.name = f"{self._first}-{begun}"  # a run killed before its first checkpoint keeps the name
                 flags = ("--name", self.name, "--tracking-uri", campaign.uri, *SMALL)
+            if campaign.cluster:
+                campaign.cluster.mend()
+                flags += ("--address", campaign.cluster.address)
             process = self.start("--workers", "2", "--patience", str(PATIENCE_S), *flags)
             ends = time.monotonic() + LONG_S
             while process.poll() is None:
@@ -338,15 +359,16 @@ class Run:
 # ------------------------------------------------------------------------------------------------------------- faults
 
 
-def _workers(process: subprocess.Popen) -> list[psutil.Process]:
+def _workers(run: Run, process: subprocess.Popen) -> list[psutil.Process]:
     with contextlib.suppress(psutil.Error):
         below = psutil.Process(process.pid).children(recursive=True)
-        return [child for child in below if child.is_running() and child.name().startswith("ray::Actor")]
+        own = [child for child in below if child.is_running() and child.name().startswith(WORKER)]
+        return own + run.campaign.workers_on_cluster()
     return []
 
 
 def _signal_a_worker(run: Run, process: subprocess.Popen, number: int) -> None:
-    if workers := _workers(process):
+    if workers := _workers(run, process):
         with contextlib.suppress(psutil.Error):
             run.rng.choice(workers).send_signal(number)
 
@@ -374,6 +396,20 @@ def _fill(folder: Path, run: Run, process: subprocess.Popen) -> None:
             ballast.unlink(missing_ok=True)
 
 
+def _lose_host(run: Run) -> None:
+    assert run.campaign.cluster
+    run.campaign.cluster.lose_host()
+    time.sleep(run.rng.uniform(0.0, 20.0))
+    run.campaign.cluster.mend()
+
+
+def _unplug(run: Run) -> None:
+    assert run.campaign.cluster
+    with run.campaign.cluster.unplugged():
+        time.sleep(run.rng.uniform(0.5, 40.0))
+    run.campaign.cluster.mend()
+
+
 FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
     "worker killed": lambda run, process: _signal_a_worker(run, process, signal.SIGKILL),
     "worker stopped": lambda run, process: _signal_a_worker(run, process, signal.SIGSTOP),
@@ -387,6 +423,8 @@ FAULTS: dict[str, Callable[[Run, subprocess.Popen], None]] = {
     "disk full": lambda run, process: _fill(run.campaign.disk, run, process),
     "shared memory full": lambda run, process: _fill(SHARED_MEMORY, run, process),
     "clock set back": lambda run, _: run.set_clock_back(run.rng.randint(1, 86_400)),
+    "host gone": lambda run, _: _lose_host(run),
+    "link down": lambda run, _: _unplug(run),
 }
 
 
@@ -396,15 +434,22 @@ def main() -> int:
     parser.add_argument("--faults", type=int, default=20, help="how many (20)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults and their moments (0)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once (1)")
+    parser.add_argument("--cluster", action="store_true", help="on two hosts; one run at a time")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
-    own = ["unshare", "--mount"]
+    if options.cluster and options.jobs > 1:
+        parser.error("--cluster has one run at a time: leave --jobs out")
+    own = ["unshare", "--mount", *(["--net"] if options.cluster else [])]
     can = shutil.which(own[0]) and not subprocess.run([*own, "true"], stderr=subprocess.DEVNULL).returncode
+    if options.cluster and not (can and shutil.which("ip")):
+        parser.error("--cluster needs root, unshare and ip (packages util-linux and iproute2)")
     if can and MOUNTS not in os.environ:
         os.execvpe(own[0], [*own, sys.executable, *sys.argv], {**os.environ, MOUNTS: "1"})
+    if options.cluster:
+        subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # runs inherit it; jobs in a shell's background ignore it
     folder = Path(tempfile.mkdtemp(prefix="gsf", dir="/tmp"))  # Ray's sockets need a short path
-    campaign, wrong = Campaign(folder, options.seed), ""
+    campaign, wrong = Campaign(folder, options.seed, options.cluster), ""
     begun = time.monotonic()
     try:
         campaign.undisturbed()

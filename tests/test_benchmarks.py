@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hosts
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
@@ -15,6 +16,7 @@ RUNS = {
         ["--faults", "20", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
     ),
+    "faults.py --cluster": (["--faults", "6", "--json"], {"faults", "runs", "champions", "host_gone", "link_down"}),
     "learners.py": (
         ["--quick", "--json"],
         {"import_gridsim_ms", "sb3_vec_env_ratio", "ppo_sb3_success", "ppo_example_success"},
@@ -36,7 +38,7 @@ RUNS = {
     "traffic.py": (["--hours", "0.01", "--seeds", "1", "--scenario", "curved", "--json"], set()),
     "traffic.py --ego": (["3", "--seeds", "1", "--scenario", "curved", "--json"], {"curved_off_road"}),
 }  # fmt: skip
-PARTS = {"ceilings.py", "simulation.py"}  # of scaling.py
+PARTS = {"ceilings.py", "simulation.py", "two_hosts.py"}  # of scaling.py and faults.py
 
 
 def test_every_script_is_run_here() -> None:
@@ -46,6 +48,8 @@ def test_every_script_is_run_here() -> None:
 @pytest.mark.e2e
 @pytest.mark.parametrize("name", RUNS)
 def test_script_runs(name: str, tmp_path: Path) -> None:
+    if "--cluster" in name and (reason := hosts.missing()):
+        pytest.skip(reason)
     arguments, figures = RUNS[name]
     script, *mode = name.split()
     command = [sys.executable, str(FOLDER / script), *mode, *arguments]
