@@ -196,8 +196,10 @@ def _drives(flags: WatchFlags, seconds: float, most: int | None = 1) -> Iterator
     if _is_recording(flags):
         yield from _recorded(flags)
         return
+    champion, name = _driver(flags)
     for seed in itertools.islice(itertools.count(flags.seed), most):
-        champion, name = _driver(flags)
+        if flags.follow:
+            champion, name = _driver(flags)
         road = flags.scenario or champion.scenario
         scenario, start = _map(road, seed, champion.sim)
         traffic = champion.traffic_on(road) if flags.traffic == -1 else flags.traffic

@@ -46,7 +46,7 @@ class Tracker:
         self._status: Status | None = None  # set by close()
         self._ended = False
 
-        self._tried, self._closed = threading.Event(), threading.Event()
+        self._tried, self._wake, self._closed = (threading.Event() for _ in range(3))
         self._thread = threading.Thread(target=self._work, name="mlflow", daemon=True)
         self._preload = threading.Thread(target=preload, name="preload", daemon=True)
 
@@ -83,6 +83,7 @@ class Tracker:
     def log_model(self, folder: Path, model: Model) -> None:
         """Write the champion as a torch model into a run's folder, send it and register it, unless that is done."""
         self._model = folder, model
+        self._wake.set()  # it takes seconds, in which the run has other work
         self._start()
 
     def close(self, status: Status, timeout_s: float | None = None) -> str | None:
@@ -96,6 +97,7 @@ class Tracker:
         if status != "FINISHED":
             self._model = None  # a resumed run finds a better one
         self._closed.set()
+        self._wake.set()
         timeout_s = timeout_s or (CLOSE_S if status == "FINISHED" else STOP_S)
         self._thread.join(timeout_s)
         steps = sorted({row.step for row in self._rows})
@@ -119,7 +121,8 @@ class Tracker:
             synced = self._sync()
             if synced and self._preload.ident is None:
                 self._preload.start()
-            self._closed.wait(FLUSH_S if synced else RETRY_S)
+            self._wake.wait(FLUSH_S if synced else RETRY_S)
+            self._wake.clear()
         if not self._sync():
             time.sleep(CHANCE_S)
             self._sync()

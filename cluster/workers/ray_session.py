@@ -114,9 +114,13 @@ def leave() -> None:
     """Leave Ray, and restore the environment: with our token, a cluster that is joined next could not call us."""
     import ray
 
+    collecting = gc.isenabled()
     gc.disable()  # a reference to Ray that another thread's collection frees while Ray stops ends this process
-    ray.shutdown(wait_for_processes=True)
-    gc.enable()
+    try:
+        ray.shutdown(wait_for_processes=True)
+    finally:
+        if collecting:
+            gc.enable()
     if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
         del os.environ["RAY_AUTH_TOKEN"]
         os.environ.pop("RAY_AUTH_MODE", None)  # set by Ray

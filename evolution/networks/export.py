@@ -78,8 +78,12 @@ def to_torch(spec: PolicySpec, genome: np.ndarray, config: SimConfig) -> torch.n
     """A genome float32 [genes] as a module in evaluation mode, on the CPU, without gradients.
 
     `config` gives the scales of the environment's observations.
+    Raises: ValueError with one line if the genome does not fit the policy.
     """
     import torch
+
+    if genome.shape != (spec.size,) or genome.dtype != np.float32:
+        raise ValueError(f"a genome of {spec} is float32 [{spec.size}], not {genome.dtype} {genome.shape}")
 
     class Driver(torch.nn.Module):
         def __init__(self) -> None:

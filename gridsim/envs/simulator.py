@@ -152,7 +152,7 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
-            worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`), if there is any.
+            worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
 
         Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
         Raises: ValueError with one line for a wrong shape, a number that is not finite, or a missing map. Nothing is
@@ -168,11 +168,13 @@ class Simulator:
             raise ValueError(f"maps must be indices into the {len(self.scenarios)} scenarios")
         if cars.ndim != 1 or (cars.size and not 0 <= cars.min() <= cars.max() < n):
             raise ValueError(f"cars must be indices from 0 to {n - 1}")
+        shape = (len(cars), *self.state.worlds.shape[1:])
+        if worlds is not None and np.shape(worlds) != shape:
+            raise ValueError(f"traffic must be {shape[0]} worlds of {shape[1]} cars, not {np.shape(worlds)}")
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
         if not len(cars):
             return ranges, starts[:, 3]
-        if worlds is not None:
-            self.state.worlds[cars] = worlds
+        self.state.worlds[cars] = -1.0 if worlds is None else worlds
         rows = self._chart(maps)
         cells = max(visit_cells(self.scenarios[m].road) for m in np.unique(maps))
         if cells > self.state.visits.shape[1]:
@@ -216,6 +218,8 @@ class Simulator:
         n, state = len(self), self.state
         if state.maps.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
+        if np.shape(actions) not in ((n,), (n, 2)):
+            raise ValueError(f"there are {n} cars, not actions of shape {np.shape(actions)}")
         actions = checked_actions(actions)
         ranges = np.empty_like(self.closing)
         speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)

@@ -122,7 +122,8 @@ def _bytes(path: Path) -> bytes:
         status = path.stat()
         regular = stat.S_ISREG(status.st_mode)
         if regular and status.st_size <= limit:
-            return path.read_bytes()
+            with path.open("rb") as file:
+                return file.read(limit)  # the file may have grown since
     except OSError as error:
         raise GridSimError(f"{path}: {error.strerror or error}") from None
     except ValueError:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import threading
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from tracked import client, steps, tracker
 
 from cluster.runs.champion import Champion
 from cluster.runs.settings import EvolveSettings
+from cluster.tracking import tracker as tracking
 from cluster.tracking.description import torch_model
 from cluster.tracking.mlflow_run import write_model
 from evolution.networks.export import example
@@ -112,6 +114,20 @@ def test_without_torch_everything_else_is_logged(uri, tmp_path):
     assert steps(uri, begun.run_id) == [0]
     assert client(uri).get_run(begun.run_id).info.status == "FINISHED"
     assert [each.path for each in client(uri).list_artifacts(begun.run_id)] == ["a.png"]
+
+
+def test_a_model_is_written_at_once_while_the_run_goes_on(uri, tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "FLUSH_S", 1000.0)
+    begun, written = tracker(uri, 1), threading.Event()
+    begun.wait_ready()
+
+    def build():
+        written.set()
+        raise ModuleNotFoundError("No module named 'torch'")
+
+    begun.log_model(tmp_path, dataclasses.replace(champion_model(), build=build))
+    assert written.wait(60.0)
+    begun.close("KILLED")
 
 
 def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):

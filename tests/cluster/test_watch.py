@@ -56,6 +56,15 @@ def drive(driver):
     return record(driver, scenario, start, 12.0)
 
 
+def test_a_champion_is_read_once_and_drives_on_when_its_file_is_gone(tmp_path):
+    (tmp_path / "champion.npz").write_bytes(CHAMPION.read_bytes())
+    drives = watch._drives(watch.WatchFlags(source=str(tmp_path / "champion.npz")), 1.0, most=None)
+    _, first = next(drives)
+    (tmp_path / "champion.npz").unlink()
+    _, second = next(drives)
+    assert first != second, "the next map"
+
+
 def test_recording_ends_with_its_episode(driver):
     scenario = build("seamless", 4)
     blind = type(driver)(np.zeros_like(driver.genome), driver.policy, driver.scenario, driver.sim)  # accelerates

@@ -61,3 +61,9 @@ def test_the_example_is_something_that_may_be_seen(text):
         assert (shown[:, :31] == 1.0).all()
         fast = 10.0 / SimConfig().vehicle.speed_limit
         assert shown[1, 31:] == pytest.approx([0.0] * (31 * spec.motion) + [fast] + [0.0] * spec.steering)
+
+
+@pytest.mark.parametrize("genome", [np.zeros(312, dtype=F), np.zeros(311), np.zeros((1, 311), dtype=F)])
+def test_another_genome_is_refused(genome):
+    with pytest.raises(ValueError, match=r"a genome of mlp:6,7 is float32 \[311\], not float"):
+        to_torch(PolicySpec.parse("mlp:6,7"), genome, SimConfig())

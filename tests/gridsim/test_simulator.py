@@ -14,6 +14,7 @@ from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.traffic.world import LANE, spawn
 
 F = np.float32
 CONFIG = SimConfig()
@@ -238,3 +239,21 @@ def test_a_start_is_taken_onto_the_torus(straight):
     assert (car[COS], car[SIN]) == pytest.approx((0.0, 1.0), abs=1e-6)
     assert (car[SPEED], car[STEERING]) == (7.0, F(0.1))
     assert not car[[DISTANCE, PACED, ODOMETER, IDLE, STEPS]].any()
+
+
+def test_actions_and_traffic_of_other_shapes_are_refused_and_cars_that_begin_without_traffic_have_none():
+    scenario = build("curved", 0)
+    starts = sample_starts(scenario, 4, np.random.default_rng(0))
+    worlds = spawn(scenario.network, starts, 3, np.arange(4, dtype=np.uint64), CONFIG)
+    simulator = Simulator([scenario], 4, traffic=3)
+    for wrong in (worlds[:1], worlds[:, :2], worlds[0]):
+        with pytest.raises(ValueError, match="traffic must be 4 worlds of 3 cars, not"):
+            simulator.reset(starts, worlds=wrong)
+    simulator.reset(starts, worlds=worlds)
+    for shape in ((1,), (5,), (4, 1), (1, 2), ()):
+        with pytest.raises(ValueError, match="there are 4 cars, not actions of shape"):
+            simulator.step(np.zeros(shape, dtype=int))
+    assert (simulator.state.worlds[:, :, LANE] >= 0).any()
+    simulator.reset(starts[:2], cars=np.array([0, 1]))
+    assert (simulator.state.worlds[:2, :, LANE] < 0).all()
+    assert (simulator.state.worlds[2:] == worlds[2:]).all()
