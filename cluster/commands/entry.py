@@ -22,15 +22,14 @@ GC_THRESHOLDS = (200_000, 20, 20)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Signal handler: raise KeyboardInterrupt, but never inside the import system or below LLVM.
+    """Signal handler: raise KeyboardInterrupt, but never during an import or below LLVM.
 
-    Raised in the former, it can be lost, or leave the import lock held, so that other threads wait for it forever.
-    Raised in a function that LLVM calls while it loads a kernel, it ends the process with a segmentation fault.
+    Raised in the former, it can be lost, become another exception, or leave the import lock held, so that other threads
+    wait for it forever. Raised in a function that LLVM calls while it loads a kernel, it ends the process with a
+    segmentation fault.
     """
-    if frame and (
-        frame.f_code.co_filename.startswith("<frozen importlib")
-        or any("llvmlite" in caller.f_code.co_filename for caller, _ in traceback.walk_stack(frame))
-    ):
+    files = [caller.f_code.co_filename for caller, _ in traceback.walk_stack(frame)]
+    if any(file.startswith("<frozen importlib") or "llvmlite" in file for file in files):
         threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
     else:
         raise KeyboardInterrupt

@@ -187,9 +187,26 @@ def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monke
     assert capsys.readouterr().err == ""
 
 
-def test_an_interrupt_within_the_import_system_or_llvm_comes_after_it():
+IMPORTED = """
+import signal
+
+class Attribute:
+    def __set_name__(self, owner, name):
+        signal.raise_signal(signal.SIGINT)  # an exception here becomes a RuntimeError
+
+class Owner:
+    attribute = Attribute()
+"""
+
+
+def test_an_interrupt_during_an_import_or_within_llvm_comes_after_it(tmp_path, monkeypatch):
+    (tmp_path / "interrupted_module.py").write_text(IMPORTED)
+    monkeypatch.syspath_prepend(tmp_path)
     before = signal.signal(signal.SIGINT, entry.interrupt)
     try:
+        importlib.import_module("interrupted_module")
+        with pytest.raises(KeyboardInterrupt):
+            time.sleep(10.0)
         # The innermost frame is one of importlib's; an exception here could leave its lock held for good.
         importlib._bootstrap._call_with_frames_removed(signal.raise_signal, signal.SIGINT)  # type: ignore
         with pytest.raises(KeyboardInterrupt):
