@@ -337,10 +337,11 @@ class Run:
             if process.returncode == 0:
                 break
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
-            # SIGBUS ends a process that writes to a full shared memory; the others end one that Python has not taken
-            # over yet, or that has just stopped.
-            by_signal = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, -signal.SIGINT, -signal.SIGTERM)
-            known = by_signal or process.returncode in (130, 1)
+            if process.returncode in (-signal.SIGINT, -signal.SIGTERM):  # before the command began, or after its end
+                self._said.write_text("")
+                continue
+            # SIGBUS ends a process that writes to a full shared memory.
+            known = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, 130, 1)
             if "Traceback" in self.said() or not (refused or known):
                 raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
         with campaign.shared:

@@ -12,7 +12,6 @@ import time
 import traceback
 from functools import partial
 from importlib import import_module
-from importlib.metadata import version
 from types import FrameType
 
 STARTED = time.perf_counter()  # when the process started, but for Python's own startup of some 30 ms
@@ -38,6 +37,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 def _enter(module: str, name: str) -> None:
     gc.set_threshold(*GC_THRESHOLDS)
     if "--version" in sys.argv[1:]:
+        from importlib.metadata import version  # which takes longer than all else until Ctrl-C is handled
+
         print(f"gridsim {version('gridsim')}")
         return
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the shell had it ignored
