@@ -25,9 +25,12 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
     Raised in the former, it can be lost, become another exception, or leave the import lock held, so that other threads
     wait for it forever. Raised in a function that LLVM calls while it loads a kernel, it ends the process with a
-    segmentation fault.
+    segmentation fault. In a hook of a process that was just forked, Python only prints it.
     """
-    files = [caller.f_code.co_filename for caller, _ in traceback.walk_stack(frame)]
+    callers = [caller.f_code for caller, _ in traceback.walk_stack(frame)]
+    files = [caller.co_filename for caller in callers]
+    if any(caller.co_name == "_after_fork" for caller in callers):
+        return
     if any(file.startswith("<frozen importlib") or "llvmlite" in file for file in files):
         threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
     else:

@@ -203,7 +203,12 @@ def test_an_interrupt_during_an_import_or_within_llvm_comes_after_it(tmp_path, m
     (tmp_path / "interrupted_module.py").write_text(IMPORTED)
     monkeypatch.syspath_prepend(tmp_path)
     before = signal.signal(signal.SIGINT, entry.interrupt)
+
+    def _after_fork():  # as threading's hook
+        signal.raise_signal(signal.SIGINT)
+
     try:
+        _after_fork()
         importlib.import_module("interrupted_module")
         with pytest.raises(KeyboardInterrupt):
             time.sleep(10.0)
