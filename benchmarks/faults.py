@@ -295,7 +295,7 @@ class Run:
         self.set_clock_back(0)
 
     def set_clock_back(self, seconds: int) -> None:
-        """For good, also for the run when it is resumed."""
+        """Set the clock of the run's processes back; it stays so when the run is resumed."""
         self._seconds_back += seconds
         new = self._clock.with_suffix(".new")
         new.write_text(str(self._seconds_back))
@@ -337,7 +337,8 @@ class Run:
             if process.returncode == 0:
                 break
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
-            if process.returncode in (-signal.SIGINT, -signal.SIGTERM):  # before the command began, or after its end
+            outside = process.returncode in (-signal.SIGINT, -signal.SIGTERM) and "in _enter" not in self.said()
+            if outside:  # Python itself was interrupted, before the command began or after its end
                 self._said.write_text("")
                 continue
             # SIGBUS ends a process that writes to a full shared memory.

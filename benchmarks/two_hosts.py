@@ -68,7 +68,7 @@ class Cluster:
             self._nodes[1:] = [self._start(self._enter, "--address", self.address)]
 
     def lose_host(self) -> None:
-        """All of the other host's processes end."""
+        """Kill all of the other host's processes."""
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error, OSError):
                 if process.pid != self._host.pid and self._network(process.pid) == self._network(self._host.pid):
@@ -77,7 +77,7 @@ class Cluster:
 
     @contextlib.contextmanager
     def unplugged(self) -> Iterator[None]:
-        """Without the link, of whose loss neither end is told."""
+        """Take the link down for a while; neither end is told."""
         self._ip("link", "set", "port", "down")
         try:
             yield

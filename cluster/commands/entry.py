@@ -25,7 +25,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
     Raised in the former, it can be lost, become another exception, or leave the import lock held, so that other threads
     wait for it forever. Raised in a function that LLVM calls while it loads a kernel, it ends the process with a
-    segmentation fault. In a hook of a process that was just forked, Python only prints it.
+    segmentation fault. In a hook that runs after a fork, Python would only print it.
     """
     callers = [caller.f_code for caller, _ in traceback.walk_stack(frame)]
     files = [caller.co_filename for caller in callers]

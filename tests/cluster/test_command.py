@@ -204,7 +204,7 @@ def test_an_interrupt_during_an_import_or_within_llvm_comes_after_it(tmp_path, m
     monkeypatch.syspath_prepend(tmp_path)
     before = signal.signal(signal.SIGINT, entry.interrupt)
 
-    def _after_fork():  # as threading's hook
+    def _after_fork():  # threading's hook in a forked process has this name
         signal.raise_signal(signal.SIGINT)
 
     try:
