@@ -200,7 +200,8 @@ class Session:
     learning: Learning = field(init=False)
     tracker: Tracker = field(init=False)
     _state: State = field(init=False)  # after the last whole step, with the unsaved rows of the history
-    _saved_steps: int = 0  # steps that are in the folder
+    _saved_steps: int = 0  # steps that are in the checkpoint
+    _logged_steps: int = 0  # steps that are in history.csv, and handed to the tracker
     _sha256: Any = field(default_factory=hashlib.sha256)  # of their records
     _saved_at: float = -math.inf
     _away: bool = False  # whether an outage of MLflow was reported
@@ -228,11 +229,9 @@ class Session:
     def learn(self) -> None:
         """Learn to the end, saving once a second and at the end."""
         learning = self.learning
-        log_rows(self.tracker, learning.history)
         self._saved_steps = learning.steps
         self._state = learning.state(self._saved_steps)
-        if learning.history:
-            self._write_history()  # it may lack the last row: it is written after the checkpoint
+        self.save()  # history.csv may lack the last row: it is written after the checkpoint
         try:
             while not learning.done() and not (learning.steps and self._out_of_time()):
                 row = learning.step()
@@ -286,12 +285,10 @@ class Session:
             self._saved_steps, self._sha256, self._saved_at = done, sha256, perf_counter()
             for k in range(saved, done):
                 del learning.elites[k]
-            self._write_history()
-            log_rows(self.tracker, learning.history[saved:done], saved)
-
-    def _write_history(self) -> None:
-        content = self.learning.history_csv(self._saved_steps)
-        checkpoint.write_atomic(self.run.path / HISTORY, content, durable=False)
+        if done > self._logged_steps:
+            checkpoint.write_atomic(path / HISTORY, learning.history_csv(done), durable=False)
+            log_rows(self.tracker, learning.history[self._logged_steps : done], self._logged_steps)
+            self._logged_steps = done
 
     def finish(self, workers: int) -> None:
         """Measure the champion on held-out drives, write the remaining files, and hand all of them to the tracker."""

@@ -14,6 +14,7 @@ What differs from Ray's defaults, and why:
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import shutil
@@ -309,16 +310,17 @@ class RayPool(WorkerPool):
             for slot in self._slots:
                 ray.kill(slot.actor)
             ray_session.leave()
-            if self._tickets:
-                self._tickets.close()
-                self._tickets = None
-            if self._session:
-                self._remove_abandoned()
-                if not self._named:
-                    shutil.rmtree(self._session, ignore_errors=True)  # Ray itself never removes its logs
         self._slots = []
         self._closed.set()
         self._thread.join(1.0)
+        if self._tickets:
+            self._tickets.close()
+            if self._named:
+                os.unlink(self._tickets.path)
+            else:
+                _remove_session(Path(self._tickets.path))  # Ray itself never removes its logs
+            self._tickets = None
+            self._remove_abandoned()
 
     def _boot(self) -> None:
         """Bring up Ray and ask it for the workers; then wait, since Ray's processes die with this thread."""
@@ -330,13 +332,10 @@ class RayPool(WorkerPool):
             if self._leaving:
                 return
             if self.address is None:
-                self._session = ray_session.start_own(self._asked)
+                self._begin(ray_session.start_own(self._asked, self._begin))
             else:
                 ray_session.join(self.address)
             self._connected = True
-            if self._session:
-                self._tickets = Tickets(f"{self._session}/tickets", new=True)
-                self._remove_abandoned()
             self._shared = Shared(ray.put, self._build_map)
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [self._start(number) for number in range(self._asked)]
@@ -346,11 +345,18 @@ class RayPool(WorkerPool):
             self._booted.set()
         self._closed.wait()
 
+    def _begin(self, session: str) -> None:
+        """Mark the folder of our own Ray by the queue in it, before Ray starts: it may be killed at any moment."""
+        if self._session is None:
+            self._session = session
+            self._tickets = Tickets(f"{session}/tickets", new=True)
+            self._remove_abandoned()
+
     def _remove_abandoned(self) -> None:
         """Remove the Ray session folders that killed runs have left on this machine."""
         for tickets in Path(self._session or "").parent.glob("session_*/tickets"):
             if abandoned(tickets):
-                shutil.rmtree(tickets.parent, ignore_errors=True)
+                _remove_session(tickets)
 
     def _wait_for_ray(self) -> None:
         if self._closed.is_set():
@@ -394,3 +400,14 @@ class RayPool(WorkerPool):
             self._last_failure = ""
             slot.heard = time.monotonic()
             slot.hello = None if preparing else slot.actor.prepare.remote(*self._update(slot))
+
+
+def _remove_session(tickets: Path) -> None:
+    """Remove a Ray session folder. The queue in it goes last: if this is cut short, the next run goes on."""
+    with contextlib.suppress(OSError):  # another run removes it, too
+        for path in set(tickets.parent.iterdir()) - {tickets}:
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+    shutil.rmtree(tickets.parent, ignore_errors=True)

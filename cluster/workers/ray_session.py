@@ -13,7 +13,7 @@ import logging
 import os
 import secrets
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -65,8 +65,11 @@ def check_address(address: str) -> str:
     return address
 
 
-def start_own(workers: int) -> str:
-    """Start Ray on this machine with one CPU for each worker; returns the folder of its logs."""
+def start_own(workers: int, begun: Callable[[str], None]) -> str:
+    """Start Ray on this machine with one CPU for each worker.
+
+    Returns: its session folder, which `begun` gets before any of Ray's processes starts.
+    """
     import ray
 
     if not any(name in os.environ for name in AUTH_ENVIRONMENT):
@@ -74,7 +77,7 @@ def start_own(workers: int) -> str:
         # where it would change what `ray start` does from then on.
         os.environ["RAY_AUTH_TOKEN"] = TOKEN
     _be_quiet()
-    with _lean_head():
+    with _lean_head(begun):
         context: Any = ray.init(
             address="local",  # whatever RAY_ADDRESS says
             num_cpus=workers,
@@ -171,12 +174,12 @@ def _be_quiet() -> None:
 
 
 @contextlib.contextmanager
-def _lean_head() -> Iterator[None]:
+def _lean_head(begun: Callable[[str], None]) -> Iterator[None]:
     """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
 
-    Its processes get groups of their own: a signal to our whole group would end them half started, and `ray.init` would
-    then wait for a minute. Ray has no settings for either, so meanwhile this replaces private names, and sets variables
-    for its processes.
+    `begun` gets its session folder before its processes start. They get groups of their own: a signal to our whole
+    group would end them half started, and `ray.init` would then wait for a minute. Ray has no settings for these, so
+    meanwhile this replaces private names, and sets variables for its processes.
     """
     with contextlib.ExitStack() as undo:
         for name in OWN_ENVIRONMENT.keys() - os.environ.keys():
@@ -186,7 +189,17 @@ def _lean_head() -> Iterator[None]:
             node, parameter, services = _private("node").Node, _private("parameter"), _private("services")
             lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
             lean()
-            replaced = [(node, "start_api_server", _no_api_server), (parameter, "RayParams", lean)]
+            init_temp = node._init_temp
+
+            def make_folder(self: Any, *arguments: Any) -> None:
+                init_temp(self, *arguments)
+                begun(self._session_dir)
+
+            replaced: list[tuple[Any, str, Any]] = [
+                (node, "_init_temp", make_folder),
+                (node, "start_api_server", _no_api_server),
+                (parameter, "RayParams", lean),
+            ]
             if sys.platform == "linux":  # elsewhere Ray ends its processes by our group
                 replaced.append((services, "ConsolePopen", partial(services.ConsolePopen, process_group=0)))
             for owner, name, value in replaced:

@@ -40,14 +40,12 @@ class Tickets:
                 yield index
 
     def close(self) -> None:
-        """Remove the queue."""
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(self.path)
+        """Close this process's end; the pipe stays where it is."""
         os.close(self._pipe)
 
 
 def abandoned(path: Path) -> bool:
-    """Whether all processes that had a queue open are gone, and none has closed it."""
+    """Whether a queue is there that no process has open any more."""
     try:
         os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
     except OSError as error:

@@ -370,7 +370,7 @@ LITTER = """
 import gc, threading, ray
 from cluster.workers import ray_session
 
-ray_session.start_own(1)
+ray_session.start_own(1, str)
 one, shutdown = ray.put(0), ray.shutdown
 cycle = [ray.ObjectRef(one.binary()) for _ in range(100_000)]
 cycle.append(cycle)
@@ -417,6 +417,34 @@ def test_what_a_killed_run_left_of_its_ray_is_removed(monkeypatch: pytest.Monkey
         assert {folder.name for folder in Path(short).glob("ray/session_2*")} == set(), "it leaves nothing either"
         assert living.exists()
         assert others.exists()
+
+
+STARTING = """
+import contextlib, sys
+from cluster.workers import ray_session
+from cluster.workers.pool import PoolError
+from cluster.workers.ray_pool import RayPool
+
+ray_session.STORE_BYTES = int(sys.argv[1])
+try:
+    with contextlib.closing(RayPool(1, None)) as pool:
+        pool._wait_for_ray()
+except PoolError as error:
+    print(error)
+"""
+
+
+def test_what_a_ray_leaves_that_was_killed_or_failed_as_it_started_is_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    start = [sys.executable, "-c", STARTING]
+    with tempfile.TemporaryDirectory(prefix="gs-") as short:
+        monkeypatch.setenv("RAY_TMPDIR", short)
+        with subprocess.Popen([*start, "100000000"]) as killed:
+            wait_until(lambda: list(Path(short).glob("ray/session_2*/logs/gcs_server*")))
+            killed.kill()
+        assert len(list(Path(short).glob("ray/session_2*"))) == 1
+        failed = subprocess.run([*start, "1"], capture_output=True, text=True, timeout=60)  # bytes; Ray needs more
+        assert failed.stdout.startswith("Ray could not be started: "), failed.stderr
+        assert list(Path(short).glob("ray/session_2*")) == []
 
 
 @pytest.mark.usefixtures("no_pool")

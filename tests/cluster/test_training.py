@@ -5,8 +5,10 @@ import shutil
 
 import numpy as np
 import pytest
+import tracked
 from commands import rows
 
+from cluster.runs import checkpoint
 from cluster.runs.checkpoint import load, save
 from cluster.runs.run import new_run, open_run
 from cluster.runs.settings import EvolveSettings
@@ -279,6 +281,8 @@ def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, 
     resumed, save = in_folder(open_run(stopped), maps), Session.save
 
     def interrupted(session):
+        if session.learning.steps < 3:
+            return save(session)
         monkeypatch.setattr(Session, "save", save)
         raise KeyboardInterrupt
 
@@ -288,6 +292,24 @@ def test_an_interrupt_while_the_last_generation_is_saved_does_not_lose_it(maps, 
     assert Session.save is save
     assert load(stopped / "checkpoint.npz")[1]["generation"] == 3
     assert len(rows(stopped)) == 3
+
+
+def test_an_interrupt_between_history_and_tracker_loses_no_row(maps, stopped, monkeypatch):
+    resumed, write = in_folder(open_run(stopped), maps), checkpoint.write_atomic
+
+    def interrupted(path, content, durable=True):
+        write(path, content, durable)
+        if path.name == "history.csv" and content.count(b"\n") == 4:
+            monkeypatch.setattr(checkpoint, "write_atomic", write)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(checkpoint, "write_atomic", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        resumed.learn()
+    assert resumed.tracker.close("KILLED") is None
+    (logged,) = tracked.runs(resumed.tracker.uri)
+    took_s = (logged.info.end_time - logged.info.start_time) / 1000
+    assert took_s == pytest.approx(float(rows(stopped)[2]["wall_s"]), abs=0.002)
 
 
 def test_a_history_without_its_last_row_is_mended(maps, stopped):
