@@ -3,8 +3,9 @@
 A small evolution with two workers runs again and again, several of them at once, beside an MLflow server of their own.
 At random moments one of FAULTS happens; a run that ended before its time is resumed. A run that came to its end must
 have the champion, the elites and the history of the undisturbed run, and MLflow each of its rows once. When all runs
-are over, no process of theirs may be left, and no file that is no result. 20 faults take about three minutes, one run
-after another. The same seed draws the same faults, but not at the same steps of a run.
+are over, and one more without faults, which removes the folders of Rays that were killed, no process of theirs may be
+left, and no file but results and logs that a message names. 20 faults take about three minutes, one run after another.
+The same seed draws the same faults, but not at the same steps of a run.
 
 A disk, and the shared memory in which Ray keeps its objects, are mounted for the campaign alone, so that they can be
 filled; where that is not allowed, these two faults are left out. A clock that is set back is what `time.time` says in
@@ -190,12 +191,17 @@ class Campaign:
 
     # --------------------------------------------------------------------------------------------------------- runs
 
-    def undisturbed(self) -> None:
-        """The run that all others are compared with."""
-        run = Run(self, "undisturbed")
+    def undisturbed(self, name: str = "undisturbed") -> None:
+        """A run without faults. All others are compared with the first one."""
+        run = Run(self, name)
         if run.start("--workers", "2", "--name", run.name, "--tracking-uri", self.uri, *SMALL).wait(LONG_S):
-            raise Wrong(f"the undisturbed run fails: {run.last_words()}")
+            raise Wrong(f"the {name} run fails: {run.last_words()}")
         self.check(run.name)
+
+    def last(self) -> None:
+        """A run without faults when all others are over; the next one would do what this does besides."""
+        self._wait_for_processes()
+        self.undisturbed("last")
 
     @property
     def happened(self) -> int:
@@ -267,15 +273,20 @@ class Campaign:
         return found
 
     def leftovers(self) -> dict[str, int]:
-        """What is left when all runs are over. Ray's helpers look for a killed coordinator for a minute."""
-        ends = time.monotonic() + 90.0
-        while self.processes() and time.monotonic() < ends:
-            time.sleep(1.0)
+        """What is left when all runs are over."""
+        self._wait_for_processes()
+        said = "".join(path.read_text() for path in self.folder.glob("said-*"))
         return {
             "processes_left": len(self.processes()),
             "shared_memory_left": len(set(os.listdir(SHARED_MEMORY)) - self._shared_memory),
-            "ray_sessions_left": len(list((self.folder / "ray").glob("**/session_2*"))),
+            "ray_sessions_left": sum(str(path) not in said for path in (self.folder / "ray").glob("**/session_2*")),
         }
+
+    def _wait_for_processes(self) -> None:
+        """Until they have ended. Ray's helpers look for a killed coordinator for a minute."""
+        ends = time.monotonic() + 90.0
+        while self.processes() and time.monotonic() < ends:
+            time.sleep(1.0)
 
 
 def history(run: Path) -> list[list[str]]:
@@ -291,6 +302,7 @@ class Run:
         self.campaign, self.name, self._first = campaign, name, name
         self.rng = random.Random(f"{campaign.seed} {name}")
         self._said = campaign.folder / f"said-{name}.log"
+        self._heard = 0  # bytes of it that are settled
         self._clock, self._seconds_back = campaign.folder / f"clock-{name}", 0
         self.set_clock_back(0)
 
@@ -339,7 +351,7 @@ class Run:
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
             outside = process.returncode in (-signal.SIGINT, -signal.SIGTERM) and "in _enter" not in self.said()
             if outside:  # Python itself was interrupted, before the command began or after its end
-                self._said.write_text("")
+                self._heard = self._said.stat().st_size
                 continue
             # SIGBUS ends a process that writes to a full shared memory.
             known = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, 130, 1)
@@ -353,7 +365,7 @@ class Run:
 
     def said(self) -> str:
         """What its commands wrote to the terminal's error stream."""
-        return self._said.read_text()
+        return self._said.read_bytes()[self._heard :].decode()
 
     def last_words(self) -> str:
         """The end of it."""
@@ -465,6 +477,7 @@ def main() -> int:
 
         with ThreadPoolExecutor(options.jobs) as jobs:
             list(jobs.map(lambda _: campaign.disturb(options.faults, tell), range(options.jobs)))
+        campaign.last()
     except Wrong as error:
         wrong = str(error)
     finally:
@@ -489,7 +502,7 @@ def main() -> int:
         print(f"{wrong}\nits files: {folder}", file=sys.stderr)
         return 1
     shutil.rmtree(folder, ignore_errors=True)
-    return 1 if left["processes_left"] or left["shared_memory_left"] else 0
+    return 1 if any(left.values()) else 0
 
 
 if __name__ == "__main__":
