@@ -414,8 +414,8 @@ def _fill(folder: Path, run: Run, process: subprocess.Popen) -> None:
 
 def _lose_host(run: Run) -> None:
     assert run.campaign.cluster
-    run.campaign.cluster.lose_host()
-    time.sleep(run.rng.uniform(0.0, 20.0))
+    with run.campaign.cluster.without_power():
+        time.sleep(run.rng.uniform(0.0, 20.0))
     run.campaign.cluster.mend()
 
 

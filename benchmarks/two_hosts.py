@@ -67,13 +67,16 @@ class Cluster:
         if len(self._nodes) < 2 or self._nodes[1].poll() is not None:
             self._nodes[1:] = [self._start(self._enter, "--address", self.address)]
 
-    def lose_host(self) -> None:
-        """Kill all of the other host's processes."""
-        for process in psutil.process_iter():
-            with contextlib.suppress(psutil.Error, OSError):
-                if process.pid != self._host.pid and self._network(process.pid) == self._network(self._host.pid):
-                    process.kill()
-        self._nodes[1].wait()
+    @contextlib.contextmanager
+    def without_power(self) -> Iterator[None]:
+        """Take the other host away for a while: at once, nothing is heard of its processes."""
+        with self.unplugged():
+            for process in psutil.process_iter():
+                with contextlib.suppress(psutil.Error, OSError):
+                    if process.pid != self._host.pid and self._network(process.pid) == self._network(self._host.pid):
+                        process.kill()
+            self._nodes[1].wait()
+            yield
 
     @contextlib.contextmanager
     def unplugged(self) -> Iterator[None]:

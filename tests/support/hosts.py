@@ -155,18 +155,14 @@ class Host:
 
     def connect(self, switch: "Host", address: str) -> None:
         """Put a cable between this host and a switch, and give the host an address of 24 bits."""
-        self._switch, self._port = switch, f"p{address.rpartition('.')[2]}"
-        cable = ["ip", "link", "add", self._port, "type", "veth", "peer", "name", "eth0", "netns", str(self.pid)]
+        port = f"p{address.rpartition('.')[2]}"
+        cable = ["ip", "link", "add", port, "type", "veth", "peer", "name", "eth0", "netns", str(self.pid)]
         subprocess.run([*switch._enter(), *cable], check=True)
-        switch.run("ip", "link", "set", self._port, "master", "switch", "up")
+        switch.run("ip", "link", "set", port, "master", "switch", "up")
         self.run("ip", "address", "add", f"{address}/24", "dev", "eth0")
         self.run("ip", "link", "set", "eth0", "up")
         self.run("ip", "route", "add", "default", "dev", "eth0")  # by it Ray finds out its address
         self.address = address
-
-    def plug(self, in_: bool) -> None:
-        """Put the cable into the switch, or pull it out: nobody at either end is told."""
-        self._switch.run("ip", "link", "set", self._port, "up" if in_ else "down")
 
     def serve_ssh(self, authorized: str) -> None:
         """Let in who has the key."""
