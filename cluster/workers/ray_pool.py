@@ -315,10 +315,11 @@ class RayPool(WorkerPool):
         self._thread.join(1.0)
         if self._tickets:
             self._tickets.close()
+            mark = Path(self._tickets.path)
             if self._named:
-                os.unlink(self._tickets.path)
+                mark.unlink(missing_ok=True)
             else:
-                _remove_session(Path(self._tickets.path))  # Ray itself never removes its logs
+                _remove_session(mark)  # Ray itself never removes its logs
             self._tickets = None
             self._remove_abandoned()
 
@@ -403,7 +404,7 @@ class RayPool(WorkerPool):
 
 
 def _remove_session(tickets: Path) -> None:
-    """Remove a Ray session folder. The queue in it goes last: if this is cut short, the next run goes on."""
+    """Remove a Ray session folder; the queue in it goes last, so that the next run goes on if this is cut short."""
     with contextlib.suppress(OSError):  # another run removes it, too
         for path in set(tickets.parent.iterdir()) - {tickets}:
             if path.is_dir():
