@@ -5,7 +5,7 @@ import math
 import numpy as np
 import oracle
 import pytest
-from pictures import straight_road
+from pictures import cars_on, straight_road
 
 from gridsim.car.ego import DISTANCE, IDLE, End
 from gridsim.car.vehicle import Action
@@ -18,7 +18,7 @@ from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
 from gridsim.sensing.boxes import cast_boxes, hits_box, top_speed_near
 from gridsim.sensing.rays import fan
-from gridsim.traffic.world import ALONG, COS, FIELDS, JUNCTION_BEHIND, LANE, PERMIT, SIN, SPEED, SPEED_FACTOR, X, Y
+from gridsim.traffic.world import COS, FIELDS, LANE, SIN, SPEED, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
@@ -151,16 +151,9 @@ def cross():
     return Map("cross", 0, road, strips, network)
 
 
-def on_lane(lane, along, speed, pose):
-    """A world with one car, `along` m along a lane of `cross`, at a pose."""
-    world = parked(pose)
-    world[0, [LANE, ALONG, JUNCTION_BEHIND, PERMIT, SPEED_FACTOR, SPEED]] = lane, along, -1.0, -1.0, 1.0, speed
-    world[0, 7:9] = lane  # the lane leads into itself
-    return world
-
-
-def meet(scenario, start, world):
-    """Drive one car of a `BLIND` world until the episode ends; (simulator, End)."""
+def meet(scenario, start, lane, along):
+    """Drive in a `BLIND` world of one car, `along` m along a lane, until the episode ends; (simulator, End)."""
+    world = cars_on(scenario.network, (lane, along, 30.0, 1.0))
     simulator = Simulator([scenario], 1, BLIND, traffic=1)
     simulator.reset(np.array([start], dtype=F), worlds=world[None])
     for _ in range(40):
@@ -174,8 +167,7 @@ def meet(scenario, start, world):
 def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
     """30 against 30 m/s, 6 m a control period, at every phase of it; and past each other with 10 cm to spare."""
     for phase in np.arange(0.0, 6.0, 0.4):
-        along, start = SIDE - 150.0 - phase, [100.0, 128.0 + aside, 0.0, 30.0, 0.0]
-        simulator, end = meet(cross, start, on_lane(0, along, 30.0, (SIDE - along, 128.0, math.pi)))
+        simulator, end = meet(cross, [100.0, 128.0 + aside, 0.0, 30.0, 0.0], 0, SIDE - 150.0 - phase)
         assert end == (End.COLLISION if abs(aside) < 2.0 else End.RUNNING)
         car, other = simulator.state.cars[0], simulator.state.worlds[0, 0]
         assert other[SPEED] == pytest.approx(30.0, abs=1e-3)
@@ -186,24 +178,17 @@ def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
 
 
 @pytest.mark.parametrize(("speed", "steering"), [(5.0, 0.0), (8.0, 0.1), (8.0, -0.4), (20.0, 0.3), (-2.0, 0.4)])
-@pytest.mark.parametrize(
-    ("heading", "pace"),
-    [
-        (math.pi, 7.0),  # comes towards us
-        (0.0, 7.0),  # drives away
-        (0.0, 0.0),  # stands
-        (math.pi / 2, 7.0),  # crosses
-    ],
-)
+@pytest.mark.parametrize(("heading", "pace"), [(math.pi, 7.0), (0.0, 7.0), (0.0, 0.0), (math.pi / 2, 7.0)])
 def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, steering, heading, pace):
-    """By finite differences of the middle of the front axle, which a turning car moves sideways."""
+    """It comes towards us, drives away, stands, crosses. By finite differences of the middle of the front axle, which a
+    turning car moves sideways."""
     simulator = Simulator([cross], 1, CONFIG, traffic=1)
     world = parked((116.0, 128.0, heading))
     world[0, SPEED] = pace
     simulator.closing[:] = 99.0
     ranges, _ = simulator.reset(np.array([[100.0, 128.0, 0.0, speed, steering]]), worlds=world[None])
     kappa, step = oracle.curvature(CONFIG, speed, steering), 1e-4
-    poses = [oracle.on_arc(CONFIG, 0.0, 0.0, 0.0, kappa, way) for way in (-step * speed, step * speed)]
+    poses = [oracle.on_arc(CONFIG, (0.0, 0.0, 0.0), kappa, way) for way in (-step * speed, step * speed)]
     before, after = (np.array([x + 1.25 * math.cos(turn), y + 1.25 * math.sin(turn)]) for x, y, turn in poses)
     velocity = (after - before) / (2 * step) - pace * np.array([math.cos(heading), math.sin(heading)])
     rays = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
@@ -217,9 +202,7 @@ def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, s
 def test_nothing_tunnels_through_crosswise(cross, offset):
     """Both at 30 m/s, at right angles, so that the middle of one is `offset` m short when that of the other crosses."""
     for phase in np.arange(0.0, 3.0, 0.4):
-        south = 128.0 - 30.0 - phase
-        start = [128.0 - 30.0 - phase - offset, 128.0, 0.0, 30.0, 0.0]
-        _, end = meet(cross, start, on_lane(1, south, 30.0, (128.0, south, math.pi / 2)))
+        _, end = meet(cross, [98.0 - phase - offset, 128.0, 0.0, 30.0, 0.0], 1, 98.0 - phase)
         assert end == End.COLLISION
 
 
@@ -230,7 +213,7 @@ def test_nothing_tunnels_through_crosswise(cross, offset):
 def test_waiting_behind_a_standing_car_is_not_idle(cross, gap, ends):
     """Standing 5 s, bumper to bumper so many m behind a car that stands, and alone."""
     simulator = Simulator([cross], 1, BLIND, traffic=1)
-    world = on_lane(0, 100.0, 0.0, (SIDE - 100.0, 128.0, math.pi))
+    world = cars_on(cross.network, (0, 100.0, 0.0, 1.0))
     if gap is None:
         world[0, LANE] = -1.0
     start = [SIDE - 100.0 + 4.0 + (gap or 3.0), 128.0, math.pi, 0.0, 0.0]

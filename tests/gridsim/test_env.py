@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from commands import finish
 from driving import SENSING, drive
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeAwareObservation
@@ -183,43 +182,31 @@ def test_the_reward_among_traffic_is_the_papers(maps: Maps) -> None:
     assert collisions > 5
 
 
-@pytest.mark.parametrize("name", ["city", "highway"])
-def test_a_grid_is_what_the_rays_say(maps: Maps, name: str) -> None:
-    options: dict[str, Any] = {"scenario": name, "maps": maps[name]}
-    env, rays = GridSimVectorEnv(6, observation="grid", **options), GridSimVectorEnv(6, **options)
-    alone = GridSimVectorEnv(6, observation="image", **options)
-    (seen, _), (beside, _) = env.reset(seed=4), rays.reset(seed=4)
-    alone.reset(seed=4)
-    table = grid_table(env.config)
-    for row in drive(env, 60, seed=5):
-        np.testing.assert_array_equal(env.ranges, rays.ranges)
-        np.testing.assert_array_equal(seen["grid"], grids(table, env.ranges)[:, None])
-        np.testing.assert_allclose(seen["speed"], beside[:, -1:], rtol=1e-6)
-        seen, *ours, info = env.step(row)
-        beside, *theirs, _ = rays.step(row)
-        np.testing.assert_array_equal(alone.step(row)[0], seen["grid"])
-        np.testing.assert_equal(ours, theirs)  # what an observation is made of changes nothing else
-    assert len(np.unique(seen["grid"])) == 3
+@pytest.mark.parametrize(("name", "observation", "frames"), [("city", "image", 4), ("highway", "grid", 1)])
+def test_grids_are_what_the_last_rays_say_and_begin_anew_with_an_episode(
+    maps: Maps, name: str, observation: Any, frames: int
+) -> None:
+    options: dict[str, Any] = {"scenario": name, "maps": maps[name], "max_episode_steps": 9}
+    env = GridSimVectorEnv(5, observation=observation, frames=frames, **options)
+    rays, table = GridSimVectorEnv(5, **options), grid_table(env.config)
+    for seed in (3, None):
+        (seen, _), (beside, _) = env.reset(seed=seed), rays.reset(seed=seed)
+        past = [[grid] * frames for grid in grids(table, env.ranges)]
+        over = np.zeros(5, dtype=bool)
+        for row in drive(env, 28, seed=6):  # in the middle of an episode
+            np.testing.assert_array_equal(env.ranges, rays.ranges)
+            np.testing.assert_array_equal(seen["grid"] if observation == "grid" else seen, np.array(past))
+            if observation == "grid":
+                np.testing.assert_allclose(seen["speed"], beside[:, -1:], rtol=1e-6)
+            seen, *ours, info = env.step(row)
+            beside, *theirs, _ = rays.step(row)
+            np.testing.assert_equal(ours, theirs)  # what an observation is made of changes nothing else
+            now = grids(table, env.ranges)
+            past = [[now[i]] * frames if over[i] else [*past[i][1:], now[i]] for i in range(5)]
+            over = ours[1] | ours[2]
+        assert any((stack[0] != stack[-1]).any() for stack in past) or frames == 1
     named = {"distance_m", "speed_mps", "is_success", "end"}
     assert set(info) == named | {f"_{name}" for name in named}
-
-
-def test_frames_are_the_last_grids_and_begin_anew_with_an_episode(maps: Maps) -> None:
-    n = 5
-    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"], observation="image", frames=4, max_episode_steps=9)
-    table = grid_table(env.config)
-    for seed in (3, None):
-        seen, _ = env.reset(seed=seed)
-        now = grids(table, env.ranges)
-        past = [[now[i]] * 4 for i in range(n)]
-        over = np.zeros(n, dtype=bool)
-        for row in drive(env, 28, seed=6):  # in the middle of an episode
-            np.testing.assert_array_equal(seen, np.array(past))
-            seen, _, terminations, truncations, _ = env.step(row)
-            now = grids(table, env.ranges)
-            past = [[now[i]] * 4 if over[i] else [*past[i][1:], now[i]] for i in range(n)]
-            over = terminations | truncations
-        assert any((stack[0] != stack[3]).any() for stack in past)
 
 
 def test_rays_motion_speed_and_steering_are_shares(maps: Maps) -> None:
@@ -312,48 +299,29 @@ def test_the_time_limit_of_make_is_the_environments_own(mode: str, steps: int) -
         assert (terminated, truncated, info["end"]) == (False, True, End.TIME)
 
 
-def test_a_make_with_other_names_inside_leaves_the_configurations_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of Gymnasium's own are read by the environment, and are no promise of Gymnasium's."""
-
-    def make(id: str, limit: int) -> gymnasium.Env:
-        env = GridSimEnv(maps=1)
-        env.spec = EnvSpec(id, max_episode_steps=limit)
-        return env
-
-    monkeypatch.setattr(gymnasium, "make", make)
-    made: Any = make(IDS[2], 7)
-    assert made.spec.max_episode_steps == 4000
-
-
 # --- wrong use
 
 
-@pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize(
     ("actions", "action", "text"),
     [
         ("discrete", 8, "not 8"),
         ("discrete", -1, "not -1"),
-        ("discrete", math.nan, "nan"),
         ("discrete", 1.0, "whole numbers"),
-        ("discrete", None, "whole numbers"),
         ("discrete", [0], "cars"),
         ("continuous", [math.nan, 0.0], "not nan"),
         ("continuous", [None, 0.0], "numbers"),
-        ("continuous", [True, False], "numbers"),
         ("continuous", [0.0, 0.0, 0.0], "cars"),
-        ("continuous", 0.0, "cars"),
     ],
 )
-def test_a_wrong_action_is_refused(maps: Maps, n: int, actions: Any, action: object, text: str) -> None:
-    env = GridSimVectorEnv(n, scenario="city", maps=maps["city"][:1], actions=actions)
+def test_a_wrong_action_is_refused(maps: Maps, actions: Any, action: object, text: str) -> None:
+    env = GridSimVectorEnv(3, scenario="city", maps=maps["city"][:1], actions=actions)
     env.reset(seed=0)
     before, traffic = env.simulator.state.cars.copy(), env.simulator.state.worlds.copy()
-    with pytest.raises(ValueError, match=text) as error:
-        env.step(np.array([action] * n))
-    assert "\n" not in str(error.value)
+    with pytest.raises(ValueError, match=rf"^[^\n]*{text}[^\n]*$"):
+        env.step(np.array([action] * 3))
     with pytest.raises(ValueError, match="cars"):
-        env.step(np.zeros((n + 1, 2)))
+        env.step(np.zeros((4, 2)))
     np.testing.assert_array_equal(env.simulator.state.cars, before)
     np.testing.assert_array_equal(env.simulator.state.worlds, traffic)
     single = GridSimEnv("city", maps=maps["city"][:1], actions=actions)
@@ -388,7 +356,6 @@ def test_steps_and_pictures_need_a_reset(maps: Maps) -> None:
         ({"map_seed": 1.5}, "map_seed must be"),
         ({"map_seed": [1, 2, 3]}, "map_seed must be"),
         ({"start": [1, 2, 3]}, "start must be"),
-        ({"start": "here"}, "start must be"),
         ({"start": [1, 2, np.nan, 0, 0]}, "finite"),
         ({"start": [1, 2, 0, 31, 0]}, "speed"),
         ({"start": [1, 2, 0, 0, 1.0]}, "steering"),
@@ -397,9 +364,8 @@ def test_steps_and_pictures_need_a_reset(maps: Maps) -> None:
 )
 def test_a_wrong_option_is_refused(options: dict[str, object], text: str) -> None:
     env = GridSimVectorEnv(2, maps=1)
-    with pytest.raises(ValueError, match=re.escape(text)) as error:
+    with pytest.raises(ValueError, match=rf"^[^\n]*{re.escape(text)}[^\n]*$"):
         env.reset(seed=0, options=options)
-    assert "\n" not in str(error.value)
     env.reset(seed=0)
 
 
@@ -416,7 +382,6 @@ def test_a_wrong_option_is_refused(options: dict[str, object], text: str) -> Non
         ({"actions": "both"}, "actions must be discrete or continuous, not 'both'"),
         ({"render_mode": "ansi"}, "render_mode must be None or rgb_array or human, not 'ansi'"),
         ({"frames": 0}, "frames must be 1 to 8"),
-        ({"frames": 9, "observation": "grid"}, "frames must be 1 to 8"),
         ({"frames": 4}, "only for grids"),
         ({"motion": True, "observation": "image"}, "leave it out with observation='image'"),
         ({"traffic": -1}, "not -1"),
@@ -426,9 +391,8 @@ def test_a_wrong_option_is_refused(options: dict[str, object], text: str) -> Non
     ],
 )
 def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(text)) as error:
+    with pytest.raises(ValueError, match=rf"^[^\n]*{re.escape(text)}[^\n]*$"):
         GridSimVectorEnv(**arguments)
-    assert "\n" not in str(error.value)
 
 
 def test_a_single_environment_has_no_autoreset_mode() -> None:

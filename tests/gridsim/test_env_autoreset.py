@@ -8,9 +8,7 @@ import pytest
 from driving import SENSING, drive
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from gridsim.car.ego import End
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.maps.map import Map
 
@@ -60,19 +58,6 @@ def test_each_mode_is_that_of_gymnasiums_own_vector_environment(
             ours, theirs = (env.reset(seed=each, options={"reset_mask": over}) for env in (native, synced))
             same(ours, theirs)
     assert ended > N
-
-
-def test_make_vec_takes_the_mode_and_statistics_are_told_at_once(maps: dict[str, list[Map]]) -> None:
-    options: Any = {"maps": maps["city"], "max_episode_steps": 5, "autoreset_mode": AutoresetMode.SAME_STEP}
-    env = RecordEpisodeStatistics(gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options))
-    env.reset(seed=0)
-    for k in range(12):
-        *_, truncations, info = env.step(np.full(2, 4))
-        assert truncations.all() == (k % 5 == 4)
-        if truncations.any():
-            assert info["episode"]["l"].tolist() == [5, 5]
-            assert info["final_info"]["end"].tolist() == [End.TIME] * 2
-            assert info["end"].tolist() == [End.RUNNING] * 2
 
 
 def test_a_car_that_has_ended_must_be_reset(maps: dict[str, list[Map]]) -> None:

@@ -23,9 +23,8 @@ def test_it_tells_sb3_what_the_vector_environment_tells():
     returns = np.zeros(4)
     for step in range(1, 41):
         np.testing.assert_array_equal(observations, expected)
-        actions = np.full(4, 4)  # none: nobody ends before the time
-        observations, rewards, dones, infos = cars.step(actions)
-        expected, own_rewards, terminated, truncated, info = own.step(actions)
+        observations, rewards, dones, infos = cars.step(np.full(4, 4))  # none: nobody ends before the time
+        expected, own_rewards, terminated, truncated, info = own.step(np.full(4, 4))
         np.testing.assert_array_equal(rewards, own_rewards)
         np.testing.assert_array_equal(dones, terminated | truncated)
         returns += rewards
@@ -48,8 +47,6 @@ def test_its_learners_learn_on_rays_and_pictures():
     assert PPO("CnnPolicy", pictures, n_steps=8, batch_size=16, n_epochs=1).learn(64).num_timesteps == 64
     grids = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="grid", frames=2, max_episode_steps=5)
     assert PPO("MultiInputPolicy", grids, n_steps=8, batch_size=16, n_epochs=1).learn(64).num_timesteps == 64
-    few = SB3VecEnv("GridSim/Curved-v0", num_envs=4, observation="grid", max_episode_steps=5)
-    assert DQN("MultiInputPolicy", few, buffer_size=100, learning_starts=50).learn(80).num_timesteps >= 80
 
 
 def test_options_are_the_next_resets():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers import RecordVideo
-from gymnasium.wrappers import vector as wrappers
+from gymnasium.wrappers.vector import NumpyToTorch
 
 from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
@@ -66,41 +66,27 @@ def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
     np.testing.assert_array_equal(pictures, env.render())
 
 
-@pytest.mark.parametrize("vector", [False, True])
-def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path, vector: bool) -> None:
-    """Films are of lengths that MoviePy 2 does not cut: it does so with 8, 10 and 11 pictures at 10 a second."""
-    options: Any = {"maps": 1, "render_mode": "rgb_array", "max_episode_steps": 6}
-    filmed: Any = {"video_folder": str(tmp_path / "films"), "episode_trigger": lambda _: True}
-    env: Any
-    if vector:
-        plain = gymnasium.make_vec("GridSim/Highway-v0", num_envs=2, **options)
-        env = wrappers.RecordVideo(plain, video_aspect_ratio=(2, 1), **filmed)
-    else:
-        env = RecordVideo(gymnasium.make("GridSim/Highway-v0", **options), **filmed)
+def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path) -> None:
+    """In a film of a length that MoviePy 2 does not cut: it does so with 8, 10 and 11 pictures at 10 a second."""
+    plain = gymnasium.make("GridSim/Highway-v0", maps=1, render_mode="rgb_array", max_episode_steps=6)
+    env = RecordVideo(plain, str(tmp_path / "films"), episode_trigger=lambda _: True)
     env.reset(seed=0)
-    for step in range(6 + 1 + 4):  # an episode, the step or reset that begins the next one, and some of that one
-        if step == 6 and not vector:
-            env.reset()
-        else:
-            env.step(np.full(2, Action.ACCELERATE) if vector else int(Action.ACCELERATE))
+    for _ in range(6):
+        env.step(int(Action.ACCELERATE))
     env.close()
-    films = []
-    for path in sorted((tmp_path / "films").glob("*.mp4")):
-        reader = imageio_ffmpeg.read_frames(str(path))
-        films.append((next(reader)["fps"], imageio_ffmpeg.count_frames_and_secs(str(path))[0]))
-        reader.close()
-    assert films == [(10.0, 7), (10.0, 5)]
+    (film,) = tmp_path.glob("films/*.mp4")
+    reader = imageio_ffmpeg.read_frames(str(film))
+    assert (next(reader)["fps"], imageio_ffmpeg.count_frames_and_secs(str(film))[0]) == (10.0, 7)
+    reader.close()
 
 
-# --- other wrappers
+# --- other wrappers, and copies
 
 
-@pytest.mark.parametrize("observation", ["rays", "grid"])
-def test_numpy_to_torch_takes_all_that_is_told(observation: str) -> None:
-    options: Any = {"maps": 1, "max_episode_steps": 3, "observation": observation}
-    env = wrappers.NumpyToTorch(gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options))
-    _, info = env.reset(seed=0)
-    assert info["end"].tolist() == [End.RUNNING] * 2
+def test_numpy_to_torch_takes_all_that_is_told() -> None:
+    options: Any = {"maps": 1, "max_episode_steps": 3, "observation": "grid"}
+    env = NumpyToTorch(gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options))
+    env.reset(seed=0)
     for _ in range(3):
         *_, info = env.step(torch.full((2,), 4))
     assert info["end"].tolist() == [End.TIME] * 2
@@ -159,17 +145,3 @@ def test_a_copied_environment_goes_on_alike_with_the_same_kernels(
         maps = [each.unwrapped.cars if single else each.unwrapped for each in (env, other)]
         if clone is copy.deepcopy:
             assert maps[0].simulator.scenarios[0] is maps[1].simulator.scenarios[0]
-
-
-def test_maps_in_the_arguments_are_not_compiled_for_anew(maps: dict[str, list[Map]]) -> None:
-    """Gymnasium copies what it is given; a kernel takes arrays that can be written to for another type."""
-    city = maps["city"][0]
-    spec: Any = gymnasium.make("GridSim/City-v0", maps=[city]).spec
-    copied = spec.make().unwrapped.cars.simulator.scenarios[0]
-    assert copied.seed == city.seed
-    for again in (city, copied, copy.deepcopy(city), pickle.loads(pickle.dumps(city))):
-        np.testing.assert_equal(again.arrays(), city.arrays())
-        parts = (*again.road, *again.network, *again.strips)
-        for array in (part for part in parts if isinstance(part, np.ndarray)):
-            assert array.flags.c_contiguous
-            assert not array.flags.writeable

@@ -19,10 +19,10 @@ from cluster.runs.run import RunError, new_run, open_run, read_config
 from cluster.runs.settings import EvolveSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
-from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
+from gridsim.envs.env import GridSimEnv
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.files import MapFile, MapWarning, load_map, map_digest, read_free, read_map_file
-from gridsim.maps.map import Map, sample_starts, starts_at
+from gridsim.maps.map import Map, starts_at
 from gridsim.maps.raster import signed_clearance
 from gridsim.maps.scenarios import build, label
 
@@ -65,17 +65,14 @@ def test_starts_head_along_a_corridor(tmp_path, degrees):
     assert not crashes(scenario.road, starts).any()
 
 
-def ring(x, y, radius, half_width):
-    return half_width - np.abs(np.hypot(x, y) - radius)
+def ring(radius, half_width):
+    return picture(lambda x, y: half_width - np.abs(np.hypot(x - 45, y - 45) - radius), 90.0, 90.0)
 
 
-@pytest.mark.parametrize(
-    ("radius", "half_width", "short"), [(18, 2, True), (30, 2, True), (30, 5, True), (36, 5, False)]
-)
+@pytest.mark.parametrize(("radius", "half_width", "short"), [(18, 2, True), (30, 5, True), (36, 5, False)])
 def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
-    pixels = picture(lambda x, y: ring(x - 45, y - 45, radius, half_width), 90.0, 90.0)
     with warnings.catch_warnings(record=True, action="always") as said:
-        load_map(save(tmp_path / "ring.png", pixels))
+        load_map(save(tmp_path / "ring.png", ring(radius, half_width)))
     assert len(said) == short
     if short:
         told = r"^ring has about (\d+) m of road\. Ground driven again within 200 m does not count"
@@ -84,8 +81,7 @@ def test_a_ring_too_short_to_count_is_told(tmp_path, radius, half_width, short):
 
 
 def test_an_inverted_picture_is_told_by_environments_and_commands(tmp_path):
-    pixels = picture(lambda x, y: ring(x - 45, y - 45, 36.0, 5.0), 90.0, 90.0)
-    save(tmp_path / "dark.png", 255 - pixels)
+    save(tmp_path / "dark.png", 255 - ring(36.0, 5.0))
     expected = "100% of dark's border is road. If the road is dark, set negate: 1 in its YAML"
     with pytest.warns(MapWarning, match=expected):
         GridSimEnv(str(tmp_path / "dark.png"))
@@ -104,24 +100,18 @@ def test_a_track_in_a_large_picture_loads_as_fast_as_one_in_a_small_one(tmp_path
     track = np.where(np.abs(away - 20.0) < 5.0, 254, 205).astype(np.uint8)
     large = np.full((3000, 3000), 205, dtype=np.uint8)
     large[-2240:-2100, 2100:2360] = track
-    spent, starts = [], []
-    for name, pixels in (("small", track), ("large", large)):
-        save(tmp_path / f"{name}.png", pixels)
-        path = write_yaml(tmp_path, name=name, image=f"{name}.png", resolution=0.5)
-        begun = time.process_time()
-        starts.append(load_map(path).starts)
-        spent.append(time.process_time() - begun)
-    np.testing.assert_allclose(starts[1] - starts[0], np.tile([1050.0, 1050.0, 0.0, 0.0, 0.0], (512, 1)), atol=1e-4)
-    assert spent[1] < 2.0
+    starts = load_map(write_yaml(tmp_path, track, resolution=0.5)).starts
+    path = write_yaml(tmp_path, large, resolution=0.5)
+    begun = time.process_time()
+    further = load_map(path).starts
+    assert time.process_time() - begun < 2.0
+    np.testing.assert_allclose(further - starts, np.tile([1050.0, 1050.0, 0.0, 0.0, 0.0], (512, 1)), atol=1e-4)
 
 
 def test_starts_are_on_the_road_and_not_in_a_yard_too_small_to_drive_in(tmp_path):
-    def places(x, y):
-        plaza = np.minimum(24.0 - np.abs(x - 30), 24.0 - np.abs(y - 30))
-        yard = np.minimum(7.0 - np.abs(x - 80), 7.0 - np.abs(y - 30))
-        return np.maximum(plaza, yard)
-
-    scenario = load_map(save(tmp_path / "plaza.png", picture(places, 100.0, 60.0)))
+    plaza, yard = strip(30, 30, 0.0, 24.0, 24.0), strip(80, 30, 0.0, 7.0, 7.0)
+    pixels = picture(lambda x, y: np.maximum(plaza(x, y), yard(x, y)), 100.0, 60.0)
+    scenario = load_map(save(tmp_path / "plaza.png", pixels))
     assert len(scenario.starts) > 100
     assert not crashes(scenario.road, scenario.starts).any()
     assert scenario.starts[:, 0].max() < 55
@@ -155,9 +145,7 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
 
 
 def test_the_outside_is_wall(tmp_path):
-    def road(x, y):  # runs out of the picture to the left and to the right
-        return 4.0 - np.abs(y - 16.0)
-
+    road = strip(32.0, 16.0, 0.0, 4.0)  # runs out of the picture to the left and to the right
     bounded = load_map(save(tmp_path / "map.png", picture(road, 64.0, 32.0)))
     assert not bounded.torus
     assert read(bounded.road, [[-0.3, 16.0], [64.3, 16.0], [-1.5, 16.0], [66.0, 16.0]]).max() < 0.0
@@ -170,8 +158,7 @@ def test_the_outside_is_wall(tmp_path):
 def test_origin_starts_and_speed(tmp_path):
     pixels = picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0)
     given = [[-40.0, 100.5, 0.1], [20.0, 101.0, math.pi]]
-    name = write_yaml(tmp_path, pixels, origin=[-50.0, 81.0, 0.0], starts=given, speed=[3, 7.5])
-    scenario = load_map(name)
+    scenario = load_map(write_yaml(tmp_path, pixels, origin=[-50.0, 81.0, 0.0], starts=given, speed=[3, 7.5]))
     np.testing.assert_allclose(scenario.starts, [[10.0, 19.5, 0.1, 0, 0], [70.0, 20.0, math.pi, 0, 0]], atol=1e-5)
     assert (float(scenario.road.speed_low), float(scenario.road.speed_high)) == (3.0, 7.5)
     assert scenario.seed == 0
@@ -239,9 +226,6 @@ def test_one_map_for_all_seeds(track):
     assert (len(track.network.steps), track.mileage.tolist()) == (0, [0.0])
     assert 100 < len(track.starts) <= 512
     assert not track.starts.flags.writeable
-    starts = sample_starts(track, 300, np.random.default_rng(1))
-    np.testing.assert_array_equal(starts, sample_starts(track, 300, np.random.default_rng(1)))
-    assert len(np.unique(starts, axis=0)) > 100
     edges = starts_at(track, np.array([0.0, np.nextafter(1.0, 0.0)]))
     np.testing.assert_array_equal(edges, track.starts[[0, -1]])
     assert not Map.from_arrays({k: v.copy() for k, v in track.arrays().items()}).torus
@@ -259,16 +243,13 @@ def test_a_changed_picture_is_read_again(tmp_path, by_yaml):
     assert map_digest(name) != digest
 
 
-def test_environments_and_champions_drive_on_it(track, tmp_path):
-    env = GridSimVectorEnv(8, scenario=track.name)
-    observations, _ = env.reset(seed=3)
-    for _ in range(20):
-        observations, *_ = env.step(np.zeros(8, dtype=np.int64))
-    assert np.isfinite(observations).all()
-    assert [s.name for s in env.simulator.scenarios] == [track.name]
-    env.reset(options={"map_seed": 7})
-    assert len(env.simulator.scenarios) == 1
-    assert GridSimEnv(track.name).reset(seed=1)[0].shape == (32,)
+def test_environments_and_champions_drive_on_it(track):
+    env = GridSimEnv(track.name)
+    env.reset(seed=3, options={"map_seed": 7})
+    for _ in range(10):
+        observation, *_ = env.step(0)
+    assert np.isfinite(observation).all()
+    assert [s.name for s in env.cars.simulator.scenarios] == [track.name]
     champion = Champion(np.zeros(PolicySpec.parse("mlp:2").size, np.float32), "mlp:2", track.name, SimConfig())
     assert evaluate(champion, episodes=8)["episodes"] == 8
 

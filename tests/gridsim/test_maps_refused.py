@@ -21,14 +21,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")
 
 def refused(name):
     """The one line with which a file is refused."""
-    with pytest.raises(ValueError) as caught:  # noqa: PT011, what it says is looked at
+    with pytest.raises(GridSimError, match=r"^[^\n]{1,600}$") as caught:
         load_map(str(name))
-    message = str(caught.value)
-    assert "\n" not in message
-    assert len(message) < 600
     with pytest.raises(GridSimError):
         from_dict(EvolveSettings, {"scenario": str(name)})
-    return message
+    return str(caught.value)
 
 
 def bomb(path, width, height):
@@ -69,7 +66,6 @@ def test_pictures_that_are_no_maps(tmp_path):
 # A YAML, and what the line says.
 WRONG = {
     "[1, 2]": "mapping",
-    "image: [": "not valid YAML",
     "[" * 2000: "not valid YAML",
     "!!python/object/apply:os.system ['true']": "not valid YAML",
     "resolution: 0.1": "image",
@@ -128,10 +124,8 @@ def small(tmp_path_factory):
 
 
 def loads_or_is_refused(path):
-    scenario = None
     with contextlib.suppress(GridSimError):
         scenario = load_map(str(path))
-    if scenario is not None:
         assert len(scenario.starts)
         assert not crashes(scenario.road, scenario.starts).any()
 
@@ -149,9 +143,7 @@ def test_any_bytes(small, data, suffix):
         loads_or_is_refused(path)
 
 
-scalars = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8), st.dates(), st.binary(max_size=4)
-)
+scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.dates() | st.binary()
 values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(scalars, inner, max_size=3))
 GOOD = {
     "image": "good.png", "resolution": 0.25, "origin": [0, 0, 0], "negate": 0, "free_thresh": 0.5,

@@ -4,12 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from pictures import read
 
 from gridsim.car.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
-from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
-from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build
 from gridsim.view import paint, render
 from gridsim.view.render import Renderer, interpolate
@@ -53,8 +52,7 @@ def test_every_pixel_is_road_where_the_map_has_road(scenario):
         image = renderer.draw(car)
         row, column = np.mgrid[0:240, 0:320]
         x, y = world(renderer, car, column, row)
-        clear = np.array([clearance(scenario.road, a, b) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
-        clear = clear.reshape(x.shape)
+        clear = read(scenario.road, np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
         wall = clear < -paint.VERGE_WIDTH - 0.3
         assert wall.sum() > 10_000
         ground = np.minimum(distance(image, paint.GROUND), distance(image, paint.GROUND_OTHER))
@@ -72,23 +70,23 @@ def test_every_pixel_is_road_where_the_map_has_road(scenario):
 def test_car_covers_its_own_outline(scenario, state):
     car, _ = state
     renderer = Renderer(scenario, (1280, 960))
-    without = renderer.draw(car_at(car[X] + 100.0, car[Y], 0.0))  # moves the view; drawn again below with the car
     image = renderer.draw(car)
-    assert (image != without).any()
-    red = distance(image, paint.EGO) < 25
-    row, column = np.nonzero(red)
-    x, y = world(renderer, car, column, row)
-    along = (x - car[X]) * car[COS] + (y - car[Y]) * car[SIN]
-    across = -(x - car[X]) * car[SIN] + (y - car[Y]) * car[COS]
+
+    def painted(colour, tolerance):
+        """How far pixels of about a colour are along the car and to its left, m."""
+        row, column = np.nonzero(distance(image, colour) < tolerance)
+        x, y = world(renderer, car, column, row)
+        dx, dy = x - car[X], y - car[Y]
+        return dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
+
+    along, across = painted(paint.EGO, 25)
     assert np.abs(along).max() == pytest.approx(2.0, abs=0.25)
     assert np.abs(across).max() == pytest.approx(1.0, abs=0.25)
     # Its front is told by the headlights: pale pixels ahead of the centre, none behind.
-    row, column = np.nonzero(distance(image, paint.LIGHT) < 12)
-    x, y = world(renderer, car, column, row)
-    ahead = (x - car[X]) * car[COS] + (y - car[Y]) * car[SIN]
-    near = np.hypot(x - car[X], y - car[Y]) < 2.2
+    along, across = painted(paint.LIGHT, 12)
+    near = np.hypot(along, across) < 2.2
     assert near.any()
-    assert ahead[near].min() > 1.2
+    assert along[near].min() > 1.2
 
 
 def test_other_cars_are_where_the_boxes_are_also_over_the_seam(scenario):
@@ -98,8 +96,8 @@ def test_other_cars_are_where_the_boxes_are_also_over_the_seam(scenario):
     box = np.array([[8.0, 130.0, 1.0, 0.0]])  # 10 m ahead, beyond the edge of the torus, and 2 m to the left
     blue = distance(renderer.draw(car, boxes=box), paint.OTHER) < 25
     blue &= ~(distance(renderer.draw(car), paint.OTHER) < 25)
-    row, column = np.nonzero(blue)
     assert blue.sum() > 30
+    row, column = np.nonzero(blue)
     assert 240 * render.CAR_AT - row.mean() == pytest.approx(10.0 * renderer.pixels_per_m, abs=2.5)
     assert 160 - column.mean() == pytest.approx(2.0 * renderer.pixels_per_m, abs=2.0)
 
@@ -111,14 +109,10 @@ def test_rays_end_where_the_ranges_say(scenario, state):
     image = renderer.draw(car, ranges=ranges)
     renderer.draw(car_at(10.0, 10.0, 2.0))
     assert (renderer.draw(car, ranges=ranges) == image).all()  # drawing leaves nothing behind
-    sensors = SimConfig().sensors
-    first, step = -np.radians(sensors.field_of_view) / 2, np.radians(sensors.field_of_view) / (sensors.rays - 1)
     seen = 0
-    for k, reach in enumerate(ranges):
-        turn = first + step * k
-        ahead, left = 1.25 + reach * np.cos(turn), reach * np.sin(turn)
-        column = 320 - left * renderer.pixels_per_m
-        row = 480 * render.CAR_AT - ahead * renderer.pixels_per_m
+    for turn, reach in zip(np.radians(np.linspace(-60.0, 60.0, 31)), ranges, strict=True):
+        column = 320 - reach * np.sin(turn) * renderer.pixels_per_m
+        row = 480 * render.CAR_AT - (1.25 + reach * np.cos(turn)) * renderer.pixels_per_m
         if reach < 49.0 and 0 <= column < 639 and 0 <= row < 479:
             seen += 1
             assert distance(image[int(row), int(column)], paint.RAY) < 40

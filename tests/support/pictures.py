@@ -1,4 +1,4 @@
-"""Small roads, pictures of roads, what is where on the maps made of them, and recorded drives."""
+"""Small roads, cars on them, pictures of roads, what is where on the maps made of them, and recorded drives."""
 
 import math
 from contextlib import closing
@@ -13,6 +13,7 @@ from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.map import without_lanes
 from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze, make_road
+from gridsim.traffic import world as traffic
 from gridsim.view.drive import Recorder, manual, poses_of
 
 PPM = 16
@@ -35,8 +36,7 @@ def distance(x, y):
 
 def picture(shape=distance, width=W, height=H, ppm=PPM):
     """An anti-aliased picture uint8 [rows, columns] of a shape, its highest row first, as pictures are."""
-    x = (np.arange(round(width * ppm)) + 0.5) / ppm
-    y = (np.arange(round(height * ppm)) + 0.5) / ppm
+    x, y = ((np.arange(round(side * ppm)) + 0.5) / ppm for side in (width, height))
     d = shape(*np.meshgrid(x, y[::-1]))
     return np.clip(127.5 + 255 * ppm * d, 0, 255).round().astype(np.uint8)
 
@@ -49,9 +49,8 @@ def save(path, pixels):
 def write_yaml(folder, pixels=None, name="map", **values):
     if pixels is not None:
         save(folder / "map.png", pixels)
-    values = {"image": "map.png", "resolution": 1 / PPM, "origin": [0, 0, 0], **values}
     path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump({k: v for k, v in values.items() if v is not None}))
+    path.write_text(yaml.safe_dump({"image": "map.png", "resolution": 1 / PPM, "origin": [0, 0, 0], **values}))
     return str(path)
 
 
@@ -86,6 +85,22 @@ def straight_road(width, height, limit, half_width=0.0):
     to move over."""
     nodes = clearance_nodes(Strips.of([[0.0, height / 2, width, height / 2, half_width]]), width, height)
     return make_road(nodes, (limit, limit), 1.0)
+
+
+def cars_on(network, *rows):
+    """A world of cars (lane, m along it, m/s, factor), placed by one look at where they are."""
+    world = np.zeros((len(rows), traffic.FIELDS), dtype=np.float32)
+    for car, (lane, along, speed, factor) in zip(world, rows, strict=True):
+        car[[traffic.LANE, traffic.ALONG, traffic.SPEED, traffic.SPEED_FACTOR]] = lane, along, speed, factor
+        car[[traffic.JUNCTION_BEHIND, traffic.PERMIT]] = -1.0
+        car[traffic.NEXT] = network.successors[lane, 0]
+        car[traffic.SECOND_NEXT] = network.successors[int(car[traffic.NEXT]), 0]
+        at = along / float(network.steps[lane])
+        first = network.offsets[lane] + int(at)
+        a, b = network.points[first], network.points[first + 1]
+        car[[traffic.X, traffic.Y]] = (a + (at - int(at)) * (b - a)) % [network.width, network.height]
+        car[[traffic.COS, traffic.SIN]] = (b - a) / np.hypot(*(b - a))
+    return world
 
 
 def record_drive(path, scenario, start, episodes):
