@@ -126,22 +126,19 @@ def test_a_copied_environment_goes_on_alike_with_the_same_kernels(
     env.action_space.seed(1)
     row = [env.action_space.sample() for _ in range(12)]
     env.reset(seed=5)
-    for middle in (False, True):  # of an episode, or at its beginning
-        env.step(row[0])
-        env.render()
-        if not middle:
-            env.reset(seed=5)
-        compiled = [len(kernel.signatures) for kernel in KERNELS]
-        other = clone(env)
-        for action in row[1:]:
-            ours, theirs = env.step(action), other.step(action)
-            assert repr(ours) == repr(theirs)
-            np.testing.assert_equal(ours, theirs)
-            if single and (ours[2] or ours[3]):
-                break
-        np.testing.assert_array_equal(env.render(), other.render())
-        np.testing.assert_equal(env.reset(), other.reset())
-        assert [len(kernel.signatures) for kernel in KERNELS] == compiled
-        maps = [each.unwrapped.cars if single else each.unwrapped for each in (env, other)]
-        if clone is copy.deepcopy:
-            assert maps[0].simulator.scenarios[0] is maps[1].simulator.scenarios[0]
+    env.step(row[0])
+    env.render()
+    compiled = [len(kernel.signatures) for kernel in KERNELS]
+    other = clone(env)
+    for action in row[1:]:
+        ours, theirs = env.step(action), other.step(action)
+        assert repr(ours) == repr(theirs)
+        np.testing.assert_equal(ours, theirs)
+        if single and (ours[2] or ours[3]):
+            break
+    np.testing.assert_array_equal(env.render(), other.render())
+    np.testing.assert_equal(env.reset(), other.reset())
+    assert [len(kernel.signatures) for kernel in KERNELS] == compiled
+    maps = [each.unwrapped.cars if single else each.unwrapped for each in (env, other)]
+    if clone is copy.deepcopy:
+        assert maps[0].simulator.scenarios[0] is maps[1].simulator.scenarios[0]

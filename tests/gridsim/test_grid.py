@@ -15,27 +15,18 @@ CONFIG = SimConfig()
 
 
 def cell_by_cell(config, ranges):
-    """The textbook, float64: each cell on its own, from its centre's angle and distance."""
-    sensors = config.sensors
+    """The textbook, float64: each cell on its own, from its centre's angle and distance; where float32 may differ."""
+    sensors, at = config.sensors, 0.5 * np.arange(80) + 0.25
     rays = np.radians(np.linspace(-sensors.field_of_view / 2, sensors.field_of_view / 2, sensors.rays))
-    grid = np.zeros((80, 80), dtype=np.uint8)
-    near_an_edge = np.zeros((80, 80), dtype=bool)  # where float32 may decide otherwise
-    for row in range(80):
-        for column in range(80):
-            ahead, left = 40.0 - 0.5 * row - 0.25, 20.0 - 0.5 * column - 0.25
-            angle, distance = math.atan2(left, ahead), math.hypot(ahead, left)
-            if abs(angle) > math.radians(sensors.field_of_view / 2):
-                continue
-            hit = float(ranges[np.abs(rays - angle).argmin()])
-            h = math.hypot(0.25, 0.25)
-            if hit >= sensors.range:
-                grid[row, column] = 127 if distance < sensors.range else 0
-                edges = [sensors.range]
-            else:
-                grid[row, column] = 127 if distance < hit - h else 255 if distance <= hit + h else 0
-                edges = [hit - h, hit + h]
-            near_an_edge[row, column] = min(abs(distance - edge) for edge in edges) < 1e-4
-    return grid, near_an_edge
+    ahead, left = 40.0 - at[:, None], 20.0 - at
+    angle, distance = np.arctan2(left, ahead), np.hypot(left, ahead)
+    hit = ranges[np.abs(rays - angle[..., None]).argmin(axis=2)].astype(float)
+    free = hit >= sensors.range
+    near, far = (np.where(free, sensors.range, hit + h) for h in (-math.hypot(0.25, 0.25), math.hypot(0.25, 0.25)))
+    seen = np.abs(angle) <= math.radians(sensors.field_of_view / 2)
+    grid = np.where(distance < near, 127, np.where(~free & (distance <= far), 255, 0))
+    near_an_edge = np.minimum(np.abs(distance - near), np.abs(distance - far)) < 1e-4
+    return np.where(seen, grid, 0), seen & near_an_edge
 
 
 SHARES = st.floats(0.0, 1.0, width=32) | st.just(1.0)

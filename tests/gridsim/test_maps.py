@@ -255,7 +255,7 @@ def test_environments_and_champions_drive_on_it(track):
 
 
 def test_traffic_that_a_map_cannot_have_changes_nothing(tmp_path, capsys):
-    name = save(tmp_path / "a.png", picture())
+    name = save(tmp_path / "a.png", picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0))
     asked, plain = (_prepare(EvolveFlags, ["--scenario", name, "--traffic", n])[1].settings for n in ("3", "0"))
     assert asked == plain
     assert capsys.readouterr().err == f"gridsim-evolve: {name} has no lanes for traffic; running without\n"

@@ -1,4 +1,5 @@
-"""Traffic: its laws against closed forms and the oracle, who waits for whom, and that it neither crashes nor stops."""
+"""Traffic: where its cars begin, its laws against closed forms and the oracle, who waits for whom, and that it neither
+crashes nor stops."""
 
 import math
 
@@ -8,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pictures import cars_on, crashes, straight_road
+from scipy import stats
 
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
 from gridsim.car.vehicle import path_curvature
@@ -16,10 +18,11 @@ from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
+from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.sensing.boxes import boxes_touch, hits_box
 from gridsim.traffic.behaviour import drivers, flow, idm
-from gridsim.traffic.world import ALONG, DRAWS, FIELDS, LANE, LANE_TIMER, NEXT, PERMIT, SECOND_NEXT, spawn
+from gridsim.traffic.world import ALONG, DRAWS, FIELDS, LANE, LANE_TIMER, NEXT, PERMIT, SECOND_NEXT, SPEED_FACTOR, spawn
 
 F = np.float32
 CONFIG = SimConfig()
@@ -87,6 +90,67 @@ def watch(network, world, seconds, ego=NOBODY, config=CONFIG):
     assert _watch(network, drivers(config), constants(config), world.copy(), ego, history) == 0
     return history
 
+
+# --- Where cars begin, and how much room they have --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scenario", ["seamless", "highway", "city"])
+def test_cars_spawn_uniformly_over_the_lanes_outside_junctions(scenario):
+    network = build(scenario, 1).network
+    keys = np.arange(4000, dtype=np.uint64)
+    cars = spawn(network, np.repeat(FAR[None], 4000, axis=0), 1, keys, CONFIG)[:, 0].astype(float)
+    assert (cars[:, LANE] >= 0).mean() > 0.99
+    cars = cars[cars[:, LANE] >= 0]
+    lane = cars[:, LANE].astype(int)
+    lengths = np.array([lane_length(network, k) for k in range(len(network.steps))])
+    free = np.diff(network.crossing_offsets) == 0
+    assert free[lane].all()
+    # No part of a car is in a junction: neither its nose past the line nor its rear.
+    before, behind = ~free[network.successors[:, 0]], np.isin(np.arange(len(free)), network.successors[~free])
+    first, last = behind * LENGTH / 2, lengths - before * (LENGTH / 2 + 0.25)
+    assert ((first[lane] - 1e-3 <= cars[:, ALONG]) & (cars[:, ALONG] <= last[lane] + 1e-3)).all()
+    counts, expected = np.bincount(lane, minlength=len(lengths))[free], (last - first)[free]
+    assert stats.chisquare(counts, expected / expected.sum() * len(cars)).pvalue > 1e-3
+    assert stats.kstest((cars[:, ALONG] - first[lane]) / (last - first)[lane], "uniform").pvalue > 1e-3
+    assert stats.kstest(cars[:, SPEED_FACTOR], "uniform", args=(0.9, 0.3)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("scenario", REGISTRY)
+def test_spawned_cars_keep_their_distance(scenario):
+    road_map = build(scenario, 2)
+    network, rng = road_map.network, np.random.default_rng(0)
+    starts = np.zeros((40, 5), dtype=F)
+    starts[:, :2] = network.points[rng.integers(len(network.points), size=40)] % [network.width, network.height]
+    worlds = spawn(network, starts, 12, np.arange(40, dtype=np.uint64), CONFIG).astype(float)
+    for world, start in zip(worlds, starts, strict=True):
+        here = world[world[:, LANE] >= 0][:, [X, Y]]
+        assert len(here) >= 8
+        assert np.hypot(*road_map.shortest(here - start[:2]).T).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
+        for k in range(1, len(here)):
+            assert np.hypot(*road_map.shortest(here[:k] - here[k]).T).min() >= CONFIG.traffic.spawn_gap - 1e-3
+
+
+def test_no_car_keeps_further_right_than_there_is_room():
+    for name in REGISTRY:
+        scenario = build(name, 3)
+        network, traffic, room = scenario.network, CONFIG.traffic, scenario.network.room
+        first = np.setdiff1d(np.arange(len(room)), network.offsets[1:] - 1)
+        along = network.points[first + 1] - network.points[first]
+        along /= np.hypot(*along.T)[:, None]
+        right = network.points[first] + room[first, None] * np.stack([along[:, 1], -along[:, 0]], axis=1)
+        kerb = clearances(scenario.road, freeze(right.astype(F)))
+        assert (room >= 0.0).all()
+        assert (kerb[room[first] > 0] >= CONFIG.vehicle.width / 2 + traffic.verge - 0.02).all()
+        assert room.max() == (0.0 if name == "highway" else pytest.approx(traffic.give_way))
+        # Gently, from lane to lane as well.
+        steps = np.repeat(network.steps, np.diff(network.offsets))
+        assert (np.abs(np.diff(room))[first] <= traffic.taper * steps[first] + 1e-4).all()
+        lane, k = np.nonzero(network.successors >= 0)
+        gaps = room[network.offsets[lane + 1] - 1] - room[network.offsets[network.successors[lane, k]]]
+        assert (np.abs(gaps) <= traffic.taper * network.steps[lane] + 1e-4).all()
+
+
+# --- How they drive --------------------------------------------------------------------------------------------------
 
 speeds = st.floats(0.0, 30.0, width=32)
 

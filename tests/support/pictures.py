@@ -18,20 +18,13 @@ from gridsim.view.drive import Recorder, manual, poses_of
 
 PPM = 16
 W, H = 100.0, 72.0  # m
-LINES = np.array([[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]])
-ARCS = np.array([[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]])
+LINES = [[15.0, 12.0, 80.0, 50.0, 4.0], [15.0, 12.0, 85.0, 15.0, 3.5]]
+TRACK = oracle.ExactRoad(Strips.of(LINES, [[40.0, 45.0, 16.0, 0.0, 2 * math.pi, 3.5]]), 256.0, 256.0)
 
 
 def distance(x, y):
-    """Clearance (m) of the strips above, in closed form."""
-    best = np.full(np.broadcast(x, y).shape, -np.inf)
-    for ax, ay, bx, by, w in LINES:
-        dx, dy = bx - ax, by - ay
-        t = np.clip(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy), 0.0, 1.0)
-        best = np.maximum(best, w - np.hypot(x - ax - t * dx, y - ay - t * dy))
-    for cx, cy, r, *_, w in ARCS:
-        best = np.maximum(best, w - np.abs(np.hypot(x - cx, y - cy) - r))
-    return best
+    """Clearance (m) of the strips above."""
+    return TRACK.clearance(np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
 
 
 def picture(shape=distance, width=W, height=H, ppm=PPM):
