@@ -31,9 +31,7 @@ SIDE = 256.0
 def parked(*poses):
     """A world with cars at poses (x, y, heading)."""
     world = np.zeros((len(poses), FIELDS), dtype=F)
-    table = np.array(poses, dtype=float).reshape(-1, 3)
-    world[:, X], world[:, Y] = table[:, 0], table[:, 1]
-    world[:, COS], world[:, SIN] = np.cos(table[:, 2]), np.sin(table[:, 2])
+    world[:, [X, Y, COS, SIN]] = directed(np.array(poses, dtype=float))
     return world
 
 
@@ -51,12 +49,9 @@ def _hits(k, poses, worlds, hits):
         hits[i] = hits_box(k, worlds[i], F(0.0), F(0.1), F(SIDE), F(SIDE), x, y, cosine, sine)
 
 
-def cast(poses, worlds):
-    """Ranges [n, 31] of sensors at poses [n, 3] in worlds [n, cars, FIELDS] without walls."""
-    sensors = np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]).astype(F)
-    ranges = np.full((len(poses), 31), 50.0, dtype=F)
-    _cast(K, RAYS, F(SIDE), sensors, worlds, ranges)
-    return ranges
+def directed(poses):
+    """Poses [n, 3] as kernels read them: float32 [n, 4], x, y, cosine, sine."""
+    return np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]).astype(F)
 
 
 # --- Rays ------------------------------------------------------------------------------------------------------------
@@ -75,7 +70,8 @@ def test_rays_are_the_oracles():
     boxes = np.concatenate([(sensors[:, None, :2] + offsets) % SIDE, turns], axis=-1)
     boxes[300:600, :, 2] = sensors[300:600, 2, None]  # rays that are parallel to two sides
     boxes, sensors = boxes.astype(F).astype(float), sensors.astype(F).astype(float)
-    ranges = cast(sensors, np.stack([parked(*row) for row in boxes]))
+    ranges = np.full((n, 31), 50.0, dtype=F)
+    _cast(K, RAYS, F(SIDE), directed(sensors), np.stack([parked(*row) for row in boxes]), ranges)
     grazing = 0  # rays that graze a corner: either answer is right
     for pose, near, seen in zip(sensors, boxes, ranges, strict=True):
         larger, smaller = (
@@ -115,9 +111,9 @@ def test_all_contacts_are_found(vehicle):
     other = one + np.column_stack([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(-3.0, 3.0, n)])
     other[:10_000, 2] = one[:10_000, 2]
     hits = np.zeros(n, dtype=bool)
-    poses = np.column_stack([one[:, :2], np.cos(one[:, 2]), np.sin(one[:, 2])]).astype(F)
     a, b = vehicle.length / 2, vehicle.width / 2
-    _hits(constants(config), poses, parked(*np.column_stack([other[:, :2] % SIDE, other[:, 2]]))[:, None], hits)
+    worlds = parked(*np.column_stack([other[:, :2] % SIDE, other[:, 2]]))[:, None]
+    _hits(constants(config), directed(one), worlds, hits)
     smaller, larger = (
         outlines_meet(*(oracle.corners(pose.astype(float), a + margin, b + margin) for pose in (one, other)))
         for margin in (-1e-3, 1e-3)

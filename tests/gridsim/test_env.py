@@ -370,7 +370,6 @@ def test_a_wrong_option_is_refused(options: dict[str, object], text: str) -> Non
         ({"maps": 0}, "1 map"),
         ({"map_seed": -1}, "map_seed"),
         ({"max_episode_steps": 0}, "1 step"),
-        ({"config": SimConfig(episode=EpisodeConfig(target=-1.0))}, "target"),
         ({"observation": "film"}, "observation must be rays or grid or image, not 'film'"),
         ({"actions": "both"}, "actions must be discrete or continuous, not 'both'"),
         ({"render_mode": "ansi"}, "render_mode must be None or rgb_array or human, not 'ansi'"),

@@ -4,6 +4,7 @@ import copy
 import pickle
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium
 import imageio_ffmpeg
@@ -93,22 +94,17 @@ def test_numpy_to_torch_takes_all_that_is_told() -> None:
 
 
 def test_environments_share_maps(monkeypatch: pytest.MonkeyPatch) -> None:
-    built = []
-
-    def counted(*of: Any) -> Map:
-        built.append(of)
-        return build(*of)
-
-    monkeypatch.setattr(episodes, "build", counted)
+    built = Mock(wraps=build)
+    monkeypatch.setattr(episodes, "build", built)
     envs: list[Any] = [gymnasium.make("GridSim/Curved-v0", maps=2, map_seed=700) for _ in range(4)]
     many = gymnasium.make_vec("GridSim/Curved-v0", num_envs=8, maps=2, map_seed=700)
     for env in (*envs, many):
         for seed in range(4):
             env.reset(seed=seed)
-    assert len(built) == 2
+    assert built.call_count == 2
     other = GridSimEnv("curved", maps=2, map_seed=700, config=SimConfig(sensors=SensorConfig(range=30.0)))
     other.reset(seed=0)
-    assert len(built) == 3
+    assert built.call_count == 3
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """The order of events: cars against the oracle through whole episodes, and what must not earn distance."""
 
 import math
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -23,17 +23,11 @@ INTERVAL = (5.0, 12.0)  # m/s
 TARGET, MAX_STEPS = 150.0, 200  # of the episodes that are driven at random and by sight
 
 
-class Run(NamedTuple):
-    """An episode of one car: actions [n], states after each step [n, FIELDS], how it ended."""
-
-    start: np.ndarray
-    actions: np.ndarray
-    states: np.ndarray
-    end: str
-
-
 def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
-    """Drive until the episode ends; `choose` is called with (step, ranges, car) and returns an action."""
+    """Drive until the episode ends; `choose` is called with (step, ranges, car) and returns an action.
+
+    Returns: the start, the actions [n], the states after each [n, FIELDS], and how it ended.
+    """
     start = np.asarray(start, dtype=F)
     simulator = Simulator([road_map], 1, config, target, max_steps)
     ranges, _ = simulator.reset(start[None])
@@ -43,7 +37,8 @@ def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
         actions.append(int(choose(len(actions), ranges[0], simulator.state.cars[0])))
         ranges, *_ = simulator.step(np.array(actions[-1:]))
         states.append(simulator.state.cars[0].copy())
-    return Run(start, np.array(actions), np.array(states), End(simulator.state.ends[0]).name)
+    end = End(simulator.state.ends[0]).name
+    return SimpleNamespace(start=start, actions=np.array(actions), states=np.array(states), end=end)
 
 
 def at_random(rng):
@@ -92,15 +87,14 @@ def exact(scenarios):
 
 @pytest.fixture(scope="module")
 def episodes(scenarios):
-    """(index of the map, Run): 80 episodes at random and 30 of a driver, from lanes, at any speed."""
+    """(index of the map, what `run` returns): 80 episodes at random and 30 of a driver, from lanes, at any speed."""
     rng = np.random.default_rng(21)
     found = []
     for k in range(110):
-        m = k % 2
-        start = sample_starts(scenarios[m], 1, rng)[0]
+        start = sample_starts(scenarios[k % 2], 1, rng)[0]
         start[3] = rng.uniform(-3.0, 12.0)
         choose = at_random(rng) if k < 80 else by_sight(rng)
-        found.append((m, run(scenarios[m], start, choose, target=TARGET, max_steps=MAX_STEPS)))
+        found.append((k % 2, run(scenarios[k % 2], start, choose, target=TARGET, max_steps=MAX_STEPS)))
     # They are worth comparing.
     states = np.concatenate([r.states for _, r in found])
     assert {"COLLISION", "IDLE", "SUCCESS", "TIME"} == {r.end for _, r in found}
@@ -199,11 +193,9 @@ def test_back_and_forth_earns_the_furthest_point(straight):
     """The classic cheat: ground is made good before anything counts again."""
     plan = [Action.ACCELERATE] * 15 + [Action.BRAKE] * 20 + [Action.REVERSE] * 7 + [Action.ACCELERATE] * 13
 
-    def choose(step, ranges, car):
-        return plan[step % len(plan)]
-
     patient = SimConfig(episode=EpisodeConfig(patience=100))
-    r = run(straight, [100, 32, 0, 0, 0], choose, max_steps=10 * len(plan), config=patient)
+    start, length = [100, 32, 0, 0, 0], len(plan)
+    r = run(straight, start, lambda step, *_: plan[step % length], max_steps=10 * length, config=patient)
     assert r.end == "TIME"
     furthest = np.maximum.accumulate(r.states[:, X].astype(float)) - 100
     assert (np.diff(r.states[:, X]) < -0.01).sum() > 30
