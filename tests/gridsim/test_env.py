@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 import pytest
 from commands import finish
-from driving import SENSING, drive
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TimeAwareObservation
 
 import gridsim
@@ -30,6 +30,15 @@ from gridsim.traffic.world import LANE
 
 IDS = list(ENVIRONMENTS)
 Maps = dict[str, list[Map]]
+SENSING = [("rays", 1), ("grid", 1), ("grid", 4), ("image", 1)]
+
+
+def drive(env: GridSimVectorEnv, steps: int, seed: int) -> np.ndarray:
+    """Random actions for all cars of a vector environment, that mostly speed up: [steps, n, ...]."""
+    rng = np.random.default_rng(seed)
+    if env.action_space.dtype == np.float32:
+        return rng.uniform([-0.2, -0.3], [1.0, 0.3], (steps, env.num_envs, 2)).astype(np.float32)
+    return rng.choice([Action.ACCELERATE, Action.NONE, Action.LEFT, Action.RIGHT], (steps, env.num_envs))
 
 
 # --- spaces
@@ -74,8 +83,7 @@ def test_gymnasiums_checker_passes_without_a_display(maps: Maps, name: str, sees
 def test_spaces_and_traffic_are_those_of_the_options(name: str, observation: str, frames: int) -> None:
     options: Any = {"observation": observation, "frames": frames, "actions": "continuous", "maps": 1}
     env: Any = gymnasium.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point", **options)
-    assert isinstance(env.unwrapped, GridSimVectorEnv)
-    assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     space: Any = env.single_observation_space
     if observation == "grid":
         assert set(space.spaces) == {"grid", "speed"}
@@ -256,7 +264,6 @@ def test_success_and_time_truncate_and_everything_else_terminates(maps: Maps) ->
     short = drive_to_the_end(Action.ACCELERATE, config=SimConfig(episode=EpisodeConfig(target=1.0)))
     _, reward, terminated, truncated, info = short[-1]
     assert (terminated, truncated, info["end"], info["is_success"]) == (False, True, End.SUCCESS, True)
-    assert reward > 0.0
     assert info["distance_m"] >= 1.0
     assert len(short) <= 10
 
@@ -296,7 +303,70 @@ def test_the_time_limit_of_make_is_the_environments_own(mode: str, steps: int) -
         assert (terminated, truncated, info["end"]) == (False, True, End.TIME)
 
 
+# --- the next episode
+
+
+def same(ours: Any, theirs: Any) -> None:
+    """Equal arrays, or dictionaries and sequences of such."""
+    if isinstance(ours, dict):
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            same(ours[name], theirs[name])
+    elif isinstance(ours, tuple) or (isinstance(ours, np.ndarray) and ours.dtype == object):
+        for a, b in zip(ours, theirs, strict=True):
+            same(a, b)
+    else:
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(("observation", "frames"), SENSING)
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_each_mode_is_that_of_gymnasiums_own_vector_environment(
+    maps: Maps, mode: AutoresetMode, observation: str, frames: int
+) -> None:
+    options: dict[str, Any] = {"observation": observation, "frames": frames}
+    options |= {"scenario": "city", "maps": maps["city"], "max_episode_steps": 25}
+    native = GridSimVectorEnv(4, autoreset_mode=mode.value, **options)
+    synced = gymnasium.vector.SyncVectorEnv([lambda: GridSimEnv(**options)] * 4, autoreset_mode=mode)
+    assert native.metadata["autoreset_mode"] is mode
+    seeds: list[int | None] = [40, 7, 40, 3]
+    ours: tuple[Any, ...] = native.reset(seed=seeds)
+    assert ours[0] in native.observation_space
+    same(ours, synced.reset(seed=seeds))
+    ended = 0
+    for row in drive(native, 70, seed=2):
+        ours = native.step(row)
+        same(ours, synced.step(row))
+        over = ours[2] | ours[3]
+        ended += over.sum()
+        if mode is AutoresetMode.DISABLED and over.any():
+            same(*(env.reset(seed=[None, 5, None, None], options={"reset_mask": over}) for env in (native, synced)))
+    assert ended > 4
+
+
 # --- wrong use
+
+
+def test_wrong_seeds_and_masks_are_refused_and_a_car_that_has_ended_must_be_reset(maps: Maps) -> None:
+    options: Any = {"scenario": "city", "maps": maps["city"], "max_episode_steps": 25}
+    env = GridSimVectorEnv(4, autoreset_mode=AutoresetMode.DISABLED, **options)
+    with pytest.raises(ResetNeeded, match="first reset of all"):
+        env.reset(options={"reset_mask": np.array([True, False, False, True])})
+    seeds: list[Any] = [[1, 2], [1, 2, 3, -4], [1, 2, 3, 0.5], "abcd"]
+    for seed in seeds:
+        with pytest.raises(ValueError, match="seed must be a whole number from 0, or 4 of them"):
+            env.reset(seed=seed)
+    env.reset(seed=1)
+    for mask in ([True] * 4, np.ones(4), np.ones(3, dtype=bool), np.zeros(4, dtype=bool), "all"):
+        with pytest.raises(ValueError, match="reset_mask must be an array of 4 bools"):
+            env.reset(options={"reset_mask": mask})
+    ended = np.zeros(4, dtype=bool)
+    while not ended.any():
+        ended = env.step(np.full(4, 4))[4]["end"] != 0
+    with pytest.raises(ResetNeeded, match="reset_mask"):
+        env.step(np.full(4, 4))
+    env.reset(options={"reset_mask": ended})
+    env.step(np.full(4, 4))
 
 
 @pytest.mark.parametrize(
@@ -389,4 +459,4 @@ def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> No
 
 def test_a_single_environment_has_no_autoreset_mode() -> None:
     with pytest.raises(ValueError, match=r"^autoreset_mode is for vector environments[^\n]*$"):
-        gymnasium.make(IDS[2], autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP)
+        gymnasium.make(IDS[2], autoreset_mode=AutoresetMode.SAME_STEP)
