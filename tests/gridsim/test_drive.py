@@ -114,22 +114,17 @@ def display(monkeypatch, no_display):
     if missing:
         pytest.skip(f"needs {' and '.join(missing)} (Debian: apt install xvfb xdotool)")
     read, write = os.pipe()
-    server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "800x600x24", "-nolisten", "tcp"],
-        pass_fds=[write],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(write)
-    try:
-        with os.fdopen(read) as file:
-            number = file.readline().strip()
-        assert number, "Xvfb did not start"
-        monkeypatch.setenv("DISPLAY", f":{number}")
-        yield
-    finally:
-        server.terminate()
-        server.wait(10)
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "800x600x24", "-nolisten", "tcp"]
+    with subprocess.Popen(command, pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+        os.close(write)
+        try:
+            with os.fdopen(read) as file:
+                number = file.readline().strip()
+            assert number, "Xvfb did not start"
+            monkeypatch.setenv("DISPLAY", f":{number}")
+            yield
+        finally:
+            server.terminate()
 
 
 def keys(*words):

@@ -129,15 +129,13 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
         return np.where(np.abs(v) <= 0.51 / PPM, -1.0, np.minimum(38 - np.abs(x - 40), 38 - np.abs(y - 40)))
 
     scenario = load_map(save(tmp_path / "thin.png", picture(halved, 80.0, 80.0)))
-    t = np.linspace(-25, 25, 2001)
-    on = np.column_stack([40 + offset + t * math.cos(angle), 40 + offset + t * math.sin(angle)])
+    along, left = np.array([math.cos(angle), math.sin(angle)]), np.array([-math.sin(angle), math.cos(angle)])
+    on = 40 + offset + np.linspace(-25, 25, 2001)[:, None] * along
     assert read(scenario.road, on).max() < 0.0
-    beside = on + 1.0 * np.array([-math.sin(angle), math.cos(angle)])
-    assert read(scenario.road, beside).min() > 0.0
+    assert read(scenario.road, on + left).min() > 0.0
     away, tilt = np.linspace(3.0, 16.0, 200), np.random.default_rng(1).uniform(-0.6, 0.6, 200)
     starts = np.zeros((200, 5), dtype=np.float32)
-    starts[:, 0] = 40 + offset + away * math.sin(angle)
-    starts[:, 1] = 40 + offset - away * math.cos(angle)
+    starts[:, :2] = 40 + offset - away[:, None] * left
     starts[:, 2] = angle + math.pi / 2 + tilt
     ranges, _ = Simulator([scenario], 200).reset(starts)
     error = (ranges[:, 15] + 1.25) * np.cos(tilt) - away + 0.4  # the wall is 0.8 m thick in the field
@@ -192,9 +190,8 @@ def test_thresholds_negate_and_the_unknown(tmp_path):
 def test_formats(tmp_path, suffix, mode):
     pixels = np.zeros((40, 60), dtype=np.uint8)
     pixels[8:24, 16:40] = 255
-    image = Image.fromarray(pixels.astype(np.uint16) * 257 if mode == "I;16" else pixels)
-    if mode != "I;16":
-        image = image.convert(mode)
+    deep = Image.fromarray(pixels.astype(np.uint16) * 257)
+    image = deep if mode == "I;16" else Image.fromarray(pixels).convert(mode)
     image.save(tmp_path / f"picture.{suffix}")
     np.testing.assert_array_equal(read_free(MapFile(tmp_path / f"picture.{suffix}")), pixels[::-1] > 128)
 
@@ -202,8 +199,8 @@ def test_formats(tmp_path, suffix, mode):
 def test_transparent_is_wall(tmp_path):
     pixels = np.full((4, 6, 4), 255, dtype=np.uint8)
     pixels[:2, :, 3] = 0
-    name = save(tmp_path / "a.png", pixels)
-    assert read_free(MapFile(Path(name))).sum(axis=1).tolist() == [6, 6, 0, 0]
+    save(tmp_path / "a.png", pixels)
+    assert read_free(MapFile(tmp_path / "a.png")).sum(axis=1).tolist() == [6, 6, 0, 0]
 
 
 def test_tiles_do_not_show():
@@ -254,11 +251,10 @@ def test_environments_and_champions_drive_on_it(track):
     assert evaluate(champion, episodes=8)["episodes"] == 8
 
 
-def test_traffic_that_a_map_cannot_have_changes_nothing(tmp_path, capsys):
-    name = save(tmp_path / "a.png", picture(strip(50, 20, 0.0, 5.0), 100.0, 40.0))
-    asked, plain = (_prepare(EvolveFlags, ["--scenario", name, "--traffic", n])[1].settings for n in ("3", "0"))
+def test_traffic_that_a_map_cannot_have_changes_nothing(track, capsys):
+    asked, plain = (_prepare(EvolveFlags, ["--scenario", track.name, "--traffic", n])[1].settings for n in ("3", "0"))
     assert asked == plain
-    assert capsys.readouterr().err == f"gridsim-evolve: {name} has no lanes for traffic; running without\n"
+    assert capsys.readouterr().err == f"gridsim-evolve: {track.name} has no lanes for traffic; running without\n"
 
 
 def test_runs_know_their_map_again(tmp_path, monkeypatch):

@@ -192,7 +192,6 @@ def test_a_round_longer_than_200_m_is_new_ground_again(plain):
 def test_back_and_forth_earns_the_furthest_point(straight):
     """The classic cheat: ground is made good before anything counts again."""
     plan = [Action.ACCELERATE] * 15 + [Action.BRAKE] * 20 + [Action.REVERSE] * 7 + [Action.ACCELERATE] * 13
-
     patient = SimConfig(episode=EpisodeConfig(patience=100))
     start, length = [100, 32, 0, 0, 0], len(plan)
     r = run(straight, start, lambda step, *_: plan[step % length], max_steps=10 * length, config=patient)
