@@ -1,20 +1,14 @@
-"""The Gymnasium environments' pictures, and Gymnasium's wrappers around them."""
+"""The Gymnasium environments' pictures, the maps that they share, and copies of them."""
 
 import copy
 import pickle
-from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import gymnasium
-import imageio_ffmpeg
 import numpy as np
 import pytest
-import torch
-from gymnasium.wrappers import RecordVideo
-from gymnasium.wrappers.vector import NumpyToTorch
 
-from gridsim.car.ego import End
 from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig
 from gridsim.envs import episodes, observing, simulator
@@ -45,6 +39,7 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
     picture: Any = array.render()
     assert picture.dtype == np.uint8
     assert picture.shape == (RENDER_SIZE[1], RENDER_SIZE[0], 3)
+    assert array.metadata["render_fps"] == 10  # films of Gymnasium's wrappers are in real time
     surface: Any = pygame.display.get_surface()
     shown = pygame.surfarray.array3d(surface).swapaxes(0, 1)
     np.testing.assert_array_equal(shown, picture)
@@ -67,30 +62,7 @@ def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
     np.testing.assert_array_equal(pictures, env.render())
 
 
-def test_record_video_keeps_a_picture_for_each_step_and_one_for_the_reset(tmp_path: Path) -> None:
-    """In a film of a length that MoviePy 2 does not cut: it does so with 8, 10 and 11 pictures at 10 a second."""
-    plain = gymnasium.make("GridSim/Highway-v0", maps=1, render_mode="rgb_array", max_episode_steps=6)
-    env = RecordVideo(plain, str(tmp_path / "films"), episode_trigger=lambda _: True)
-    env.reset(seed=0)
-    for _ in range(6):
-        env.step(int(Action.ACCELERATE))
-    env.close()
-    (film,) = tmp_path.glob("films/*.mp4")
-    reader = imageio_ffmpeg.read_frames(str(film))
-    assert (next(reader)["fps"], imageio_ffmpeg.count_frames_and_secs(str(film))[0]) == (10.0, 7)
-    reader.close()
-
-
-# --- other wrappers, and copies
-
-
-def test_numpy_to_torch_takes_all_that_is_told() -> None:
-    options: Any = {"maps": 1, "max_episode_steps": 3, "observation": "grid"}
-    env = NumpyToTorch(gymnasium.make_vec("GridSim/City-v0", num_envs=2, **options))
-    env.reset(seed=0)
-    for _ in range(3):
-        *_, info = env.step(torch.full((2,), 4))
-    assert info["end"].tolist() == [End.TIME] * 2
+# --- maps and copies
 
 
 def test_environments_share_maps(monkeypatch: pytest.MonkeyPatch) -> None:
