@@ -1,13 +1,15 @@
-"""The Gymnasium environments' pictures, the maps that they share, and copies of them."""
+"""The Gymnasium environments' pictures and films, the maps that they share, and copies of them."""
 
 import copy
 import pickle
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import RecordVideo
 
 from gridsim.car.vehicle import Action
 from gridsim.config import SensorConfig, SimConfig
@@ -39,7 +41,6 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
     picture: Any = array.render()
     assert picture.dtype == np.uint8
     assert picture.shape == (RENDER_SIZE[1], RENDER_SIZE[0], 3)
-    assert array.metadata["render_fps"] == 10  # films of Gymnasium's wrappers are in real time
     surface: Any = pygame.display.get_surface()
     shown = pygame.surfarray.array3d(surface).swapaxes(0, 1)
     np.testing.assert_array_equal(shown, picture)
@@ -60,6 +61,17 @@ def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
     assert len(pictures) == 3
     assert len({p.tobytes() for p in pictures}) == 3
     np.testing.assert_array_equal(pictures, env.render())
+
+
+def test_record_video_films_in_real_time(tmp_path: Path) -> None:
+    plain = gymnasium.make("GridSim/Highway-v0", maps=1, render_mode="rgb_array", max_episode_steps=6)
+    env = RecordVideo(plain, str(tmp_path / "films"))
+    assert env.frames_per_sec == 10
+    env.reset(seed=0)
+    for _ in range(6):
+        env.step(int(Action.ACCELERATE))
+    env.close()
+    assert len(list(tmp_path.glob("films/*.mp4"))) == 1
 
 
 # --- maps and copies
