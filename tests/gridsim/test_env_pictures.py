@@ -65,7 +65,7 @@ def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
 
 def test_record_video_films_in_real_time(tmp_path: Path) -> None:
     plain = gymnasium.make("GridSim/Highway-v0", maps=1, render_mode="rgb_array", max_episode_steps=6)
-    env = RecordVideo(plain, str(tmp_path / "films"))
+    env: Any = RecordVideo(plain, str(tmp_path / "films"))
     assert env.frames_per_sec == 10
     env.reset(seed=0)
     for _ in range(6):

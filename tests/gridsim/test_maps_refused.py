@@ -59,8 +59,6 @@ def test_pictures_that_are_no_maps(tmp_path):
     assert "all wall" in refused(save(tmp_path / "wall.png", np.zeros((99, 99), np.uint8)))
     assert "no room" in refused(save(tmp_path / "path.png", picture(strip(50, 20, 0.0, 1.0), 100.0, 40.0)))
     assert "no room" in refused(save(tmp_path / "yard.png", picture(strip(50, 20, 0.0, 5.0, 6.0), 100.0, 40.0)))
-    noise = np.random.default_rng(0).integers(0, 256, (800, 800), dtype=np.uint8)
-    assert "no room" in refused(save(tmp_path / "noise.png", noise))
 
 
 # A YAML, and what the line says.

@@ -201,12 +201,6 @@ def test_the_ego_car_in_the_lane_is_followed_and_waited_for(ring):
     assert (car[X] - world[0, ALONG]) % 1024 < LENGTH + oracle.equilibrium_gap(CONFIG, 4.0, 12.0) + 3.0
 
 
-def test_the_ego_car_beside_the_lane_is_passed(ring):
-    history = watch(ring, cars_on(ring, (0, 400.0, 12.0, 1.0)), 20, ego(500.0, 32.0 + 2.6))
-    assert history[-1, 0, ALONG] == pytest.approx(640.0, abs=1.0)
-    assert history[:, 0, SPEED].min() > 11.9
-
-
 @pytest.mark.parametrize("heading", np.arange(0, 8, 3) * math.pi / 4)
 @pytest.mark.parametrize("radius", [math.inf, 16.0, -16.0])
 def test_lanes_are_as_fast_as_their_bends_allow(heading, radius):
@@ -445,7 +439,8 @@ def test_nobody_drives_into_an_ego_car_that_stands_or_off_the_road(scenario, len
         start = sample_starts(here, 1, np.random.default_rng(seed))
         world = spawn(here.network, start, 24, np.array([seed], dtype=np.uint64), config)[0]
         sides = np.array([here.network.width, here.network.height])
-        stands = ego(*start[0, :2] % sides, start[0, 2])
+        x, y = start[0, :2] % sides
+        stands = ego(x, y, start[0, 2])
         history = watch(here.network, world, 120, stands, config)
         cars = history[history[..., LANE] >= 0]
         away = (stands[[X, Y]] - cars[:, [X, Y]] + sides / 2) % sides - sides / 2
