@@ -76,11 +76,10 @@ def test_large_values_can_be_saved_and_taken_up_again(loop):
     assert again.counts() == learning.counts()
 
 
-@pytest.mark.parametrize("gene", [np.nan, np.inf])
-def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop, gene):
+def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop):
     learning = loop()
     learning.step()
-    learning.learner.online.genome.data[3] = gene
+    learning.learner.online.genome.data[3] = np.nan
     with pytest.raises(FloatingPointError, match=r"^the Q network diverged at update \d+: try a lower learning rate$"):
         learning.step()
     assert len(learning.history) == 1
@@ -93,10 +92,9 @@ def test_a_step_ends_early_when_time_is_up(loop):
     assert learning.batches == 1
 
 
-@pytest.mark.parametrize("bound", [{"car_steps": 5000}, {"episodes": 200}])
-def test_no_batch_is_begun_beyond_a_bound(loop, bound):
-    learning = loop(evaluate_every=10**9, **bound)
-    name, most = next(iter(bound.items()))
+@pytest.mark.parametrize(("name", "most"), [("car_steps", 5000), ("episodes", 200)])
+def test_no_batch_is_begun_beyond_a_bound(loop, name, most):
+    learning = loop(evaluate_every=10**9, **{name: most})
     begun: list[int] = []
     collect = learning._collect
 

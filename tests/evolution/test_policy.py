@@ -25,21 +25,16 @@ from evolution.networks.policy import (
 
 F = np.float32
 WIDTHS = [1, 6, 7, 8, 9, 15, 16, 17, 31, 64, 65, 80]
-TEXTS = [
-    "mlp:6,7", "mlp:16,16", "mlp:9,1,20", "mlp:17,5,3,11", "mlp:64,80,65", "mlp:128,8",
-    *(f"mlp:{width}" for width in WIDTHS), *(f"mlp:{a},{b}" for a, b in itertools.pairwise(WIDTHS)),
-]  # fmt: skip
+TEXTS = ["mlp:17,5,3,11", "mlp:64,80,65", "mlp:128,8", *(f"mlp:{a},{b}" for a, b in itertools.pairwise(WIDTHS))]
 
 
 def kernel_outputs(spec, genome, inputs, junk=0.0):
     packed = pack(genome, spec.layers)
     scratch = np.full(scratch_size(spec.layers), junk, dtype=F)
     scratch[: spec.inputs] = inputs
+    again = scratch.copy()
     at = int(forward(packed, spec.layers, scratch))
-    outputs = scratch[at : at + spec.outputs].copy()
-    scratch[:] = junk
-    scratch[: spec.inputs] = inputs
-    return outputs, decide(packed, spec.layers, scratch)
+    return scratch[at : at + spec.outputs], decide(packed, spec.layers, again)
 
 
 def lambert(x):
@@ -82,10 +77,8 @@ def test_forward_is_numpys(text):
     assert worst < 0.02
 
 
-@pytest.mark.parametrize("text", ["mlp:6,7", "mlp:9,1,20"])
-def test_a_gene_that_is_not_a_number_is_no_action(text):
-    spec = PolicySpec.parse(text)
-    rng = np.random.default_rng(3)
+def test_a_gene_that_is_not_a_number_is_no_action():
+    spec, rng = PolicySpec.parse("mlp:9,1,20"), np.random.default_rng(3)
     genome, inputs = rng.normal(size=spec.size).astype(F), rng.uniform(0.1, 1, INPUTS).astype(F)
     for gene in range(spec.size):
         spoilt = genome.copy()
@@ -95,34 +88,26 @@ def test_a_gene_that_is_not_a_number_is_no_action(text):
 
 def test_the_first_of_equal_outputs_acts():
     spec = PolicySpec.parse("mlp:3")
-    genome = np.zeros(spec.size, dtype=F)
-    inputs = np.zeros(INPUTS, dtype=F)
-    assert kernel_outputs(spec, genome, inputs)[1] == 0
     for action in range(ACTIONS):
-        biased = genome.copy()
-        biased[-ACTIONS + action :] = 1.0
-        assert kernel_outputs(spec, biased, inputs)[1] == action
+        genome = np.zeros(spec.size, dtype=F)
+        genome[-ACTIONS + action :] = 1.0
+        assert kernel_outputs(spec, genome, np.zeros(INPUTS, dtype=F))[1] == action
 
 
-@given(x=st.floats(-50, 50, width=32))
-def test_squash_is_nearly_tanh(x):
-    assert float(squash(F(x))) == pytest.approx(math.tanh(x), abs=2e-4)
-    assert float(squash(F(-x))) == -float(squash(F(x)))
-
-
-def test_squash_never_falls_and_keeps_what_is_not_a_number():
-    y = np.array([squash(x) for x in np.linspace(-6, 6, 4001).astype(F)], dtype=float)
+def test_squash_is_nearly_tanh_never_falls_and_keeps_what_is_not_a_number():
+    x = np.arange(-6.0, 6.0, 1 / 256).astype(F)
+    y = np.array([squash(each) for each in x], dtype=float)
+    assert y == pytest.approx(np.tanh(x.astype(float)), abs=2e-4)
     assert np.diff(y).min() > -2e-7
+    assert (y[1:] == -y[:0:-1]).all()
     assert squash(F(math.inf)) == -squash(F(-math.inf)) == y[-1]
     assert math.isnan(squash(F(math.nan)))
 
 
 def test_what_the_network_sees():
-    inputs = np.zeros(INPUTS + 1, dtype=F)
-    ranges = np.linspace(0, 50, 31).astype(F)
-    encode(ranges, None, F(12.5), F(-0.1), inputs)
-    r = ranges.astype(float)
-    assert inputs[:31] == pytest.approx(2 * r / (r + 8) - 1, abs=1e-6)
+    inputs, ranges = np.zeros(INPUTS + 1, dtype=F), np.linspace(0, 50, 31)
+    encode(ranges.astype(F), None, F(12.5), F(-0.1), inputs)
+    assert inputs[:31] == pytest.approx(2 * ranges / (ranges + 8) - 1, abs=1e-6)
     assert inputs[31] == pytest.approx(0.25, abs=1e-6)
     assert inputs[32] == pytest.approx(-0.2, abs=1e-6)  # the wheels' angle, which only some networks see
     assert inputs.min() == -1.0
@@ -139,11 +124,10 @@ def test_text_and_back(hidden, motion, steering):
     assert spec.size == sum((n + 1) * m for n, m in itertools.pairwise(sizes))
 
 
-WRONG = "mlp mlp: mlp:0 mlp:6,0 mlp:-3 mlp:6, mlp:,6 mlp:6.5 MLP:6 mlp:99999,99999 mlp:1000000 cnn: cnn:16,32"
-WRONG += " cnn:8,8,8,8 cnn:8,12,16 cnn:0,8,8 cnn:8,8,8@0 cnn:8,8,8@9 cnn:8,8,8@ cnn:8,8,8@-1 cnn:16,64,1024 cnn@1 rnn:3"
+WRONG = "mlp mlp:0 mlp:6,0 mlp:6, mlp:6.5 MLP:6 mlp:99999,99999 cnn:16,32 cnn:8,12,16 cnn:0,8,8 cnn:8,8,8@0 cnn:8,8,8@9"
 
 
-@pytest.mark.parametrize("text", [*WRONG.split(), "", "mlp:6 7", "mlp:6,7\n", "cnn:8,8,8 @1", " mlp:6"])
+@pytest.mark.parametrize("text", [*WRONG.split(), "", "mlp:6,7\n", "cnn:16,64,1024", "cnn@1", " mlp:6"])
 def test_other_texts_are_refused_in_one_line(text):
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
         PolicySpec.parse(text)

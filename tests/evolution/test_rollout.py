@@ -9,12 +9,11 @@ from cluster.runs.champion import load_champion
 from cluster.workers.worker import Task, Worker
 from evolution.episodes.rollout import RESULT, Limits, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack
+from evolution.networks.policy import PolicySpec, outputs_of
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, End, X, Y
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
-from gridsim.jit import njit
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import ALONG, LANE, SHIFT
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
@@ -25,24 +24,9 @@ CARS = 8
 AMONG = Limits(1000.0, 1700)
 
 
-@njit
-def _decide(packed, layers, ranges, speeds, actions):
-    scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    for i in range(len(actions)):
-        encode(ranges[i], None, speeds[i], np.float32(0.0), scratch)
-        actions[i] = decide(packed, layers, scratch)
-
-
-class Wheel:
-    """A genome that drives the cars of a `Simulator`."""
-
-    def __init__(self, spec, genome):
-        self.layers, self.packed = spec.layers, pack(genome, spec.layers)
-
-    def __call__(self, ranges, speeds):
-        actions = np.zeros(len(ranges), dtype=np.int64)
-        _decide(self.packed, self.layers, ranges, speeds, actions)
-        return actions
+def actions_of(spec, genome, ranges, speeds):
+    """How a genome drives the cars of a `Simulator`."""
+    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds)).argmax(axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +57,6 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     shared, _, _ = Worker().evaluate(task, maps, recipes)
     assert all(row.tobytes() == results[0].tobytes() for row in shared)
 
-    wheel = Wheel(spec, genome)
     for cars in (np.arange(9), np.array([4])):
         simulator = Simulator(maps, len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
         ranges, speeds = simulator.reset(episodes["start"][cars], episodes["map"][cars], worlds=worlds[cars])
@@ -83,7 +66,7 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
                 at = min(step, int(row["steps"]))
                 assert simulator.state.cars[i].tobytes() == states[at].tobytes()
                 assert simulator.state.worlds[i].tobytes() == traffic[at].tobytes()
-            ranges, speeds, _, ends = simulator.step(wheel(ranges, speeds))
+            ranges, speeds, _, ends = simulator.step(actions_of(spec, genome, ranges, speeds))
         assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
 
 
@@ -103,14 +86,13 @@ def test_what_is_rewound_goes_on_as_it_did(among):
         if End(int(row["end"])) != End.COLLISION:
             continue
         compared += 1
-        wheel = Wheel(spec, genome)
         original, again = (
             Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2)
         )
         ranges, speeds = original.reset(episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
         again.reset(starts[0, k : k + 1], worlds=then[0, k : k + 1])
         for step in range(last):
-            action = wheel(ranges, speeds)
+            action = actions_of(spec, genome, ranges, speeds)
             ranges, speeds, *_ = original.step(action)
             if step >= first:
                 assert not again.state.ends[0]
