@@ -152,8 +152,9 @@ def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer, monkeypatch):
         np.testing.assert_allclose(seer.act({"grid": stack, "speed": shares}), speeds, rtol=1e-6)
     with pytest.raises(ValueError, match="needs the speed"):
         seer.act(stack)
-    with pytest.raises(ValueError, match="sees grids"):
-        seer.act(np.zeros(32, dtype=np.float32), 5.0)
+    for other in (np.zeros(32, dtype=np.float32), stack.astype(np.float32), stack[0, 0], stack[..., None]):
+        with pytest.raises(ValueError, match="^cnn:8,8,8@2 sees grids uint8"):
+            seer.act(other, 5.0)
 
 
 def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):

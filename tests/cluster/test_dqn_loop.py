@@ -9,8 +9,7 @@ from cluster.runs.settings import DqnSettings
 from cluster.training import dqn as dqn_loop
 from cluster.training.dqn import Dqn
 from cluster.training.trainer import Maps
-from cluster.workers.pool import Chunk, Collected, PoolError, SerialPool
-from cluster.workers.worker import Worker
+from cluster.workers.pool import Chunk, PoolError, SerialPool, finish
 from gridsim.config import SimConfig
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -114,19 +113,16 @@ class Losing(SerialPool):
 
     one_in = 3
 
-    def collect(self, task, on_progress=None, meanwhile=None):
-        collected, worker = Collected(task), Worker()
-        maps = [self._build_map(*name) for name in task.maps]
-        for k in range(len(task.episodes)):
+    def _work(self, call, on_progress, meanwhile):
+        maps = [self._build_map(*name) for name in call.task.maps]
+        for k in range(len(call.task.episodes)):
             chunk = Chunk(slice(k, k + 1), slice(0, 1))
             if k % self.one_in:
-                collected.add(0, chunk, *worker.answer(task, maps, collected.recipes, k, k + 1))
+                call.add(0, chunk, *self._worker.answer(call.task, maps, *call.work(chunk)))
             else:
-                collected.lose(chunk)
-                collected.warnings.append(f"episode {k} is lost")
-        while meanwhile and meanwhile():
-            pass
-        return collected
+                call.lose(chunk)
+                call.warnings.append(f"episode {k} is lost")
+        finish(meanwhile)
 
 
 def test_lost_episodes_are_in_no_replay_and_in_no_mean(loop, maps):

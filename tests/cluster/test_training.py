@@ -32,6 +32,7 @@ SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
 RANDOM = dataclasses.replace(SETTINGS, search="random")
 GENES = PolicySpec.parse(SETTINGS.policy).size
+EAGER = {"promising": 0.0, "latest": 0, "validation_share": 1.0}  # a candidate is validated in every generation
 
 
 @pytest.fixture(scope="module")
@@ -41,13 +42,13 @@ def maps():
     maps.close()
 
 
-def begin(maps, settings=SETTINGS):
-    """A run with a short validation."""
-    return with_a_short_validation(Evolution(settings, SerialPool(maps.build), maps))
+def begin(maps, settings=SETTINGS, **changes):
+    """A run with a short validation, and changes of its curriculum."""
+    return changed(Evolution(settings, SerialPool(maps.build), maps), **changes)
 
 
-def with_a_short_validation(evolution):
-    evolution.curriculum.config = dataclasses.replace(evolution.curriculum.config, validation=8)
+def changed(evolution, **changes):
+    evolution.curriculum.config = dataclasses.replace(evolution.curriculum.config, validation=8, **changes)
     return evolution
 
 
@@ -77,35 +78,23 @@ def stopped(halfway, tmp_path):
 @pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
 def test_a_run_among_traffic_goes_on_exactly(maps, tmp_path, settings):
     """From each generation of three, also with candidates validated, and as if it had never been concluded."""
-    straight = eager(begin(maps, settings))
+    straight = begin(maps, settings, **EAGER)
     for generation in range(3):
         save(tmp_path / f"{generation}.npz", *straight.state())
         go_on(straight)
     assert straight.champion is not None
     for generation in range(3):
-        resumed = eager(begin(maps, settings))
+        resumed = begin(maps, settings, **EAGER)
         resumed.restore(*load(tmp_path / f"{generation}.npz"))
         assert resumed.steps == generation
         while resumed.steps < 3:
             go_on(resumed)
-        assert state_of(resumed) == state_of(straight)
+        np.testing.assert_equal(resumed.state(), straight.state())
         assert resumed.validation_steps == straight.validation_steps > 0
         for step, elite in resumed.elites.items():
             assert elite.tobytes() == straight.elites[step].tobytes()
     ended, other = straight.choose_champion(), resumed.choose_champion()
     assert (ended.genome.tobytes(), ended.score) == (other.genome.tobytes(), other.score)
-
-
-def state_of(evolution):
-    arrays, numbers = evolution.state()
-    return {name: array.tobytes() for name, array in arrays.items()}, numbers
-
-
-def eager(evolution):
-    """Validates a candidate in every generation."""
-    curriculum = evolution.curriculum
-    curriculum.config = dataclasses.replace(curriculum.config, promising=0.0, latest=0, validation_share=1.0)
-    return evolution
 
 
 def test_a_search_is_what_was_asked_for(maps):
@@ -139,7 +128,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     evolution = begin(maps, dataclasses.replace(settings, population=50))
     for _ in range(after):
         go_on(evolution)
-    eager(evolution)
+    changed(evolution, **EAGER)
     candidate = evolution.candidate()
     told: list[np.ndarray] = []
     evolution.search.tell, evolution.pool = told.append, Watching(maps.build)
@@ -250,7 +239,7 @@ def test_a_checkpoint_without_a_part_is_refused_in_one_line(maps, stopped, name)
 def in_folder(run, maps):
     """A run in its folder, with a short validation."""
     made = Session(run, SerialPool(maps.build), maps, f"sqlite:///{run.path.parent}/m.db", "test")
-    with_a_short_validation(made.learning)
+    changed(made.learning)
     return made
 
 

@@ -2,8 +2,6 @@
 
 import math
 from collections import namedtuple
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,16 +27,15 @@ LIMITS = Limits(120.0, 150)
 
 # The arguments of `collect`, in its order.
 Asked = namedtuple("Asked", "spec weights scenarios episodes epsilons keys limits config worlds")
-Asking = Callable[[str, int, float, int], Asked]
 
 
 @pytest.fixture(scope="module")
-def ask(root: Path) -> Asking:
+def ask(root):
     """Makes arguments for `n` episodes; of a `mlp:6,7` the weights are a trained driver's."""
     driver = load_champion(root / "benchmarks" / "champion_traffic.npz").genome
     scenarios = [build("seamless", 3), build("highway", 4)]
 
-    def make(policy: str, n: int, epsilon: float, cars: int) -> Asked:
+    def make(policy, n, epsilon, cars):
         rng = np.random.default_rng(5)
         spec = PolicySpec.parse(policy)
         weights = driver if policy == "mlp:6,7" else (rng.normal(size=spec.size) * 0.3).astype(F)
@@ -49,13 +46,13 @@ def ask(root: Path) -> Asking:
     return make
 
 
-def only(of: Asked, which: list[int]) -> Asked:
+def only(of, which):
     """The same for some episodes."""
     rows = np.array(which, dtype=int)
     return of._replace(**{name: getattr(of, name)[rows] for name in ("episodes", "epsilons", "keys", "worlds")})
 
 
-def cut_up(experience: Experience) -> list[Experience]:
+def cut_up(experience):
     """Its episodes."""
     ends = np.flatnonzero(experience.actions == NO_ACTION) + 1
     assert ends[-1] == len(experience.actions)
@@ -64,7 +61,7 @@ def cut_up(experience: Experience) -> list[Experience]:
 
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", ["mlp:5+motion+steering", "cnn:8,8,16@3"])
-def test_every_row_is_what_the_simulator_shows_for_these_actions(ask: Asking, policy: str, cars: int) -> None:
+def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, cars):
     of = ask(policy, 8, 0.3, cars)
     experience, results = collect(*of)
     inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
@@ -91,7 +88,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask: Asking, po
 
 @pytest.mark.parametrize("cars", [0, CARS])
 @pytest.mark.parametrize("policy", ["mlp:6,7", "mlp:5+motion+steering", "cnn:8,8,16@3"])
-def test_without_exploring_it_is_evaluate(ask: Asking, policy: str, cars: int) -> None:
+def test_without_exploring_it_is_evaluate(ask, policy, cars):
     of = ask(policy, 12, 0.0, cars)
     _, results = collect(*of)
     wanted, _, _ = evaluate(of.spec, of.weights[None], of.scenarios, of.episodes, LIMITS, CONFIG, of.worlds)
@@ -99,7 +96,7 @@ def test_without_exploring_it_is_evaluate(ask: Asking, policy: str, cars: int) -
     assert results["steps"].sum() > 100
 
 
-def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask: Asking) -> None:
+def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask):
     of = ask("mlp:6,7", 60, 0.1, 0)
     of.epsilons[1::2] = 0.8
     of.episodes["steps"][::3] = 40
@@ -117,7 +114,7 @@ def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask: As
 
 
 @pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,16@3"])
-def test_a_network_without_numbers_leaves_whole_rows(ask: Asking, policy: str) -> None:
+def test_a_network_without_numbers_leaves_whole_rows(ask, policy):
     of = ask(policy, 6, 0.5, 0)
     experience, results = collect(*of._replace(weights=np.full_like(of.weights, math.nan)))
     assert experience.actions.tolist() == [NO_ACTION] * 6
@@ -125,7 +122,7 @@ def test_a_network_without_numbers_leaves_whole_rows(ask: Asking, policy: str) -
     assert (results["end"] == End.IDLE).all()
 
 
-def test_random_actions_are_uniform_and_as_many_as_asked_for(ask: Asking) -> None:
+def test_random_actions_are_uniform_and_as_many_as_asked_for(ask):
     of = ask("mlp:6,7", 600, 1.0, 0)
     counts = np.bincount(collect(*of)[0].actions, minlength=256)[:8]
     assert counts.sum() > 8000
@@ -137,7 +134,7 @@ def test_random_actions_are_uniform_and_as_many_as_asked_for(ask: Asking) -> Non
     assert np.mean(driven != 4) == pytest.approx(0.25 * 7 / 8, abs=5 * math.sqrt(0.22 * 0.78 / len(driven)))
 
 
-def test_an_episode_depends_on_itself_alone(ask: Asking) -> None:
+def test_an_episode_depends_on_itself_alone(ask):
     """In any order, alone or in company, and with epsilons of its own; another key, another episode."""
     of = ask("mlp:6,7", 12, 0.0, CARS)
     of.epsilons[:] = np.linspace(0.0, 1.0, 12)
@@ -154,7 +151,7 @@ def test_an_episode_depends_on_itself_alone(ask: Asking) -> None:
     assert [len(array) for array in (*collect(*only(of, []))[0], collect(*only(of, []))[1])] == [0] * 5
 
 
-def test_what_does_not_fit_is_refused(ask: Asking) -> None:
+def test_what_does_not_fit_is_refused(ask):
     of = ask("mlp:6,7", 4, 0.5, 0)
     for change, text in (
         ({"weights": of.weights[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),

@@ -46,10 +46,3 @@ def test_a_gene_that_is_not_a_number_is_no_action():
         spoilt[gene] = math.nan
         assert convnet.decide(spoilt, spec.layers, F(5), room) == -1, gene
     assert convnet.decide(genome, spec.layers, F(5), room) >= 0  # and nothing of it stays
-
-
-def test_other_observations_are_refused():
-    for frames, shape, kind in ((1, (4, 80, 80, 1), np.uint8), (4, (3, 80, 80), np.uint8), (1, (80, 80), F)):
-        spec = CnnSpec((8, 8, 8), frames)
-        with pytest.raises(ValueError, match=rf"^cnn:8,8,8@{frames} sees grids uint8"):
-            convnet.act_on(spec, np.zeros(spec.size, F), np.zeros(shape, kind), 1.0)

@@ -40,9 +40,3 @@ def test_the_example_sees_nothing_at_standstill_and_at_10_mps():
     assert (shown[:, :-1] == FREE).all()
     assert shown[:, -1].tolist() == [0.0, 10.0]
     assert shown.dtype == F
-
-
-@pytest.mark.parametrize("genome", [np.zeros(312, dtype=F), np.zeros(311), np.zeros((1, 311), dtype=F)])
-def test_another_genome_is_refused(genome):
-    with pytest.raises(ValueError, match=r"a genome of mlp:6,7 is float32 \[311\], not float"):
-        to_torch(PolicySpec.parse("mlp:6,7"), genome, SimConfig())

@@ -80,8 +80,6 @@ def test_out_of_order_raises(kind):
             search.tell(wrong)
     search.tell(np.zeros(40))  # what was refused has changed nothing
     assert search.generation == 1
-    with pytest.raises(RuntimeError, match="without ask"):
-        search.tell(np.zeros(40))
 
 
 @pytest.mark.parametrize("kind", SEARCHES)
