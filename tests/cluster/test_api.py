@@ -112,8 +112,6 @@ def test_fitness_of_the_wrong_shape_is_said_and_not_a_number_loses():
 
 
 def test_bad_champions_are_refused(champion, tmp_path):
-    with pytest.raises(CheckpointError):
-        load_champion(tmp_path / "none.npz")
     save(tmp_path / "short.npz", {"genome": champion.genome[:10]}, {"policy": "mlp:6,7", "scenario": "curved"})
     with pytest.raises(CheckpointError):
         load_champion(tmp_path / "short.npz")
@@ -153,7 +151,7 @@ def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer, monkeypatch):
     with pytest.raises(ValueError, match="needs the speed"):
         seer.act(stack)
     for other in (np.zeros(32, dtype=np.float32), stack.astype(np.float32), stack[0, 0], stack[..., None]):
-        with pytest.raises(ValueError, match="^cnn:8,8,8@2 sees grids uint8"):
+        with pytest.raises(ValueError, match=r"^cnn:8,8,8@2 sees grids uint8"):
             seer.act(other, 5.0)
 
 

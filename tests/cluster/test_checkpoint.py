@@ -144,19 +144,14 @@ def test_meta_that_is_not_ours(tmp_path, member, reason):
     assert reason in refused(signed({"meta.npy": member}, tmp_path / "a.npz")).replace("\\n", "")
 
 
-class Payload:
-    path = ""
-
-    def __reduce__(self):
-        return (os.mkdir, (self.path,))
-
-
 def test_a_pickle_is_refused_and_not_run(tmp_path):
-    payload = Payload()
-    payload.path = str(tmp_path / "was-run")
-    members = {"meta.npy": meta_member(), "x.npy": npy(np.array([payload], object))}
+    class Payload:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "was-run"),)
+
+    members = {"meta.npy": meta_member(), "x.npy": npy(np.array([Payload()], object))}
     refused(signed(members, tmp_path / "object-array.npz"))
-    members["x.npy"] = pickle.dumps(payload)
+    members["x.npy"] = pickle.dumps(Payload())
     refused(signed(members, tmp_path / "bare-pickle.npz"))
     assert not (tmp_path / "was-run").exists()
 

@@ -15,7 +15,7 @@ from cluster.runs.settings import EvolveSettings
 from cluster.runs.train import Session
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Champion, Maps
-from cluster.workers.pool import PoolError, SerialPool
+from cluster.workers.pool import Outcome, PoolError, SerialPool
 from evolution.episodes.curriculum import FINAL_SEEDS, HELD_OUT_SEEDS
 from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
@@ -114,13 +114,6 @@ def test_a_run_may_begin_with_a_champion(maps):
         assert evolution.elites[0].tobytes() == genome.tobytes()
 
 
-class Watching(SerialPool):
-    def evaluate(self, task, recipes, on_progress=None, asked=None, meanwhile=None):
-        outcome = super().evaluate(task, recipes, on_progress, asked, meanwhile)
-        self.seen = recipes, outcome
-        return outcome
-
-
 @pytest.mark.parametrize("settings", [SETTINGS, TWO, RANDOM], ids=["all", "two", "random"])
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(maps, settings, after):
@@ -131,13 +124,13 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     changed(evolution, **EAGER)
     candidate = evolution.candidate()
     told: list[np.ndarray] = []
-    evolution.search.tell, evolution.pool = told.append, Watching(maps.build)
+    driven: list[Outcome] = []
+    evolution.search.tell, evolution._report = told.append, lambda stage, outcome: driven.append(outcome)
     curriculum, config, leader = evolution.curriculum, evolution.curriculum.config, evolution.search.leader()
     limits, long = curriculum.limits(), curriculum.leader_limits()
     episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
     row = evolution.step()
-    recipes, outcome = evolution.pool.seen
-    groups = evolution.search.asked.groups
+    outcome, groups = driven[0], evolution.search.asked.groups
     e = len(episodes.rows) // len(groups)
     assert len(groups) == config.groups == 3
     assert e == config.starts + (after == 2) * config.crash_starts  # nobody led the first
@@ -153,7 +146,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     assert told[0].tobytes() == score.tobytes()
     assert not outcome.results[groups[0], e : len(episodes.rows)]["steps"].any()  # nor anybody else's
     if leader is None:
-        assert len(recipes) == 50
+        assert len(outcome.recipes) == 50
         assert evolution.elites[after].tobytes() == genomes[score.argmax()].tobytes()
         assert row["fitness/best"] == score.max()
     else:
@@ -168,13 +161,13 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert row["distance_m/best"] == led["distance"].mean()
         assert row["fitness/best"] == evolution._score(alone.results, long.target)[0]
         assert row["fitness/mean"] == score.mean()
-        assert len(recipes) == 52
+        assert len(outcome.recipes) == 52
         validation = evolution.drive("alone", candidate[None], curriculum.validation())
         assert validation.results[0].tobytes() == outcome.results[51, -config.validation :].tobytes()
         assert evolution.champion.success_rate == (validation.results["end"] == End.SUCCESS).mean()
 
 
-def test_a_candidate_is_validated_when_the_leader_does_well(maps):
+def test_a_candidate_is_validated_when_the_leader_does_well(maps, monkeypatch):
     evolution = begin(maps)
     go_on(evolution)
     config = evolution.curriculum.config
@@ -188,10 +181,9 @@ def test_a_candidate_is_validated_when_the_leader_does_well(maps):
         ("tried", evolution.candidate()),
     ):
         assert evolution._promising()
-        before = getattr(evolution, name)
-        setattr(evolution, name, value)
-        assert not evolution._promising()
-        setattr(evolution, name, before)
+        with monkeypatch.context() as patch:
+            patch.setattr(evolution, name, value)
+            assert not evolution._promising()
 
 
 def test_a_run_that_ends_chooses_between_champion_and_last_candidate_on_other_maps(maps):
@@ -319,14 +311,12 @@ def test_lost_members_cannot_win_whatever_the_fitness(maps, settings, last):
     """They are no elites, no parents (where tournaments of lost ones alone are rare) and no candidates."""
     evolution = losing(maps, settings, evolve=slice(3, last))
     go_on(evolution)
-    kept = [evolution.candidate(), *evolution.elites.values()]
-    kept += list(getattr(evolution.search, "parents", []))
+    kept = [evolution.candidate(), *evolution.elites.values(), *getattr(evolution.search, "parents", [])]
     assert len(evolution.pool.genomes) == last - 3 == evolution.lost_chunks
     assert not {genome.tobytes() for genome in evolution.pool.genomes} & {genome.tobytes() for genome in kept}
     assert np.isfinite(list(evolution.history[0].values())).all()
-    arrays, meta = evolution.state()
     resumed = begin(maps, settings)
-    resumed.restore(arrays, meta)
+    resumed.restore(*evolution.state())
     assert resumed.lost_chunks == last - 3
 
 

@@ -108,9 +108,6 @@ def test_other_texts_are_refused_in_one_line(text):
         PolicySpec.parse(text)
 
 
-# --- Networks on the grid --------------------------------------------------------------------------------------------
-
-
 def test_cnn_alone_is_the_papers_network():
     spec = PolicySpec.parse("cnn")
     assert spec == CnnSpec() == PolicySpec.parse("cnn:16,32,256") == PolicySpec.parse("cnn:16,32,256@4")

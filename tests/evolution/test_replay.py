@@ -39,11 +39,8 @@ def numbers(observations, spec=RAYS):
     return np.rint(observations[:, 0 if spec is RAYS else -1] * 4096).astype(int)
 
 
-EPISODES = st.lists(
-    st.tuples(st.lists(st.integers(-9, 9), min_size=1, max_size=12), st.sampled_from([*TERMINAL, End.TIME])),
-    min_size=1,
-    max_size=4,
-)
+REWARDS = st.lists(st.integers(-9, 9), min_size=1, max_size=12)
+EPISODES = st.lists(st.tuples(REWARDS, st.sampled_from([*TERMINAL, End.TIME])), min_size=1, max_size=4)
 
 
 def expected(parts, capacity, frames):
