@@ -9,8 +9,7 @@ from cluster.runs.settings import DqnSettings
 from cluster.training import dqn as dqn_loop
 from cluster.training.dqn import Dqn
 from cluster.training.trainer import Maps
-from cluster.workers.pool import Chunk, Collected, PoolError, SerialPool
-from cluster.workers.worker import Worker
+from cluster.workers.pool import Chunk, PoolError, SerialPool, finish
 from gridsim.config import SimConfig
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -76,11 +75,10 @@ def test_large_values_can_be_saved_and_taken_up_again(loop):
     assert again.counts() == learning.counts()
 
 
-@pytest.mark.parametrize("gene", [np.nan, np.inf])
-def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop, gene):
+def test_a_network_that_diverged_ends_the_run_before_it_is_saved(loop):
     learning = loop()
     learning.step()
-    learning.learner.online.genome.data[3] = gene
+    learning.learner.online.genome.data[3] = np.nan
     with pytest.raises(FloatingPointError, match=r"^the Q network diverged at update \d+: try a lower learning rate$"):
         learning.step()
     assert len(learning.history) == 1
@@ -93,10 +91,9 @@ def test_a_step_ends_early_when_time_is_up(loop):
     assert learning.batches == 1
 
 
-@pytest.mark.parametrize("bound", [{"car_steps": 5000}, {"episodes": 200}])
-def test_no_batch_is_begun_beyond_a_bound(loop, bound):
-    learning = loop(evaluate_every=10**9, **bound)
-    name, most = next(iter(bound.items()))
+@pytest.mark.parametrize(("name", "most"), [("car_steps", 5000), ("episodes", 200)])
+def test_no_batch_is_begun_beyond_a_bound(loop, name, most):
+    learning = loop(evaluate_every=10**9, **{name: most})
     begun: list[int] = []
     collect = learning._collect
 
@@ -116,19 +113,16 @@ class Losing(SerialPool):
 
     one_in = 3
 
-    def collect(self, task, on_progress=None, meanwhile=None):
-        collected, worker = Collected(task), Worker()
-        maps = [self._build_map(*name) for name in task.maps]
-        for k in range(len(task.episodes)):
+    def _work(self, call, on_progress, meanwhile):
+        maps = [self._build_map(*name) for name in call.task.maps]
+        for k in range(len(call.task.episodes)):
             chunk = Chunk(slice(k, k + 1), slice(0, 1))
             if k % self.one_in:
-                collected.add(0, chunk, *worker.answer(task, maps, collected.recipes, k, k + 1))
+                call.add(0, chunk, *self._worker.answer(call.task, maps, *call.work(chunk)))
             else:
-                collected.lose(chunk)
-                collected.warnings.append(f"episode {k} is lost")
-        while meanwhile and meanwhile():
-            pass
-        return collected
+                call.lose(chunk)
+                call.warnings.append(f"episode {k} is lost")
+        finish(meanwhile)
 
 
 def test_lost_episodes_are_in_no_replay_and_in_no_mean(loop, maps):

@@ -45,9 +45,7 @@ def test_runs_are_compared_from_python(tmp_path):
         *(("config.json", text, "not a config.json of this GridSim") for text in ('{"settings": []}', '{"format": 3}')),
         ("champion.npz", "PK", "truncated|not a GridSim file"),
         ("summary.json", {"champion_sha256": "0" * 64}, "do not belong together"),
-        ("summary.json", {"seed": 4}, "do not belong together"),
         ("summary.json", {"held_out": {**HELD_OUT, "distance_m": None}}, "damaged"),
-        ("summary.json", {"held_out": None}, "damaged"),
         ("summary.json", {"held_out": {}}, "make it again with --resume"),
     ],
 )
@@ -57,6 +55,5 @@ def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):
         path.unlink()
     else:
         path.write_text(json.dumps(summary | content) if isinstance(content, dict) else content)
-    with pytest.raises(GridSimError, match=said) as refused:
+    with pytest.raises(GridSimError, match=rf"^[^\n]*({said})[^\n]*$"):
         read_run(tmp_path / "a")
-    assert len(str(refused.value).splitlines()) == 1

@@ -12,7 +12,8 @@ from gridsim.maps.scenarios import build
 CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
 
 
-def new():
+@pytest.fixture
+def curriculum():
     return Curriculum(CONFIG, 7, lambda seed: build("seamless", seed), EpisodeConfig(), traffic=2)
 
 
@@ -26,8 +27,7 @@ def led(curriculum, generation, ends, distance=0.0, steps=50):
     return episodes, rewound
 
 
-def test_a_leader_s_episodes_are_longer_and_rewound():
-    curriculum = new()
+def test_a_leader_s_episodes_are_longer_and_rewound(curriculum):
     episodes = curriculum.leader_episodes(0)
     assert len(episodes.rows) == 8
     assert (episodes.rows["rewind"] == CONFIG.rewind).all()
@@ -37,10 +37,9 @@ def test_a_leader_s_episodes_are_longer_and_rewound():
     assert (curriculum.episodes(0).rows["rewind"] == 0).all()
 
 
-def test_only_who_crashed_or_stood_still_on_the_way_is_remembered():
-    curriculum = new()
-    ends = np.array([End.COLLISION, End.SUCCESS, End.TIME, End.IDLE, End.COLLISION, End.IDLE, End.SUCCESS, End.TIME])
-    steps = np.array([50, 50, 50, 50, 10, 11, 50, 50])  # the fifth crashed at its start
+def test_only_who_crashed_or_stood_still_on_the_way_is_remembered(curriculum):
+    ends = [End.COLLISION, End.SUCCESS, End.TIME, End.IDLE, End.COLLISION, End.IDLE, End.SUCCESS, End.TIME]
+    steps = [50, 50, 50, 50, 10, 11, 50, 50]  # the fifth crashed at its start
     episodes, rewound = led(curriculum, 0, ends, steps=steps)
     kept = [0, 3, 5]
     assert curriculum.crashes["start"].tobytes() == rewound[kept].tobytes()
@@ -55,8 +54,7 @@ def test_only_who_crashed_or_stood_still_on_the_way_is_remembered():
     assert curriculum.crashes["start"][0, 0] == 3.0
 
 
-def test_the_task_doubles_as_the_leader_succeeds():
-    curriculum = new()
+def test_the_task_doubles_as_the_leader_succeeds(curriculum):
     distance = np.array([150.0] * 4 + [149.0] * 4)
     led(curriculum, 0, End.TIME, distance)
     assert curriculum.target == 150.0  # 4 of 8 are less than 0.6
@@ -68,10 +66,8 @@ def test_the_task_doubles_as_the_leader_succeeds():
         assert curriculum.target == CONFIG.last_target
 
 
-def test_each_group_has_as_many_new_starts_and_crashes():
-    curriculum = new()
-    fresh = curriculum.episodes(0)
-    assert len(fresh.rows) == 3 * 2
+def test_each_group_has_as_many_new_starts_and_crashes(curriculum):
+    assert len(curriculum.episodes(0).rows) == 3 * 2
     led(curriculum, 0, End.COLLISION)
     remembered = {crash["start"].tobytes() for crash in curriculum.crashes}
     episodes = curriculum.episodes(1)
@@ -85,14 +81,12 @@ def test_each_group_has_as_many_new_starts_and_crashes():
         k = next(k for k, crash in enumerate(curriculum.crashes) if crash["start"].tobytes() == row["start"].tobytes())
         assert episodes.maps[row["map"]] == curriculum.map_seeds[curriculum.crashes["map"][k]]
         assert world.tobytes() == curriculum.crash_worlds[k].tobytes()
-    again = curriculum.episodes(1)
-    assert again.rows.tobytes() == episodes.rows.tobytes()
+    assert curriculum.episodes(1).rows.tobytes() == episodes.rows.tobytes()
     assert curriculum.episodes(2).rows.tobytes() != episodes.rows.tobytes()
 
 
-def test_crashes_that_all_members_avoid_are_seldom_driven_again():
-    curriculum = new()
-    led(curriculum, 0, np.full(8, End.COLLISION))
+def test_crashes_that_all_members_avoid_are_seldom_driven_again(curriculum):
+    led(curriculum, 0, End.COLLISION)
     easy = curriculum.crashes["start"][4:, 0]
 
     def crash_starts(generation):
@@ -111,13 +105,12 @@ def test_crashes_that_all_members_avoid_are_seldom_driven_again():
     drawn = np.concatenate([crash_starts(generation) for generation in range(40, 90)])
     # Of 6 starts without repetition, 4 are hard ones nearly always.
     assert 0.58 < 1.0 - np.isin(drawn, easy).mean() < 0.67
-    led(curriculum, 1, np.full(8, End.COLLISION))
+    led(curriculum, 1, End.COLLISION)
     assert len(curriculum.failures) == len(curriculum.crashes) == CONFIG.crash_memory
     assert curriculum.failures[-8:] == pytest.approx(0.5)
 
 
-def test_maps_come_in_one_by_one():
-    curriculum = new()
+def test_maps_come_in_one_by_one(curriculum):
     assert [curriculum.maps_in_use(generation) for generation in (0, 1, 2, 8)] == [2, 3, 3, 3]
     assert set(curriculum.episodes(0).maps) <= set(curriculum.map_seeds[:2])
     assert len(set(curriculum.map_seeds)) == 3

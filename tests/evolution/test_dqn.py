@@ -17,22 +17,15 @@ F = np.float32
 SPEC = PolicySpec.parse("mlp:5")
 
 
-def learner_of(genome=None, **config):
-    learner = DqnLearner(SPEC, DqnConfig(**config), seed=1)
-    if genome is not None:
-        learner.load_weights(genome)
-    return learner
+def learner_of(**config):
+    return DqnLearner(SPEC, DqnConfig(**config), seed=1)
 
 
-def random_batch(n, seed=0):
+def random_batch(seed):
     rng = np.random.default_rng(seed)
-    return Batch(
-        rng.uniform(-1, 1, (n, SPEC.inputs)).astype(F),
-        rng.integers(0, 8, n),
-        rng.normal(size=n).astype(F),
-        rng.uniform(-1, 1, (n, SPEC.inputs)).astype(F),
-        rng.uniform(0, 1, n).astype(F),
-    )
+    observations, following = rng.uniform(-1, 1, (2, 32, SPEC.inputs)).astype(F)
+    rewards, discounts = rng.normal(size=32).astype(F), rng.uniform(0, 1, 32).astype(F)
+    return Batch(observations, rng.integers(0, 8, 32), rewards, following, discounts)
 
 
 def replay_of_random_episodes():
@@ -64,7 +57,8 @@ def biased(values):
 
 def test_targets_by_hand():
     """Of action 2 with reward 3: the network prefers action 3, which the target values at 20; its own best is 40."""
-    learner = learner_of(biased([1, 0, 0.5, 7, 0, 0, 0, 0]), huber_delta=2)
+    learner = learner_of(huber_delta=2)
+    learner.load_weights(biased([1, 0, 0.5, 7, 0, 0, 0, 0]))
     learner.target.genome.copy_(torch.from_numpy(biased([10, 0, 0, 20, 0, 40, 0, 0])))
     zeros = np.zeros((3, SPEC.inputs), dtype=F)
     batch = Batch(zeros, np.full(3, 2), np.full(3, 3, dtype=F), zeros, np.array([0, 0.5, 0.25], dtype=F))
@@ -81,7 +75,7 @@ def test_updates_are_those_of_pytorchs_adam_on_clipped_gradients():
     adam = torch.optim.Adam([network.genome], lr=0.01, eps=learner.config.adam_epsilon)
     target = learner.weights
     for k in range(5):
-        batch = random_batch(32, seed=k)
+        batch = random_batch(k)
         if k % 2:  # errors of a hundredth
             values = learner.q_values(batch.observations)[np.arange(32), batch.actions]
             batch = batch._replace(rewards=values + F(0.01) * batch.rewards, discounts=np.zeros(32, dtype=F))
@@ -124,7 +118,6 @@ def test_a_chain_of_two_states_is_learned():
     q = learner.q_values(np.eye(32, dtype=F)[:2])
     wanted = np.full((2, 8), discount**2)
     wanted[0, 1], wanted[1, 0] = discount, 1
-    assert q.argmax(axis=1).tolist() == [1, 0]
     assert q == pytest.approx(wanted, abs=0.03)
 
 
@@ -149,15 +142,3 @@ def test_seeds_differ_and_repeat():
     assert not np.array_equal(one, other)
     first = one[: 33 * 5]
     assert 0.9 / math.sqrt(32) < np.abs(first).max() <= 1 / math.sqrt(32)
-    state = torch.random.get_rng_state()
-    learner_of().train(replay_of_random_episodes(), 2)
-    assert torch.equal(state, torch.random.get_rng_state())
-
-
-def test_a_network_that_diverged_is_reported_and_left_as_it_was():
-    learner, batch = learner_of(), random_batch(8)
-    batch.rewards[3] = np.inf
-    before = learner.weights
-    with pytest.raises(FloatingPointError, match="diverged at update 0"):
-        learner.update(batch)
-    assert np.array_equal(learner.weights, before)

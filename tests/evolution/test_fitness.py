@@ -18,14 +18,14 @@ def results(distance, paced):
     return made
 
 
+def worth(*drives):
+    """The fitness of members with one episode each, given as (metres, paced metres)."""
+    distance, paced = np.array(drives, dtype=float).T[:, :, None]
+    return scalar(results(distance, paced), TARGET).tolist()
+
+
 metres = st.floats(0.0, 1000.0, width=32)
 episodes = st.lists(st.tuples(metres, st.floats(0.0, 1.0)), min_size=1, max_size=6)  # distance, share that was paced
-
-
-def test_nothing_is_0_and_the_target_is_1():
-    assert scalar(results([[0.0]], [[0.0]]), TARGET).tolist() == [0.0]
-    for beyond in (TARGET, 3 * TARGET):
-        assert scalar(results([[beyond]], [[beyond]]), TARGET) == pytest.approx([1.0])
 
 
 @given(drives=episodes, which=st.integers(0, 5), more=st.floats(0.5, 100.0))
@@ -43,20 +43,14 @@ def test_further_and_better_paced_is_never_worse(drives, which, more):
             assert scalar(paced, TARGET)[0] > scalar(row, TARGET)[0]
 
 
-def test_the_first_bend_is_worth_as_much_as_a_long_way_later():
-    value = scalar(results([[0.0], [20.0], [400.0], [420.0]], [[0.0], [20.0], [400.0], [420.0]]), TARGET)
-    assert value[1] - value[0] > 5 * (value[3] - value[2])
-
-
-def test_a_metre_at_a_speed_within_the_interval_counts_for_more():
-    """0.7 of the score is for paced metres, 0.3 for all: 400 m without pace are as good as 120 m with it."""
-    value = scalar(results([[400.0], [120.0]], [[0.0], [120.0]]), TARGET)
-    assert value[0] == pytest.approx(value[1])
-
-
-def test_a_fifth_of_the_distance_may_be_outside_the_interval():
-    value = scalar(results([[400.0], [400.0], [400.0]], [[400.0], [320.0], [310.0]]), TARGET)
-    assert value[0] == value[1] > value[2]
+def test_what_metres_are_worth():
+    assert worth((0, 0), (TARGET, TARGET), (3 * TARGET, 3 * TARGET)) == pytest.approx([0.0, 1.0, 1.0], abs=0.0)
+    nothing, first_bend, far, further = worth((0, 0), (20, 20), (400, 400), (420, 420))
+    assert first_bend - nothing > 5 * (further - far)
+    unpaced, paced = worth((400, 0), (120, 120))  # 0.7 of the score is for paced metres, 0.3 for all
+    assert unpaced == pytest.approx(paced)
+    whole, enough, less = worth((400, 400), (400, 320), (400, 310))  # a fifth may be outside the interval
+    assert whole == enough > less
 
 
 def test_each_episode_may_have_its_own_target():

@@ -24,7 +24,7 @@ def episode(rewards, end, first=0, spec=RAYS):
     observations = empty(spec, steps + 1).observations
     observations[:] = 0
     if spec is RAYS:
-        observations[:, 0], observations[:, 1] = number % 4096, number // 4096
+        observations[:, 0] = number
     else:
         observations[:, 0], observations[:, 1] = number % 3, number // 3 % 3  # in the first cells of each frame
         observations[:, -2:] = number.astype("<i2").view(np.uint8).reshape(-1, 2)
@@ -36,16 +36,11 @@ def episode(rewards, end, first=0, spec=RAYS):
 
 def numbers(observations, spec=RAYS):
     """What `episode` numbered the rows."""
-    if spec is RAYS:
-        return np.rint(observations[:, 0] * 4096 + observations[:, 1] * 4096 * 4096).astype(int)
-    return np.rint(observations[:, -1] * 4096).astype(int)
+    return np.rint(observations[:, 0 if spec is RAYS else -1] * 4096).astype(int)
 
 
-EPISODES = st.lists(
-    st.tuples(st.lists(st.integers(-9, 9), min_size=1, max_size=12), st.sampled_from([*TERMINAL, End.TIME])),
-    min_size=1,
-    max_size=4,
-)
+REWARDS = st.lists(st.integers(-9, 9), min_size=1, max_size=12)
+EPISODES = st.lists(st.tuples(REWARDS, st.sampled_from([*TERMINAL, End.TIME])), min_size=1, max_size=4)
 
 
 def expected(parts, capacity, frames):

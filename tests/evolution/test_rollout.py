@@ -9,12 +9,11 @@ from cluster.runs.champion import load_champion
 from cluster.workers.worker import Task, Worker
 from evolution.episodes.rollout import RESULT, Limits, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
-from evolution.networks.policy import BLOCK, PolicySpec, decide, encode, pack
+from evolution.networks.policy import PolicySpec, outputs_of
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.car.ego import COS, SIN, SPEED, STEERING, End, X, Y
 from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
-from gridsim.jit import njit
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import ALONG, LANE, SHIFT
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
@@ -25,24 +24,9 @@ CARS = 8
 AMONG = Limits(1000.0, 1700)
 
 
-@njit
-def _decide(packed, layers, ranges, speeds, actions):
-    scratch = np.zeros(2 * (layers.max() + BLOCK), dtype=np.float32)
-    for i in range(len(actions)):
-        encode(ranges[i], None, speeds[i], np.float32(0.0), scratch)
-        actions[i] = decide(packed, layers, scratch)
-
-
-class Wheel:
-    """A genome that drives the cars of a `Simulator`."""
-
-    def __init__(self, spec, genome):
-        self.layers, self.packed = spec.layers, pack(genome, spec.layers)
-
-    def __call__(self, ranges, speeds):
-        actions = np.zeros(len(ranges), dtype=np.int64)
-        _decide(self.packed, self.layers, ranges, speeds, actions)
-        return actions
+def actions_of(spec, genome, ranges, speeds):
+    """How a genome drives the cars of a `Simulator`."""
+    return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds)).argmax(axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +57,6 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     shared, _, _ = Worker().evaluate(task, maps, recipes)
     assert all(row.tobytes() == results[0].tobytes() for row in shared)
 
-    wheel = Wheel(spec, genome)
     for cars in (np.arange(9), np.array([4])):
         simulator = Simulator(maps, len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
         ranges, speeds = simulator.reset(episodes["start"][cars], episodes["map"][cars], worlds=worlds[cars])
@@ -83,34 +66,42 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
                 at = min(step, int(row["steps"]))
                 assert simulator.state.cars[i].tobytes() == states[at].tobytes()
                 assert simulator.state.worlds[i].tobytes() == traffic[at].tobytes()
-            ranges, speeds, _, ends = simulator.step(wheel(ranges, speeds))
+            ranges, speeds, _, ends = simulator.step(actions_of(spec, genome, ranges, speeds))
         assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
 
 
 def test_what_is_rewound_goes_on_as_it_did(among):
-    """64 steps before the end the ego car and its world are those of then, and with the same actions end the same."""
+    """The car and its world are those of so many steps before the end, or of the start; no result depends on it.
+
+    With the same actions they end the same.
+    """
     spec, genome, maps, episodes, worlds, paths = among
+    both = np.stack([genome, np.zeros_like(genome)])
+    plain, starts, then = evaluate(spec, both, maps, episodes, AMONG, CONFIG, worlds)
+    assert (starts.shape, then.shape) == ((2, 0, 5), (2, 0, *worlds.shape[1:]))
+    crashed = [int(row["end"]) == End.COLLISION for row, _, _ in paths]
     wanted = episodes.copy()
-    wanted["rewind"] = 64
-    _, starts, then = evaluate(spec, genome[None], maps, wanted, AMONG, CONFIG, worlds)
-    compared = 0
-    for k, (row, states, traffic) in enumerate(paths):
-        first, last = max(int(row["steps"]) - 64, 0), int(row["steps"])
-        assert then[0, k].tobytes() == traffic[first].tobytes()
+    wanted["rewind"] = np.where(crashed, 64, [0, 1, 5000, 1, 5000, 0, 5000, 0, 1])
+    results, starts, then = evaluate(spec, both, maps, wanted, AMONG, CONFIG, worlds)
+    assert results.tobytes() == plain.tobytes()
+    kept = np.flatnonzero(wanted["rewind"])
+    assert (starts.shape, then.shape) == ((2, len(kept), 5), (2, len(kept), *worlds.shape[1:]))
+    for start, world, k in zip(starts[0], then[0], kept, strict=True):
+        row, states, traffic = paths[k]
+        last = int(row["steps"])
+        first = max(last - int(wanted["rewind"][k]), 0)
         car = states[first]
-        pose = [*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]]
-        assert starts[0, k] == pytest.approx(pose)
-        if End(int(row["end"])) != End.COLLISION:
+        assert world.tobytes() == traffic[first].tobytes()
+        assert start == pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]])
+        if not crashed[k]:
             continue
-        compared += 1
-        wheel = Wheel(spec, genome)
         original, again = (
             Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2)
         )
         ranges, speeds = original.reset(episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
-        again.reset(starts[0, k : k + 1], worlds=then[0, k : k + 1])
+        again.reset(start[None], worlds=world[None])
         for step in range(last):
-            action = wheel(ranges, speeds)
+            action = actions_of(spec, genome, ranges, speeds)
             ranges, speeds, *_ = original.step(action)
             if step >= first:
                 assert not again.state.ends[0]
@@ -119,26 +110,6 @@ def test_what_is_rewound_goes_on_as_it_did(among):
                 assert (again.state.worlds[0, :, LANE] == traffic[step + 1][:, LANE]).all()
                 assert again.state.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
         assert again.state.ends[0] == End.COLLISION
-    assert compared
-
-
-def test_only_episodes_that_ask_for_it_are_rewound_and_no_result_depends_on_it(among):
-    """Each as far back as it says; a longer way than it drove is back to its start."""
-    spec, genome, maps, episodes, worlds, paths = among
-    both = np.stack([genome, np.zeros_like(genome)])
-    plain, starts, then = evaluate(spec, both, maps, episodes, AMONG, CONFIG, worlds)
-    assert (starts.shape, then.shape) == ((2, 0, 5), (2, 0, *worlds.shape[1:]))
-    some = episodes.copy()
-    some["rewind"][[1, 4, 6]] = 1, 64, 5000
-    results, starts, then = evaluate(spec, both, maps, some, AMONG, CONFIG, worlds)
-    assert results.tobytes() == plain.tobytes()
-    assert (starts.shape, then.shape) == ((2, 3, 5), (2, 3, *worlds.shape[1:]))
-    for k, (column, back) in enumerate([(1, 1), (4, 64), (6, 5000)]):
-        row, states, traffic = paths[column]
-        first = max(int(row["steps"]) - back, 0)
-        assert then[0, k].tobytes() == traffic[first].tobytes()
-        assert starts[0, k, :2] == pytest.approx(states[first][[X, Y]])
-    assert starts[0, 2] == pytest.approx(episodes["start"][6], abs=1e-5)
 
 
 def test_without_room_for_anybody_there_is_no_traffic(among):

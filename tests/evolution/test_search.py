@@ -1,14 +1,13 @@
 """What searches share: ranks within groups, tournaments in closed form, groups of pairs, the order of ask and tell."""
 
 import itertools
-from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from searching import first_gene, state_of, told
+from searching import state_of
 
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import SearchConfig, ranks, split, tournament_weights, tournaments
@@ -44,17 +43,12 @@ def test_weights_are_what_all_tournaments_come_to(scores, size):
     np.testing.assert_allclose(tournament_weights(scores, size), wins / len(scores) ** size, atol=1e-12)
 
 
-@pytest.mark.parametrize(("n", "size"), [(20, 1), (20, 2), (20, 3), (12, 8), (2, 2)])
+@pytest.mark.parametrize(("n", "size"), [(20, 1), (20, 3), (2, 2)])
 def test_tournaments_are_won_at_their_weights(n, size):
     rng = np.random.default_rng(100 * n + size)
     scores, count = rng.permutation(n).astype(float), 60_000
-    winners = tournaments(scores, size, count, rng)
-    assert winners.shape == (count,)
-    seen, expected = np.bincount(winners, minlength=n), count * tournament_weights(scores, size)
-    likely = expected >= 5
-    seen = np.append(seen[likely], seen[~likely].sum())
-    expected = np.append(expected[likely], expected[~likely].sum())
-    assert stats.chisquare(seen[expected > 0], expected[expected > 0]).pvalue > 1e-3
+    seen = np.bincount(tournaments(scores, size, count, rng), minlength=n)
+    assert stats.chisquare(seen, count * tournament_weights(scores, size)).pvalue > 1e-3
 
 
 @given(data=st.data())
@@ -65,16 +59,14 @@ def test_pairs_stay_together_in_groups_of_about_as_many(data):
     parts = split(members, groups, first)
     assert len(parts) == groups
     assert [k for part in parts for k in range(part.start, part.stop)] == list(range(members))
-    for part in parts[1:]:
-        assert (part.start - first) % 2 == 0  # no pair is cut
+    assert all((part.start - first) % 2 == 0 for part in parts[1:])  # no pair is cut
     sizes = np.array([part.stop - part.start for part in parts])
     sizes[0] -= first
     assert np.ptp((sizes + 1) // 2) <= 1
 
 
-@pytest.mark.parametrize("kind", SEARCHES)
-def test_out_of_order_raises(kind):
-    search = kind(SPEC, SearchConfig(population=40, groups=2), seed=9)
+def test_out_of_order_raises():
+    search = Recombination(SPEC, SearchConfig(population=40, groups=2), seed=9)
     with pytest.raises(RuntimeError, match="without ask"):
         search.tell(np.zeros(40))
     with pytest.raises(RuntimeError, match="asked for"):
@@ -87,36 +79,27 @@ def test_out_of_order_raises(kind):
             search.tell(wrong)
     search.tell(np.zeros(40))  # what was refused has changed nothing
     assert search.generation == 1
-    with pytest.raises(RuntimeError, match="without ask"):
-        search.tell(np.zeros(40))
 
 
 @pytest.mark.parametrize("kind", SEARCHES)
-def test_the_first_generation_is_new_and_its_groups_cover_it(kind):
-    search = kind(SPEC, SearchConfig(population=41, groups=3), seed=4)
+def test_the_first_generation_is_new_and_each_has_a_key_of_its_own(kind):
+    search, other = (kind(SPEC, SearchConfig(population=41, groups=3), seed) for seed in (4, 5))
     assert search.leader() is None
     asked = search.ask()
-    assert asked.parents.shape == (0, SPEC.size)
-    assert len({genome.tobytes() for genome in search.genomes(np.arange(41))}) == 41
-    assert 0 <= asked.key < 2**63
     assert asked.groups == split(41, 3)
+    assert len({genome.tobytes() for genome in search.genomes(np.arange(41))}) == 41
+    keys = {other.ask().key, asked.key}
+    for _ in range(49):
+        search.tell(np.arange(41.0))
+        keys.add(search.ask().key)
+    assert len(keys) == 51
 
 
 @pytest.mark.parametrize("kind", SEARCHES)
-def test_each_generation_has_a_key_of_its_own(kind):
-    search, keys = kind(SPEC, SearchConfig(population=8, groups=1), seed=4), []
-    for _ in range(50):
-        keys.append(search.ask().key)
-        search.tell(np.arange(8.0))
-    assert len(set(keys)) == 50
-
-
-@pytest.mark.parametrize("kind", SEARCHES)
-@pytest.mark.parametrize("bad", [np.nan, -np.inf])
-def test_a_score_that_is_not_a_number_loses(kind, bad):
+def test_a_score_that_is_not_a_number_loses(kind):
     """The search goes as if it were lower than all others'."""
     states = []
-    for spoilt in (bad, -1e300):
+    for spoilt in (np.nan, -np.inf, -1e300):
         search = kind(SPEC, SearchConfig(population=16, groups=2, tournament=4), seed=6)
         for generation in range(4):
             search.ask()
@@ -124,17 +107,4 @@ def test_a_score_that_is_not_a_number_loses(kind, bad):
             scores[[2, 3, 11]] = spoilt
             search.tell(scores)
         states.append(state_of(search))
-    assert states[0] == states[1]
-
-
-@pytest.mark.parametrize("kind", [Recombination, TwoParents, partial(TwoParents, random=True)])
-@pytest.mark.parametrize("generations", [0, 1, 4])
-def test_a_restored_search_goes_on_bit_for_bit(kind, generations):
-    search, again, other = (kind(SPEC, SearchConfig(population=20, groups=2), seed=seed) for seed in (10, 10, 11))
-    for _ in range(generations):
-        told(search, first_gene)
-    again.restore({name: array.copy() for name, array in search.state().items()})
-    again.generation = search.generation
-    for _ in range(3):
-        members = told(search, first_gene).tobytes()
-        assert told(again, first_gene).tobytes() == members != told(other, first_gene).tobytes()
+    assert states[0] == states[1] == states[2]

@@ -42,11 +42,13 @@ def test_elites_are_the_best_of_their_groups():
     assert search.parents[:8].tobytes() == members[best].tobytes()
 
 
-def test_both_parents_come_from_the_pool():
-    search = TwoParents(SPEC, SearchConfig(population=4000, groups=1, tournament=2, elites=3), seed=5)
+def test_both_parents_come_from_the_pool_and_mutation_is_as_asked_for():
+    config = SearchConfig(population=4000, groups=1, tournament=2, elites=3, sigma=0.7, mutation_rate=0.2)
+    search = TwoParents(SPEC, config, seed=5)
     told(search, first_gene)
     assert len(search.parents) == PARENTS + 3
     asked = search.ask()
+    assert asked.mutation == Mutation(rate=0.2, sigma=0.7)
     children = asked.recipes[3:]
     for side in ("a", "b"):
         assert set(children[side].tolist()) == set(range(3, PARENTS + 3))
@@ -54,18 +56,12 @@ def test_both_parents_come_from_the_pool():
     assert len(set(children["seed"].tolist())) == len(children)
 
 
-def test_mutation_is_as_asked_for():
-    search = TwoParents(SPEC, SearchConfig(population=8, groups=1, sigma=0.7, mutation_rate=0.2, elites=1), seed=5)
-    assert search.ask().mutation == Mutation(rate=0.2, sigma=0.7)
-
-
-@pytest.mark.parametrize("bad", [np.nan, -np.inf])
-def test_who_has_no_score_is_neither_elite_nor_parent(bad):
+def test_who_has_no_score_is_neither_elite_nor_parent():
     """Not even where all of its group is spoilt, and so equal."""
     search = TwoParents(SPEC, SearchConfig(population=40, groups=4, tournament=20, elites=25), seed=3)
     search.ask()
     members = search.genomes(EVERYONE)
     scores = first_gene(members)
-    scores[:10] = bad
+    scores[:5], scores[5:10] = np.nan, -np.inf
     search.tell(scores)
     assert not {m.tobytes() for m in members[:10]} & {p.tobytes() for p in search.parents}
