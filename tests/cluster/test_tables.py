@@ -20,7 +20,6 @@ from cluster.comparison.page import page
 from cluster.comparison.plan import Plan
 from cluster.comparison.tables import spread
 from cluster.report import pictures
-from cluster.training.evolution import Evolution
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
@@ -106,15 +105,3 @@ def test_picture_shows_who_was_compared(tmp_path):
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
     assert [has(tmp_path / "two.png", colour) for colour in (evolution, dqn)] == [True, True]
     assert [has(tmp_path / "one.png", colour) for colour in (evolution, dqn)] == [True, False]
-
-
-def test_curves_call_each_figure_by_one_name(tmp_path, monkeypatch):
-    figure, axes = pictures._figure(15, 3.8, 4)
-    monkeypatch.setattr(pictures, "_figure", lambda *shape: (figure, axes))
-    pictures.curves([dict.fromkeys(Evolution.columns, 0.5)] * 2, tmp_path / "curves.png", "generation")
-    assert [[text.get_text() for text in axis.get_legend().get_texts()] for axis in axes] == [
-        ["leader, on longer drives", "members, mean", "members, standard deviation"],
-        ["members, episode length", "leader, on longer drives", "members, mean"],
-        ["leader, on longer drives", "members, mean"],
-        ["champion, validation", "leader, on longer drives"],
-    ]
