@@ -24,14 +24,8 @@ from cluster.workers.pool import PoolError
 from gridsim.errors import GridSimError
 from gridsim.view.render import NoDisplayError
 
-FLAGS = {
-    "gridsim-evolve": EvolveFlags,
-    "gridsim-dqn": DqnFlags,
-    "gridsim-evaluate": EvaluateFlags,
-    "gridsim-watch": WatchFlags,
-    "gridsim-drive": DriveFlags,
-    "gridsim-compare": CompareFlags,
-}
+KINDS = (EvolveFlags, DqnFlags, EvaluateFlags, WatchFlags, DriveFlags, CompareFlags)
+FLAGS = {f"gridsim-{kind.__name__.removesuffix('Flags').lower()}": kind for kind in KINDS}
 
 
 @pytest.mark.parametrize("prog", FLAGS)
@@ -112,16 +106,15 @@ def test_a_command_is_called_as_this_one_was(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "venv/bin"
     folder.mkdir(parents=True)
-    for name in ("gridsim-evolve", "gridsim-watch", "mlflow"):
-        (folder / name).touch()
-    monkeypatch.setattr(sys, "argv", ["venv/bin/gridsim-evolve"])
-    monkeypatch.setenv("PATH", "/usr/bin:/bin")
-    assert command_path("gridsim-watch") == "venv/bin/gridsim-watch"
-    assert command_path("mlflow") == "venv/bin/mlflow"
-    monkeypatch.setenv("PATH", f"/bin:{folder}")
-    assert command_path("gridsim-watch") == "gridsim-watch"
-    monkeypatch.setattr(sys, "argv", ["-c"])
-    assert command_path("gridsim-watch") == "gridsim-watch"
+    (folder / "gridsim-watch").touch()
+    for called, path, other in (
+        ("venv/bin/gridsim-evolve", "/bin", "venv/bin/gridsim-watch"),
+        ("venv/bin/gridsim-evolve", f"/bin:{folder}", "gridsim-watch"),
+        ("-c", "/bin", "gridsim-watch"),
+    ):
+        monkeypatch.setattr(sys, "argv", [called])
+        monkeypatch.setenv("PATH", path)
+        assert command_path("gridsim-watch") == other
 
 
 @pytest.mark.parametrize("prog", FLAGS)
@@ -138,11 +131,7 @@ def test_a_command_is_entered_and_ctrl_c_is_quiet_while_its_libraries_load(monke
     monkeypatch.setattr(os, "_exit", sys.exit)  # which would end the tests
     with pytest.raises(SystemExit, match="7"):
         entry.watch_main()
-
-    def interrupted(name):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(entry, "import_module", interrupted)
+    monkeypatch.setattr(entry, "import_module", Mock(side_effect=KeyboardInterrupt))
     with pytest.raises(SystemExit, match="130"):
         entry.watch_main()
 

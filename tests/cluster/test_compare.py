@@ -23,8 +23,6 @@ from cluster.workers.pool import PoolError
 from gridsim import evolve
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
-UNTRACKED = Mock()  # in place of MLflow's parent run
-UNTRACKED.return_value.close.return_value = None
 
 
 def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
@@ -33,6 +31,7 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
     make_run(tmp_path / "a")
     for arguments, said in [
         (["nowhere"], "no such folder"),
+        (["."], "none of its runs is finished"),
         ([tmp_path / "a" / "config.json"], "is not a folder"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
@@ -61,7 +60,7 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(compare, "train", train)
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
-    monkeypatch.setattr(compare, "Tracker", UNTRACKED)
+    monkeypatch.setattr(compare, "Tracker", Mock(**{"return_value.close.return_value": None}))
     run = functools.partial(call, compare_main, monkeypatch, capsys)
     asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
     code, _, err = run(*asked, "--name", "c", "--seeds", 1)
@@ -108,10 +107,6 @@ def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, m
     assert unsent.startswith(f"gridsim-compare: warning: not logged to MLflow at {away}: ")
 
 
-SMALL = ["--scenarios", "curved", "--learners", "evolution", "random", "--seeds", "1", "--population", "32",
-         "--workers", "0", "--name", "c"]  # fmt: skip
-
-
 def files(folder):
     return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
 
@@ -120,7 +115,8 @@ def files(folder):
 def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_what_is_finished(tmp_path):
     folder = tmp_path / "runs" / "c"
     first, second = folder / "curved-evolution-s0", folder / "curved-random-s0"
-    with running("gridsim-compare", *SMALL, "--budget", "1h", "--generations", "3", cwd=tmp_path) as process:
+    asked = "--scenarios curved --learners evolution random --seeds 1 --population 32 --budget 1h --generations 3"
+    with running("gridsim-compare", *asked.split(), "--workers", "0", "--name", "c", cwd=tmp_path) as process:
         wait_until(lambda: second.exists() or process.poll() is not None, 240)
         process.send_signal(signal.SIGINT)
         errors = process.communicate(timeout=120)[1]
@@ -138,12 +134,10 @@ def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_wha
     rows = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
     assert [(row["learner"], row["run"]) for row in rows] == [("evolution", first.name), ("random", second.name)]
     assert float(rows[0]["velocity_error_percent"]) > 0.0
-    found = {logged.info.run_name: logged for logged in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db")}
-    assert set(found) == {"c", first.name, second.name}
-    parent = found["c"].info.run_id
-    assert all(found[path.name].data.tags["mlflow.parentRunId"] == parent for path in (first, second))
-    assert found["c"].info.status == "FINISHED"
-    assert found["c"].data.metrics["runs_done"] == 2
+    whole, *runs = sorted(tracked.runs(f"sqlite:///{tmp_path}/mlflow.db"), key=lambda run: run.info.run_name)
+    assert [run.info.run_name for run in (whole, *runs)] == ["c", first.name, second.name]
+    assert all(run.data.tags["mlflow.parentRunId"] == whole.info.run_id for run in runs)
+    assert (whole.info.status, whole.data.metrics["runs_done"]) == ("FINISHED", 2)
 
 
 @pytest.mark.e2e

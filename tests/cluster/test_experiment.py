@@ -115,16 +115,6 @@ def test_same_run_twice_is_refused(tmp_path):
         read_runs([tmp_path / "a", tmp_path / "b"])
 
 
-def test_a_comparison_stands_for_its_finished_runs(tmp_path):
-    folder = ComparisonFolder(tmp_path, PLAN)
-    folder.write()
-    assert open_comparison(tmp_path) == folder
-    with pytest.raises(GridSimError, match="none of its runs"):
-        read_runs([tmp_path])
-    make_run(PLAN.cells(tmp_path)[0].path)
-    assert [found.folder.name for found in read_runs([tmp_path])] == ["curved-evolution-s0"]
-
-
 @pytest.mark.parametrize(
     "change",
     [

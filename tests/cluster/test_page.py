@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, needs_chromium
-from PIL import Image
+from pictures import small_map
 
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
@@ -18,7 +18,6 @@ from cluster.runs.champion import load_champion
 from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, X, Y
 from gridsim.car.vehicle import act
 from gridsim.config import constants
-from gridsim.maps.files import MapWarning, load_map
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
 from gridsim.traffic.world import spawn
@@ -75,14 +74,9 @@ def shown_drives():
     return champion, drive, Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive)
 
 
-def test_a_map_file_is_shown_from_side_to_side_of_its_road(tmp_path):
-    free = np.zeros((400, 400), bool)
-    free[40:120, 60:300] = True  # rows from above
-    Image.fromarray((255 * free).astype(np.uint8)).save(tmp_path / "hall.png")
-    (tmp_path / "hall.yaml").write_text("image: hall.png\nresolution: 0.25\norigin: [0, 0, 0]\nnegate: 0\n")
-    with pytest.warns(MapWarning):
-        road_map = load_map(str(tmp_path / "hall.yaml"))
-    assert bounds(road_map) == pytest.approx([15.0 - 5, 75.0 + 5, 70.0 - 5, 90.0 + 5], abs=0.6)
+def test_a_map_file_is_shown_from_side_to_side_of_its_road():
+    road_map, _ = small_map([[20.0, 40.0, 44.0, 40.0, 4.0]])  # its ends are round
+    assert bounds(road_map) == pytest.approx([16.0 - 5, 48.0 + 5, 36.0 - 5, 44.0 + 5], abs=0.6)
 
 
 @pytest.mark.e2e
