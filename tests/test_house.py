@@ -45,21 +45,19 @@ def imports(node: ast.AST, when: str = "at import") -> Iterator[tuple[str, int, 
         yield from imports(inner, when)
 
 
-def breaches(file: str, source: str) -> list[str]:
-    """What in a file (its path from the root) breaks a rule, a line each."""
+def breaches(file: str, source: str) -> Iterator[str]:
+    """Yield what in a file (its path from the root) breaks a rule, a line each."""
     package = file.partition("/")[0]
-    found = []
     tree = ast.parse(source, filename=file)
     for module, line, when in sorted({(name.partition(".")[0], line, when) for name, line, when in imports(tree)}):
         if RANK.get(module, 0) > RANK[package]:
-            found.append(f"{file}:{line}: {package} imports {module}, upwards")
+            yield f"{file}:{line}: {package} imports {module}, upwards"
         elif module in NOT_IN.get(package, ()):
-            found.append(f"{file}:{line}: {package} knows no {module}")
+            yield f"{file}:{line}: {package} knows no {module}"
         elif module in BEHIND and file not in BEHIND[module]:
-            found.append(f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}")
+            yield f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}"
         elif module == "torch" and when == "at import" and file not in TORCH_AT_IMPORT:
-            found.append(f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}")
-    return found
+            yield f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}"
 
 
 @pytest.mark.parametrize("package", RANK)

@@ -44,16 +44,10 @@ def probe(path):
 
 
 @pytest.fixture(scope="module")
-def driver():
-    """A champion that drives well."""
-    return load_champion(CHAMPION)
-
-
-@pytest.fixture(scope="module")
-def drive(driver):
-    scenario = build("seamless", 2_000_000, driver.sim)
+def drive():
+    scenario = build("seamless", 2_000_000)
     start = sample_starts(scenario, 1, np.random.default_rng(3))[0]
-    return record(driver, scenario, start, 12.0)
+    return record(load_champion(CHAMPION), scenario, start, 12.0)
 
 
 def test_a_champion_is_read_once_and_drives_on_when_its_file_is_gone(tmp_path):
@@ -65,8 +59,8 @@ def test_a_champion_is_read_once_and_drives_on_when_its_file_is_gone(tmp_path):
     assert first != second, "the next map"
 
 
-def test_recording_ends_with_its_episode(driver):
-    scenario = build("seamless", 4)
+def test_recording_ends_with_its_episode():
+    driver, scenario = load_champion(CHAMPION), build("seamless", 4)
     blind = replace(driver, genome=np.zeros_like(driver.genome))  # accelerates
     drive = record(blind, scenario, sample_starts(scenario, 1, np.random.default_rng(0))[0], 60.0)
     assert drive.end == End.COLLISION
