@@ -45,40 +45,33 @@ def imports(node: ast.AST, when: str = "at import") -> Iterator[tuple[str, int, 
         yield from imports(inner, when)
 
 
-def breaches(file: str, source: str) -> list[str]:
-    """What in a file (its path from the root) breaks a rule, a line each."""
+def breaches(file: str, source: str) -> Iterator[str]:
+    """Yield what in a file (its path from the root) breaks a rule, a line each."""
     package = file.partition("/")[0]
-    found = []
     tree = ast.parse(source, filename=file)
     for module, line, when in sorted({(name.partition(".")[0], line, when) for name, line, when in imports(tree)}):
         if RANK.get(module, 0) > RANK[package]:
-            found.append(f"{file}:{line}: {package} imports {module}, upwards")
+            yield f"{file}:{line}: {package} imports {module}, upwards"
         elif module in NOT_IN.get(package, ()):
-            found.append(f"{file}:{line}: {package} knows no {module}")
+            yield f"{file}:{line}: {package} knows no {module}"
         elif module in BEHIND and file not in BEHIND[module]:
-            found.append(f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}")
+            yield f"{file}:{line}: {module} belongs behind {', '.join(sorted(BEHIND[module]))}"
         elif module == "torch" and when == "at import" and file not in TORCH_AT_IMPORT:
-            found.append(f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}")
-    return found
+            yield f"{file}:{line}: torch at import time outside {', '.join(sorted(TORCH_AT_IMPORT))}"
 
 
 @pytest.mark.parametrize("package", RANK)
-def test_package_keeps_the_rules(root: Path, package: str) -> None:
-    files = sorted((root / package).rglob("*.py"))
-    assert files, f"{package}/ is missing or empty"
-    assert [b for f in files for b in breaches(f.relative_to(root).as_posix(), f.read_text(encoding="utf-8"))] == []
-
-
-@pytest.mark.parametrize("package", RANK)
-def test_files_and_folders_stay_small(root: Path, package: str) -> None:
-    files = sorted((root / package).rglob("*.py"))
-    assert [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > MOST_LINES] == []
-    modules = Counter(f.parent.relative_to(root).as_posix() for f in files if f.name != "__init__.py")
+def test_package_keeps_the_rules_and_its_files_and_folders_stay_small(root: Path, package: str) -> None:
+    sources = {f.relative_to(root): f.read_text(encoding="utf-8") for f in (root / package).rglob("*.py")}
+    assert sources, f"{package}/ is missing or empty"
+    assert [breach for file, source in sources.items() for breach in breaches(file.as_posix(), source)] == []
+    assert [file for file, source in sources.items() if len(source.splitlines()) > MOST_LINES] == []
+    modules = Counter(file.parent for file in sources if file.name != "__init__.py")
     assert [folder for folder, count in modules.items() if count > MOST_MODULES] == []
 
 
-def own_imports(root: Path) -> dict[str, set[str]]:
-    """For each module those of the project's that it imports, at once or later."""
+def test_no_files_import_each_other_in_a_circle(root: Path) -> None:
+    """Neither at once nor later."""
     files = [f for package in RANK for f in (root / package).rglob("*.py")]
     names = {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
     found: dict[str, set[str]] = {}
@@ -86,11 +79,7 @@ def own_imports(root: Path) -> dict[str, set[str]]:
         tree = ast.parse(file.read_text(encoding="utf-8"))
         asked = {other for other, _, when in imports(tree) if when != "for types"}
         found[name] = (asked & names.keys()) - {name}
-    return found
-
-
-def test_no_files_import_each_other_in_a_circle(root: Path) -> None:
-    TopologicalSorter(own_imports(root)).prepare()  # raises CycleError, which names them
+    TopologicalSorter(found).prepare()  # raises CycleError, which names them
 
 
 @pytest.mark.parametrize(

@@ -21,22 +21,18 @@ def test_installed_commands_are_the_declared_ones() -> None:
     assert {entry.name: entry.value for entry in installed} == SCRIPTS
 
 
-def test_every_folder_is_a_package_and_typed(root: Path) -> None:
+def test_every_folder_is_a_package_and_typed_and_files_that_are_no_python_are_packaged(root: Path) -> None:
     tops = {pattern.removesuffix("*") for pattern in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]}
     assert tops == {"cluster", "evolution", "gridsim"}
     folders = {path.parent for top in tops for path in (root / top).rglob("*.py")}
     assert [folder for folder in sorted(folders) if not (folder / "__init__.py").is_file()] == []
     assert [top for top in sorted(tops) if not (root / top / "py.typed").is_file()] == []
-
-
-def test_files_that_are_no_python_are_packaged(root: Path) -> None:
     patterns = PROJECT["tool"]["setuptools"]["package-data"]["cluster"]
     packaged = {path.name for pattern in patterns for path in (root / "cluster").glob(pattern)}
     assert packaged == {"aws.yaml", "gcp.yaml", "kuberay.yaml", "local.yaml", "drive.html"}
 
 
 def test_make_installs_the_test_tools_for_tests_alone(root: Path, tmp_path: Path) -> None:
-
     def said(target: str) -> str:
         command = ["make", "--dry-run", target, f"VENV={tmp_path}"]
         return subprocess.run(command, cwd=root, capture_output=True, text=True, check=True).stdout

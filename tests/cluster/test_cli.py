@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tracked
-from commands import all_in_mlflow, descendants, finish, refused, rows, start, summary, wait_until
+from commands import all_in_mlflow, descendants, finish, refused, rows, same_run, start, summary, wait_until
 
-from cluster.commands.cli import DqnFlags, EvaluateFlags, EvolveFlags, dqn_main, evaluate_main, evolve_main
-from cluster.commands.compare import CompareFlags, compare_main
+from cluster.commands.cli import dqn_main, evolve_main
+from cluster.commands.compare import compare_main
 from cluster.comparison.plan import ComparisonFolder, Plan
 from cluster.runs.champion import Champion
-from cluster.runs.checkpoint import load, save
+from cluster.runs.checkpoint import save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import EvolveSettings
 from evolution.networks.policy import PolicySpec
@@ -34,12 +34,6 @@ def evolve(*arguments, cwd):
     return finish("gridsim-evolve", *arguments, cwd=cwd)
 
 
-def in_mlflow(cwd):
-    """The only run that MLflow has in a folder's database, and how long it took (s)."""
-    (run,) = (each for each in tracked.runs(f"sqlite:///{cwd}/mlflow.db") if each.info.run_name != "other")
-    return run.info, (run.info.end_time - run.info.start_time) / 1000.0
-
-
 @pytest.mark.e2e
 @pytest.mark.usefixtures("database")  # a run waits for MLflow no more than 15 s then
 def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
@@ -53,12 +47,8 @@ def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
     assert "Traceback" not in out + err
     assert "--resume runs/c" in err
     wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 30)
-    found, duration_s = in_mlflow(tmp_path)
-    assert found.status == "KILLED"
-    assert duration_s == pytest.approx(float(rows(run)[-1]["wall_s"]), abs=0.01)
     evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
-    assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
-    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
+    assert same_run(run, reference)
 
 
 def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path, monkeypatch):
@@ -73,34 +63,6 @@ def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path, mon
     assert not set(shell) - {"HOME", "PYTHONPATH"} & set(names)
 
 
-KEEP = """
-import ray
-class Kept:
-    def word(self):
-        return "still here"
-ray.init(namespace="mine", log_to_driver=False)
-ray.get(ray.remote(Kept).options(name="kept", lifetime="detached").remote().word.remote())
-"""
-ASK = "import ray; ray.init(namespace='mine', log_to_driver=False); print(ray.get(ray.get_actor('kept').word.remote()))"
-
-
-@pytest.mark.e2e
-def test_a_users_own_ray_outlives_tests_that_start_and_end_others(cluster, root, tmp_path):
-    """They are started in the shell of a user whose Ray has a token, and who has an MLflow server somewhere."""
-    token = tmp_path / ".ray/auth_token"
-    token.parent.mkdir()
-    token.write_text("ab" * 32)
-    token.chmod(0o600)
-    address, _ = cluster(1, HOME=str(tmp_path), RAY_AUTH_MODE="token")
-    shell = {"HOME": str(tmp_path), "RAY_ADDRESS": address, "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
-    finish("python", "-c", KEEP, cwd=tmp_path, **shell)
-    test = "tests/cluster/test_ray_pool.py::test_any_number_of_workers_gives_the_serial_pools_bits"
-    server = {"MLFLOW_TRACKING_URI": "http://127.0.0.1:1", "MLFLOW_EXPERIMENT_NAME": "mine"}
-    finish("pytest", test, cwd=root, timeout=500, **shell, **server)
-    assert finish("python", "-c", ASK, cwd=tmp_path, **shell).stdout == "still here\n"
-    assert token.read_text() == "ab" * 32
-
-
 @pytest.mark.e2e
 def test_run_folder_and_mlflow_keep_their_contracts(reference):
     home = reference.parent.parent
@@ -109,10 +71,6 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
         assert stored[name] == (reference / name).read_bytes() > b""
     assert (reference / "checkpoint.npz").is_file()
     assert not (reference / "steps.part").exists()
-    assert "steps.part" not in stored
-    assert "elites" not in load(reference / "checkpoint.npz")[0]
-    with np.load(reference / "champion.npz", allow_pickle=False) as arrays:
-        assert arrays["genome"].dtype == np.float32
     figures = summary(reference)
     assert len(rows(reference)) == figures["generations"] == 6
     assert all_in_mlflow(reference)
@@ -132,32 +90,28 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
     """The same run again, a part of it first: flags beside `--config` change it."""
     config, run = str(reference / "config.json"), tmp_path / "runs/s"
     evolve("--workers", "0", "--config", config, "--generations", "3", "--name", "s", cwd=tmp_path)
-    assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
     assert "finished" in evolve("--workers", "0", "--resume", "runs/s", cwd=tmp_path).stdout
     done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
-    assert len(rows(run)) == 6
-    assert (run / "elites.npz").read_bytes() == (reference / "elites.npz").read_bytes()
-    assert in_mlflow(tmp_path)[1] == pytest.approx(summary(run)["wall_s"], abs=0.01)
+    assert same_run(run, reference)
     assert "compare: make ui, or" in done.stdout
     assert "at the end: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout
     assert "--resume runs/s --generations 12\n" in done.stdout
-    assert "http://127.0.0.1:5000/#/experiments/2/runs?workflowType=machine_learning&" in done.stdout
-    assert summary(run)["champion_sha256"] == summary(reference)["champion_sha256"]
 
 
 @pytest.mark.e2e
 @pytest.mark.usefixtures("database")
 def test_init_begins_with_a_champion(reference, tmp_path):
-    arguments = ["--workers", "0", *ROAD, "--population", "24", "--generations", "1"]
-    arguments += ["--recombination", "two", "--mutation-rate", "0"]
-    evolve(*arguments, "--init", str(reference), "--name", "warm", cwd=tmp_path)
+    small = ["--population", "24", "--generations", "1", "--recombination", "two", "--mutation-rate", "0"]
+    evolve("--workers", "0", *ROAD, *small, "--init", str(reference), "--name", "warm", cwd=tmp_path)
     # Without mutation every member is the one it started from.
     assert summary(tmp_path / "runs/warm")["champion_sha256"] == summary(reference)["champion_sha256"]
 
 
 @pytest.mark.e2e
-@pytest.mark.parametrize("send", [os.kill, os.killpg])  # the second as timeout, Slurm and terminals do
-@pytest.mark.parametrize(("sign", "after_s"), [(signal.SIGTERM, 0.0), (signal.SIGTERM, 1.5), (signal.SIGINT, 0.5)])
+@pytest.mark.parametrize(
+    ("send", "sign", "after_s"),  # killpg as timeout, Slurm and terminals do
+    [(os.kill, signal.SIGTERM, 0.0), (os.killpg, signal.SIGTERM, 1.5), (os.killpg, signal.SIGINT, 0.5)],
+)
 def test_stopped_while_ray_starts_it_ends_soon_and_leaves_nothing(tmp_path, send, sign, after_s):
     with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
         process = start("gridsim-evolve", "--workers", "2", *SMALL, cwd=tmp_path, RAY_TMPDIR=short)
@@ -181,11 +135,9 @@ WRONG = [
     ("--patience -1", "--patience must be 0 or more"),
     ("--output /proc/nowhere", "--output"),
     ("--name ../up", "--name"),
-    ("--resume .", "not a run's folder"),
     ("--resume nowhere", "nowhere: no such folder"),
     ("--config /etc/hostname", "config.json"),
     ("--init nothing.npz", "nothing.npz: no such file"),
-    ("--traffic 100000", "--traffic must be 0 to 100"),
     ("--workers 1 --address 127.0.0.1:1", "127.0.0.1:1"),
     ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1: Connection refused; start one"),
 ]
@@ -194,32 +146,8 @@ WRONG = [
 @pytest.mark.parametrize(("arguments", "expected"), WRONG)
 def test_wrong_use_is_one_clear_line(arguments, expected, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    began = time.monotonic()
-    lines = refused(evolve_main, monkeypatch, capsys, "--workers", "0", *arguments.split())
-    assert expected in lines[0]
-    assert time.monotonic() - began < 30
+    assert expected in refused(evolve_main, monkeypatch, capsys, "--workers", "0", *arguments.split())[0]
     assert list(tmp_path.iterdir()) == []  # nothing half-written
-
-
-@pytest.mark.parametrize(
-    ("flags", "main"),
-    [
-        (EvolveFlags, evolve_main), (DqnFlags, dqn_main), (EvaluateFlags, evaluate_main), (CompareFlags, compare_main),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("form", ["{} 3", "{}=3", "{} 3 --help", "--traffic 1 {}=a=b"])
-def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(
-    form, flags, main, monkeypatch, capsys, tmp_path
-):
-    monkeypatch.chdir(tmp_path)
-    prog = f"gridsim-{main.__name__.removesuffix('_main')}"
-    for flag, instead in flags.removed.items():
-        for spelling in (flag, "--" + flag[2:].replace("-", "_")):
-            (line,) = refused(main, monkeypatch, capsys, *form.format(spelling).split())
-            assert line == f"{prog}: error: {flag} was removed: {instead}"
-    # As a value it is one.
-    lines = refused(evolve_main, monkeypatch, capsys, "--name", "parents", "--population", "3", "--workers", "0")
-    assert "--population must be 4 to 1,000,000" in lines[0]
 
 
 @pytest.mark.parametrize(("flag", "path"), [("--resume", "old"), ("--config", "old/config.json")])
@@ -227,17 +155,11 @@ def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypa
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "old"
     folder.mkdir()
-    settings = {"scenario": "curved", "population": 512, "parents": 64, "crossover": 0.0, "islands": 4}
-    config = {"format": 1, "command": "gridsim-evolve", "gridsim": "0.1.0", "settings": settings}
+    config = {"format": 1, "command": "gridsim-evolve", "settings": {"scenario": "curved", "islands": 4}}
     (folder / "config.json").write_text(json.dumps(config))
-    save(folder / "checkpoint.npz", {"parents0": np.zeros((2, 3), dtype=np.float32)}, {"generation": 7})
-    before = {entry.name: entry.read_bytes() for entry in folder.iterdir()}
-    for form in ([flag, path], [f"{flag}={path}"]):
-        (line,) = refused(evolve_main, monkeypatch, capsys, *form)
-        assert "old/config.json is of a run of GridSim 0.1" in line
-        assert "start a new run" in line
-    assert {entry.name: entry.read_bytes() for entry in folder.iterdir()} == before
-    assert os.listdir(tmp_path) == ["old"]
+    (line,) = refused(evolve_main, monkeypatch, capsys, flag, path)
+    assert "old/config.json is of a run of GridSim 0.1, which this version cannot continue; start a new run" in line
+    assert (os.listdir(tmp_path), os.listdir(folder)) == (["old"], ["config.json"])
 
 
 @pytest.fixture
@@ -256,10 +178,8 @@ def stopped(tmp_path):
     ("change", "said"),
     [
         ("--seed 6", "--seed 6 contradicts the run's 5; leave it out, or start a new run"),
-        ("--population 64", "--population 64 contradicts the run's 48"),
         ("--generations 2", "--generations 2 contradicts the run's 6; give a greater --generations, or start a new"),
         ("--car-steps 1e6", "--car-steps 1000000 does not limit the run; give a greater --generations"),
-        ("--name other", "--name other contradicts the run's r"),
         ("--output elsewhere", "contradicts the run's"),
         ("--config r/config.json", "--resume and --config exclude each other"),
         ("--generations 9 --tracking-uri ftp://x", "not a tracking address"),  # no contradiction
@@ -298,19 +218,16 @@ def test_a_device_that_is_not_there_is_said(monkeypatch, capsys, tmp_path):
     assert "--device cuda: PyTorch finds no device" in line
 
 
-@pytest.mark.parametrize(
-    ("policy", "genome", "said"),
-    [
+def test_a_champion_that_does_not_fit_is_refused(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for policy, gene, said in (
         ("mlp:6,7", 0.0, "is a mlp:6,7; use --policy mlp:6,7"),
         ("mlp:64+steering", np.nan, "some of its genes are not numbers"),
-    ],
-)
-def test_a_champion_that_does_not_fit_is_refused(policy, genome, said, monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    genes = np.full(PolicySpec.parse(policy).size, genome, dtype=np.float32)
-    Champion(genes, policy, "curved", SimConfig()).save("c.npz")
-    (line,) = refused(evolve_main, monkeypatch, capsys, "--workers", "0", "--init", "c.npz")
-    assert said in line
+    ):
+        genes = np.full(PolicySpec.parse(policy).size, gene, dtype=np.float32)
+        Champion(genes, policy, "curved", SimConfig()).save("c.npz")
+        (line,) = refused(evolve_main, monkeypatch, capsys, "--workers", "0", "--init", "c.npz")
+        assert said in line
 
 
 @pytest.mark.parametrize("main", [evolve_main, compare_main])

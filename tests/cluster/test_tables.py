@@ -20,7 +20,6 @@ from cluster.comparison.page import page
 from cluster.comparison.plan import Plan
 from cluster.comparison.tables import spread
 from cluster.report import pictures
-from cluster.training.evolution import Evolution
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
@@ -32,18 +31,12 @@ def test_medians_lie_between_quartiles(values):
     assert min(values) <= lower <= median <= upper <= max(values)
 
 
-def rows_of(text):
-    """Cells of the tables in a markdown text, without heads and rules."""
-    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
-    return [line for line in lines if line[0] not in ("road", "---")]
-
-
 def test_tables_show_what_is_missing():
     runs = [run("evolution", "curved", 0, 10.0), run("evolution", "curved", 1, 20.0), run("random", "seamless", 0, 5.0)]
     groups = tables.group(runs, PLAN)
     text = tables.table_md(groups, PLAN).decode()
-    assert text.startswith("2 seeds, at most 1k a run, 31 rays, traffic as each road has it by default.\n")
-    driving, errors = rows_of(text)[:4], rows_of(text)[4:]
+    assert text.startswith("2 seeds, at most 1k a run, 31 rays, traffic as each road has it by default.\n\n| road |")
+    (_, *driving), (_, *errors) = (tables.table(groups, columns) for columns in (tables.DRIVING, tables.ERRORS))
     assert [line[:3] for line in driving] == [
         ["curved", "evolution", "2"],
         ["curved", "random search", "missing"],
@@ -106,15 +99,3 @@ def test_picture_shows_who_was_compared(tmp_path):
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
     assert [has(tmp_path / "two.png", colour) for colour in (evolution, dqn)] == [True, True]
     assert [has(tmp_path / "one.png", colour) for colour in (evolution, dqn)] == [True, False]
-
-
-def test_curves_call_each_figure_by_one_name(tmp_path, monkeypatch):
-    figure, axes = pictures._figure(15, 3.8, 4)
-    monkeypatch.setattr(pictures, "_figure", lambda *shape: (figure, axes))
-    pictures.curves([dict.fromkeys(Evolution.columns, 0.5)] * 2, tmp_path / "curves.png", "generation")
-    assert [[text.get_text() for text in axis.get_legend().get_texts()] for axis in axes] == [
-        ["leader, on longer drives", "members, mean", "members, standard deviation"],
-        ["members, episode length", "leader, on longer drives", "members, mean"],
-        ["leader, on longer drives", "members, mean"],
-        ["champion, validation", "leader, on longer drives"],
-    ]

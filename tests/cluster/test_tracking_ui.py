@@ -90,8 +90,8 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
             browser.wait_for(f"{curves} == 2")
             browser.run("document.querySelector('.is-visibility-toggle-checkbox').click()")  # the eye in front of a run
             browser.wait_for(f"{curves} == 1")
-        address, json_type = f"http://127.0.0.1:{port}/ajax-api/3.0/mlflow/ui-telemetry", "application/json"
-        events = urllib.request.Request(address, b'{"records": []}', {"Content-Type": json_type})
+        address = f"http://127.0.0.1:{port}/ajax-api/3.0/mlflow/ui-telemetry"
+        events = urllib.request.Request(address, b'{"records": []}', {"Content-Type": "application/json"})
         with urllib.request.urlopen(events, timeout=20) as answer:
             assert json.load(answer) == {"status": "disabled"}
 

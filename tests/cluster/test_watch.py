@@ -1,11 +1,11 @@
 """Films and windows on champions: frame counts and rates read back, runs that are over or still going, wrong use."""
 
-import dataclasses
 import json
 import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from pictures import record_drive
 
 from cluster.commands import watch
 from cluster.commands.watch import checkpoint_time, elite, watch_main
-from cluster.report.film import Recording, VideoError, frames, picture, record, write_video
+from cluster.report.film import VideoError, frames, picture, record, write_video
 from cluster.runs import checkpoint, steps
 from cluster.runs.champion import load_champion
 from cluster.runs.checkpoint import CheckpointError
@@ -44,16 +44,10 @@ def probe(path):
 
 
 @pytest.fixture(scope="module")
-def driver():
-    """A champion that drives well."""
-    return load_champion(CHAMPION)
-
-
-@pytest.fixture(scope="module")
-def drive(driver):
-    scenario = build("seamless", 2_000_000, driver.sim)
+def drive():
+    scenario = build("seamless", 2_000_000)
     start = sample_starts(scenario, 1, np.random.default_rng(3))[0]
-    return record(driver, scenario, start, 12.0)
+    return record(load_champion(CHAMPION), scenario, start, 12.0)
 
 
 def test_a_champion_is_read_once_and_drives_on_when_its_file_is_gone(tmp_path):
@@ -65,13 +59,13 @@ def test_a_champion_is_read_once_and_drives_on_when_its_file_is_gone(tmp_path):
     assert first != second, "the next map"
 
 
-def test_recording_ends_with_its_episode(driver):
-    scenario = build("seamless", 4)
-    blind = type(driver)(np.zeros_like(driver.genome), driver.policy, driver.scenario, driver.sim)  # accelerates
+def test_recording_ends_with_its_episode():
+    driver, scenario = load_champion(CHAMPION), build("seamless", 4)
+    blind = replace(driver, genome=np.zeros_like(driver.genome))  # accelerates
     drive = record(blind, scenario, sample_starts(scenario, 1, np.random.default_rng(0))[0], 60.0)
     assert drive.end == End.COLLISION
     assert drive.seconds < 30
-    lost = type(driver)(np.full_like(driver.genome, np.nan), driver.policy, driver.scenario, driver.sim)
+    lost = replace(driver, genome=np.full_like(driver.genome, np.nan))
     assert len(record(lost, scenario, drive.cars[0, :5] * 0 + 128, 60.0).cars) == 1
 
 
@@ -90,7 +84,7 @@ def test_picture_shows_other_cars_between_two_states(drive):
     boxes = np.zeros((len(drive.cars), 1, 5), dtype=np.float32)
     boxes[:, 0, :4] = drive.cars[:, :4]
     boxes[:, 0, :2] += 6.0 * drive.cars[:, 2:4]  # six metres ahead
-    seen = Recording(drive.scenario, drive.cars, drive.ranges, boxes, drive.end, drive.period)
+    seen = replace(drive, boxes=boxes)
     renderer = Renderer(drive.scenario, (320, 240))
     for seconds in (3.0, 3.05, 12.0, 99.0):
         assert (picture(renderer, seen, seconds) != picture(renderer, drive, seconds)).any()
@@ -120,14 +114,12 @@ def test_film_is_whole_or_not_there(drive, tmp_path, monkeypatch):
 def test_watch_writes_films(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     film = [CHAMPION, "--output", "a.mp4", "--seconds", 1, "--size", "320x180"]
-    code, out, err = call(watch_main, monkeypatch, capsys, *film)
-    assert (code, err) == (0, "")
-    assert "a.mp4: 1.0 s, 20 pictures" in out
+    assert "a.mp4: 1.0 s, 20 pictures" in call(watch_main, monkeypatch, capsys, *film)[1]
     assert probe(tmp_path / "a.mp4")[2:6] == (320, 180, 20.0, 20)
     film = [CHAMPION, "--output", "b.gif", "--seconds", 2, "--size", "160x90", "--seed", 7, "--scenario", "city"]
     assert call(watch_main, monkeypatch, capsys, *film)[0] == 0
-    assert probe(tmp_path / "b.gif")[0] == "gif"
-    assert probe(tmp_path / "b.gif")[5] == 20
+    codec, *_, count, _ = probe(tmp_path / "b.gif")
+    assert (codec, count) == ("gif", 20)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["a.mp4", "b.gif"]
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))  # right use, and it fails
     code, _, err = call(watch_main, monkeypatch, capsys, *film)
@@ -136,16 +128,12 @@ def test_watch_writes_films(tmp_path, monkeypatch, capsys):
 
 
 def test_a_page_of_several_champions_begins_with_all_of_them(tmp_path, monkeypatch, capsys):
-    files = [str(CHAMPION.with_name(name)) for name in ("champion.npz", "champion_traffic.npz")]
-    for page, sources, marks in (
-        ("two.html", files, ["benchmarks", "champion_traffic.npz"]),
-        ("one.html", files[:1], ["1"]),
-    ):
-        call(watch_main, monkeypatch, capsys, *sources, "--seconds", "5", "--output", str(tmp_path / page))
-        (found,) = re.findall(r'type="application/json">(.*)</script>', (tmp_path / page).read_text())
-        data = json.loads(found)
-        assert [each["short"] for each in data["drives"]] == marks
-        assert data["together"] == (len(sources) > 1)
+    files, page = [CHAMPION, CHAMPION.with_name("champion_traffic.npz")], tmp_path / "two.html"
+    call(watch_main, monkeypatch, capsys, *files, "--seconds", "5", "--output", page)
+    (found,) = re.findall(r'type="application/json">(.*)</script>', page.read_text())
+    data = json.loads(found)
+    assert [each["short"] for each in data["drives"]] == ["benchmarks", "champion_traffic.npz"]
+    assert data["together"]
 
 
 def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
@@ -155,15 +143,11 @@ def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
     record_drive(tmp_path / "drive.csv", scenario, start, [[0] * 16, [0] * 11])
     for arguments, pictures in (([], 25), (["--seconds", 2], 20)):
         film = ["drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]
-        code, out, _ = call(watch_main, monkeypatch, capsys, *film)
-        assert code == 0
+        assert f"{pictures / 10:.1f} s, {pictures} pictures" in call(watch_main, monkeypatch, capsys, *film)[1]
         assert probe(tmp_path / "d.mp4")[5] == pictures
-        assert f"{pictures / 10:.1f} s, {pictures} pictures" in out
     (tmp_path / "cut.csv").write_text((tmp_path / "drive.csv").read_text()[:-30])
     for line, said in (("cut.csv", "cut.csv, line 28"), ("drive.csv --follow", "its own driver and road")):
-        code, _, err = call(watch_main, monkeypatch, capsys, *line.split(), "--output", "e.mp4")
-        assert code == 2
-        assert said in err
+        assert said in refused(watch_main, monkeypatch, capsys, *line.split(), "--output", "e.mp4")[0]
 
 
 def test_window_is_shown_on_a_chosen_driver_for_so_long(dummy, monkeypatch, capsys):
@@ -175,12 +159,12 @@ def test_window_is_shown_on_a_chosen_driver_for_so_long(dummy, monkeypatch, caps
 @pytest.fixture
 def going(tmp_path):
     """A run's folder as it is while the run goes on."""
-    settings = EvolveSettings("curved", policy="mlp:6,7")
-    RunFolder(tmp_path / "run", settings).path.mkdir()
-    RunFolder(tmp_path / "run", settings).write_config()
+    run = RunFolder(tmp_path / "run", EvolveSettings("curved", policy="mlp:6,7"))
+    run.path.mkdir()
+    run.write_config()
     elites = np.random.default_rng(0).standard_normal((4, PolicySpec.parse("mlp:6,7").size)).astype(np.float32)
-    save_steps(tmp_path / "run", 0, elites)
-    return tmp_path / "run"
+    save_steps(run.path, 0, elites)
+    return run.path
 
 
 def save_steps(run, first, elites):
@@ -203,11 +187,6 @@ def test_follow_takes_the_newest_elite_while_the_run_goes_on(going, dummy, monke
     assert (code, out, err) == (0, "waiting for the first generation ...\n", "")
 
 
-def test_a_road_is_named_with_its_seed_unless_it_is_a_file():
-    assert watch._name(build("curved", 7)) == "curved, map 7"
-    assert watch._name(dataclasses.replace(build("curved", 0), name="/tmp/track.yaml")) == "track"
-
-
 def test_newest_elite_is_read_anew(going):
     elites = steps.read_elites(going, "mlp:6,7")
     first, name = elite(going, None)
@@ -228,11 +207,9 @@ def test_newest_elite_is_read_anew(going):
 
 WRONG = [
     ("RUN", "to watch it as it stands: --follow, or --generation N"),
-    ("nothing", "nothing: no such file"),
     (".", "not a run's folder"),
     ("CHAMPION/x --output a.mp4", "no such file"),
     ("RUN --generation 99 --output a.mp4", "0 to 3"),
-    ("RUN --generation -1 --output a.mp4", "0 to 3"),
     ("CHAMPION --generation 1", "run's folder"),
     ("RUN --follow --output a.mp4", "--follow"),
     ("RUN --follow --generation 1", "exclude each other"),
@@ -242,7 +219,6 @@ WRONG = [
     ("CHAMPION --output a.mp4 --fps 1000", "--fps"),
     ("CHAMPION --output a.mp4 --seconds nan", "--seconds"),
     ("CHAMPION --output a.mp4 --traffic 999", "--traffic"),
-    ("CHAMPION --output a.mp4 --scenario moon", "unknown scenario"),
     ("CHAMPION --output a.mp4 --seed -4", "seed"),
     ("CHAMPION", "DISPLAY"),
 ]

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from subprocess import PIPE
 
 import psutil  # type: ignore[import-untyped]
 import pytest
@@ -18,15 +19,10 @@ BIN = Path(sys.executable).parent
 PATH = os.pathsep.join(name for name in os.get_exec_path() if Path(name).resolve() != BIN.resolve())
 
 
-def start(*arguments, cwd, **env):
+def start(program, *flags, cwd, **env):
+    command, environment = [str(BIN / program), *flags], {**os.environ, "PATH": PATH, **env}
     return subprocess.Popen(
-        [str(BIN / arguments[0]), *arguments[1:]],
-        cwd=cwd,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PATH": PATH, **env},
-        start_new_session=True,
+        command, cwd=cwd, env=environment, stdout=PIPE, stderr=PIPE, text=True, start_new_session=True
     )
 
 

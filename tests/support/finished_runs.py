@@ -15,10 +15,10 @@ from gridsim.config import SimConfig
 HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 90.0, "speed_mps": 7.0, "collision_rate": 0.5}
 
 
-def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, settings=None, **more):
+def make_run(folder, learner="evolution", scenario="curved", seed=0, settings=None):
     """A finished run's folder, as small as one can be; `settings` in place of what a comparison asks for."""
     folder.mkdir(parents=True)
-    settings = settings or Plan(traffic=traffic).settings(scenario, learner, seed)
+    settings = settings or Plan(traffic=0).settings(scenario, learner, seed)
     rng = np.random.default_rng(np.random.SeedSequence(list(f"{folder.name} {settings.seed}".encode())))
     genome = rng.standard_normal(PolicySpec.parse(settings.policy).size).astype(np.float32)
     champion = Champion(genome, settings.policy, settings.scenario, SimConfig(), settings.traffic)
@@ -26,17 +26,17 @@ def make_run(folder, learner="evolution", scenario="curved", seed=0, traffic=0, 
     summary = {
         "scenario": settings.scenario, "seed": settings.seed, "car_steps": 5000, "wall_s": 12.5,
         "champion_generation": 1, "training_s": 6.0, "best_car_steps": 3000.0, "best_wall_s": 4.0,
-        "champion_sha256": champion.sha256, "held_out": HELD_OUT, **more,
+        "champion_sha256": champion.sha256, "held_out": HELD_OUT,
     }  # fmt: skip
     RunFolder(folder, settings).write_config()
     (folder / "summary.json").write_text(json.dumps(summary))
     return summary
 
 
-def run(learner, scenario, seed, percent, training_s=10.0, success=0.9, traffic=0, observation="rays", **more):
+def run(learner, scenario, seed, percent, traffic=0, observation="rays", **more):
     """A finished run with its errors."""
     figures = dict.fromkeys([*RUN_FIGURES, *ERROR_FIGURES], 1.0)
-    figures |= {"velocity_error_percent": percent, "training_s": training_s, "success_rate": success} | more
+    figures |= {"velocity_error_percent": percent, "training_s": 10.0, "success_rate": 0.9} | more
     name = f"{scenario}-{learner}-s{seed}"
     settings = Plan(traffic=traffic, observation=observation, budget="1k").settings(scenario, learner, seed)
     return Run(Path(name), settings, name, figures)
