@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from driving import to_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -39,6 +38,7 @@ from gridsim.maps.scenarios import build
 from gridsim.traffic.world import FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
+GROUPS = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
 Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray]  # what `Worker.evaluate` returns
 
 
@@ -49,11 +49,7 @@ class Answering(Worker):
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         results["distance"] = recipes["seed"][:, None] * 16.0 + task.episodes["start"][:, 4]
         results["paced"] = task.parents[recipes["a"], 0][:, None]
-        results["steps"] = sum(m.seed for m in maps)
-        back = task.episodes["start"][task.episodes["rewind"] > 0]
-        rewound = np.repeat(back[None], len(recipes), axis=0)
-        worlds = np.repeat(task.worlds[task.episodes["rewind"] > 0][None], len(recipes), axis=0)
-        return results, rewound, worlds
+        return results, np.zeros(0), np.zeros(0)  # nothing is rewound
 
     def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
         """Episodes of key % 5 steps whose rows are all marked by their keys."""
@@ -172,33 +168,20 @@ def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers(
     assert abs(busy[0] - busy[1]) <= WORTH_SENDING_S
 
 
-def test_a_parcel_holds_members_of_several_groups_and_each_drives_what_is_asked_of_it_alone() -> None:
+def test_a_parcel_holds_members_of_several_groups() -> None:
     """So that the number of parcels does not grow with the number of groups."""
-    groups = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
-    task, progress = make_task(episodes=goals(*[400.0] * 16)), [(0, 0)]
-    assert len(cut(task, groups, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
-    recipes, wanted = make_recipes(512), np.zeros((512, 16))
-    for group in groups:
+    task = make_task(episodes=goals(*[400.0] * 16))
+    assert len(cut(task, GROUPS, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
+
+
+def test_what_is_asked_for_is_driven_and_nothing_else_and_progress_is_reported() -> None:
+    pool, recipes = SerialPool(never_built, Answering), make_recipes(512)
+    progress, wanted = [(0, 0)], np.zeros((512, 16))
+    for group in GROUPS:
         wanted[group] = recipes["seed"][group.rows, None] * 16.0
-    pool = SerialPool(never_built, Answering)
-    outcome = pool.evaluate(task, recipes, lambda *done: progress.append(done), groups)
+    task = make_task(episodes=goals(*[400.0] * 16))
+    outcome = pool.evaluate(task, recipes, lambda *done: progress.append(done), GROUPS)
     assert np.array_equal(outcome.results["distance"], wanted)
-    assert progress[-1] == (512, 512)
-
-
-def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
-    """Of a large network, 1 ms a metre, before any of it is measured."""
-    task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
-    assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
-
-
-def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
-    progress: list[tuple[int, int]] = []
-    pool = SerialPool(never_built, Answering)
-    recipes = make_recipes(512)
-    outcome = pool.evaluate(make_task(), recipes, lambda done, of: progress.append((done, of)))
-    assert np.array_equal(outcome.results["distance"][:, 1], recipes["seed"] * 16.0 + 1)
     assert progress == sorted(progress)
     assert progress[-1] == (512, 512)
     assert len(progress) > 5
@@ -207,6 +190,13 @@ def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
     assert pool.evaluate(make_task(), make_recipes(0)).results.shape == (0, 2)
     for _ in range(2):
         pool.close()
+
+
+def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
+    """Of a large network, 1 ms a metre, before any of it is measured."""
+    task = make_task(episodes=goals(100.0, 100.0))
+    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
+    assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
 
 
 def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
@@ -218,25 +208,11 @@ def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
     assert left == []
 
 
-def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
-    task, maps = collect_drive_task(9)
-    whole = SerialPool(lambda *name: maps[name[1]]).collect(task)
-    collected = Collected(task)
-    for first, stop in ((5, 9), (0, 2), (2, 5)):
-        answer = Worker().answer(task, maps, make_recipes(0), first, stop)
-        collected.add(first, Chunk(slice(first, stop), slice(0, 1)), *answer)
-    assert collected.done == collected.total
-    assert to_bytes(collected.experience) == to_bytes(whole.experience)
-    assert collected.results.tobytes() == whole.results.tobytes()
-    assert set(collected.busy_s) == {0, 2, 5}
-
-
-def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
-    """A member whose first episode came back and whose second kills; and an episode of a batch."""
+def test_a_lost_member_has_no_results_and_experience_is_in_order() -> None:
+    """A member whose first episode came back and whose second kills; an episode of a batch whose end came first."""
     outcome = Outcome(make_task(), make_recipes(3), rectangle(3, 2))
-    none, no_cars = np.zeros((2, 0, 5), dtype=np.float32), np.zeros((2, 0, 0, FIELDS), dtype=np.float32)
-    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), none, no_cars, 0.1)
-    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), none[:1], no_cars[:1], 0.1)
+    for rows, columns in ((slice(0, 2), slice(0, 2)), (slice(2, 3), slice(0, 1))):
+        outcome.add(0, Chunk(rows, columns), np.ones((), dtype=RESULT), np.zeros(0), np.zeros(0), 0.1)
     assert outcome.done < outcome.total
     outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
     assert outcome.done == outcome.total
@@ -250,7 +226,7 @@ def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
         collected.add(0, Chunk(slice(first, stop), slice(0, 1)), *answer)
     collected.lose(Chunk(slice(3, 4), slice(0, 1)))
     assert collected.done == collected.total
-    assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    assert list(dict.fromkeys(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 @pytest.mark.parametrize("what", ["members", "episodes"])

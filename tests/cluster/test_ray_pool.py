@@ -4,8 +4,6 @@ import contextlib
 import functools
 import http.server
 import os
-import pickle
-import re
 import signal
 import socket
 import subprocess
@@ -56,7 +54,6 @@ class Obeying(Answering):
             if int(seed) not in seeds:
                 continue
             if what == "sleep":
-                (self._folder / "sleeper").write_text(f"{os.getpid()} ")
                 time.sleep(float(path.read_text()))
                 continue
             times = int(path.read_text())
@@ -94,11 +91,6 @@ class Reluctant(Task):
             mine.touch()
             raise MemoryError("no room")
         vars(self).update(state)
-
-
-class Unfit(Answering):
-    def __init__(self) -> None:
-        raise RuntimeError("not in this state")
 
 
 @pytest.fixture(scope="module")
@@ -161,25 +153,14 @@ def test_results_progress_and_what_is_sent(pool: RayPool, way: str) -> None:
 
 @pytest.mark.usefixtures("way")
 def test_what_a_killed_worker_was_at_runs_elsewhere_at_once_and_it_is_replaced(pool: RayPool, folder: Path) -> None:
-    (folder / "sleep-300").write_text("600")
-    killed: list[tuple[int, float]] = []
-
-    def kill() -> None:
-        wait_until(lambda: (folder / "sleeper").exists() and (folder / "sleeper").read_text().endswith(" "))
-        (folder / "sleep-300").unlink()
-        killed.append((int((folder / "sleeper").read_text()), time.perf_counter()))
-        os.kill(killed[0][0], signal.SIGKILL)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
+    before = set(pool.pids())
+    (folder / "kill-300").write_text("1")
     outcome = pool.evaluate(make_task(), make_recipes(512))
-    seconds = time.perf_counter() - killed[0][1]
-    killer.join()
     assert outcome.results.tobytes() == expected(512)
     assert 1 <= outcome.retries <= 2
-    assert seconds < 5.0
+    assert outcome.wall_s < 5.0
     wait_until(lambda: pool.evaluate(make_task(), make_recipes(8)) and len(pool.pids()) == 2)
-    assert killed[0][0] not in pool.pids()
+    assert len(before.intersection(pool.pids())) == 1
 
 
 @pytest.mark.parametrize("what", ["kill", "raise"])
@@ -269,8 +250,7 @@ def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatc
     assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"
 
 
-@pytest.mark.parametrize("calls", [20, 200])
-def test_something_is_done_again_and_again_while_workers_are_busy(pool: RayPool, folder: Path, calls: int) -> None:
+def test_something_is_done_again_and_again_while_workers_are_busy(pool: RayPool, folder: Path) -> None:
     """Answers are taken in between; all of it is done when the call returns."""
     (folder / "sleep-0").write_text("0.5")  # in the first chunk
     progress, done_by_then = [(0, 400)], []
@@ -278,23 +258,19 @@ def test_something_is_done_again_and_again_while_workers_are_busy(pool: RayPool,
     def learn() -> bool:
         time.sleep(0.005)
         done_by_then.append(progress[-1][0])
-        return len(done_by_then) < calls
+        return len(done_by_then) < 200
 
     collected = pool.collect(make_collect_task(400), lambda *done: progress.append(done), learn)
     wanted = SerialPool(never_built, Answering).collect(make_collect_task(400))
     assert to_bytes(collected.experience) == to_bytes(wanted.experience)
-    assert len(done_by_then) == calls
+    assert len(done_by_then) == 200
     assert 0 < done_by_then[19] < 400, "the other worker's answers, not the sleeping one's"
-    assert done_by_then[-1] == 400 or calls == 20
-
-
-def interrupted() -> None:
-    raise KeyboardInterrupt
+    assert done_by_then[-1] == 400
 
 
 def test_only_one_pool_at_a_time_which_survives_an_interruption(pool: RayPool) -> None:
     with pytest.raises(KeyboardInterrupt):
-        pool.collect(make_collect_task(400), meanwhile=interrupted)
+        pool.collect(make_collect_task(400), meanwhile=lambda: signal.raise_signal(signal.SIGINT))
     second = RayPool(1, never_built, worker_factory=Answering)
     with pytest.raises(PoolError, match="in use in this process already"):
         second.evaluate(make_task(), make_recipes(4))
@@ -404,8 +380,8 @@ def test_what_a_ray_leaves_that_was_killed_or_failed_as_it_started_is_removed_an
 @pytest.mark.usefixtures("no_pool")
 def test_workers_that_cannot_start_are_given_up() -> None:
     with (
-        contextlib.closing(RayPool(2, never_built, worker_factory=Unfit, patience_s=300.0)) as pool,
-        pytest.raises(PoolError, match=r"^no worker can be started: .*RuntimeError: not in this state"),
+        contextlib.closing(RayPool(2, never_built, worker_factory=Obeying, patience_s=300.0)) as pool,  # type: ignore
+        pytest.raises(PoolError, match=r"^no worker can be started: .*TypeError: .*missing 1 required .*'folder'"),
     ):
         pool.evaluate(make_task(), make_recipes(20))
 
@@ -421,7 +397,7 @@ def test_a_pool_needs_workers() -> None:
 @pytest.mark.parametrize(
     ("address", "said"),
     [
-        *((text, "is not a Ray address; give host:port") for text in ("nowhere", "host:99999", ":6379", "ray://a:10001")),
+        *((text, "is not a Ray address; give") for text in ("nowhere", "host:99999", ":6379", "ray://a:10001")),
         ("127.0.0.1:1", r"^no Ray cluster answers at 127.0.0.1:1: Connection refused; is `ray start"),
     ],
 )

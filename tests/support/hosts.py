@@ -4,7 +4,6 @@ A host is a process in namespaces of its own (`unshare`). Its first process read
 end, however that is, it ends too, and the kernel removes the host's processes, mounts and network with it.
 """
 
-import importlib.util
 import os
 import pwd
 import shutil
@@ -71,9 +70,7 @@ def package_folders() -> set[str]:
     code = f"import importlib.util as u; [print(*u.find_spec(n).submodule_search_locations) for n in {names}]"
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     installed = subprocess.run([sys.executable, "-c", code], cwd="/", env=environment, capture_output=True, text=True)
-    ours = [importlib.util.find_spec(name) for name in names]
-    here = {folder for spec in ours for folder in (spec and spec.submodule_search_locations) or ()}
-    return {*here, *installed.stdout.split()}
+    return {*(str(Path(__file__).parents[2] / name) for name in names), *installed.stdout.split()}
 
 
 class Command:
@@ -119,12 +116,10 @@ class Host:
             env=self.environment(),
         )
         assert self._process.stdout is not None
-        said = b""
-        while not said.endswith(b"ready\n"):
-            line = self._process.stdout.readline()
-            if not line:
-                raise RuntimeError(f"the host could not be set up: {said.decode()}")
-            said += line
+        said = [line := self._process.stdout.readline()]
+        while line not in (b"ready\n", b""):
+            said.append(line := self._process.stdout.readline())
+        assert line, f"the host could not be set up: {b''.join(said).decode()}"
         self.pid = descendants(self._process.pid)[0]
 
     @staticmethod
@@ -168,16 +163,11 @@ class Host:
         """Let in who has the key."""
         (self.home / ".ssh" / "authorized_keys").write_text(authorized)
         self.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/host")
-        options = {
-            "HostKey": HOME / ".ssh/host",
-            "ListenAddress": self.address,
-            "PasswordAuthentication": "no",
-            "PermitRootLogin": "prohibit-password",
-            "PidFile": "none",
-            "StrictModes": "no",
-            "UsePAM": "no",
-        }
-        flags = [flag for name, value in options.items() for flag in ("-o", f"{name}={value}")]
+        options = (
+            f"HostKey={HOME}/.ssh/host ListenAddress={self.address} PasswordAuthentication=no "
+            "PermitRootLogin=prohibit-password PidFile=none StrictModes=no UsePAM=no"
+        )
+        flags = [flag for option in options.split() for flag in ("-o", option)]
         self.run(shutil.which("sshd", path=SEARCH), "-f", "/dev/null", "-E", "/tmp/sshd.log", *flags)
 
     def processes(self) -> list[str]:
