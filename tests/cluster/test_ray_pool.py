@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
@@ -240,11 +241,8 @@ def test_an_exception_ends_the_run_in_one_line(pool: RayPool, folder: Path) -> N
 
 
 def test_an_error_of_rays_own_ends_the_run_in_one_line(pool: RayPool, monkeypatch: pytest.MonkeyPatch) -> None:
-    def wait(*_: object, **__: object) -> None:
-        raise ray.exceptions.RaySystemError("the store\nis gone")
-
     with monkeypatch.context() as patch:
-        patch.setattr(ray, "wait", wait)
+        patch.setattr(ray, "wait", Mock(side_effect=ray.exceptions.RaySystemError("the store\nis gone")))
         with pytest.raises(PoolError, match=r"^Ray failed: .*is gone \(logs: .*/logs\)$"):
             pool.evaluate(make_task(), make_recipes(512))
     assert pool.evaluate(make_task(), make_recipes(100)).results.tobytes() == expected(100), "the pool goes on"

@@ -76,8 +76,9 @@ def check_complete(served, name):
             wanted[GENERATIONS] = found["validation_success_rate"]  # with the last candidate, tried after the last step
         logged = client(served.uri).get_metric_history(run_id, column)
         assert {metric.step: metric.value for metric in logged} == pytest.approx(wanted)
-    metrics = run.data.metrics
-    assert metrics["held_out/distance_m"] == found["held_out"]["distance_m"]
+        times = {metric.step: metric.timestamp - run.info.start_time for metric in logged if metric.step < GENERATIONS}
+        assert times == pytest.approx({k: 1000.0 * float(row["wall_s"]) for k, row in enumerate(history)}, abs=2.0)
+    assert run.data.metrics["held_out/distance_m"] == found["held_out"]["distance_m"]
     assert f"**{found['held_out']['success_rate']:.1%}**" in run.data.tags["mlflow.note.content"]
     assert f'"runs:/{run_id}/model"' in run.data.tags["mlflow.note.content"]
 

@@ -17,14 +17,12 @@ from commands import command_line, descendants, wait_until
 
 HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
 PROGRAMS = {
-    "unshare": "util-linux",
-    "nsenter": "util-linux",
-    "ip": "iproute2",
-    "sshd": "openssh-server",
-    "ssh": "openssh-client",
-    "ssh-keygen": "openssh-client",
-    "rsync": "rsync",
-    "uptime": "procps",  # `ray up` asks with it whether a host is there
+    "util-linux": ("unshare", "nsenter"),
+    "iproute2": ("ip", "ss"),
+    "openssh-server": ("sshd",),
+    "openssh-client": ("ssh", "ssh-keygen"),
+    "rsync": ("rsync",),
+    "procps": ("uptime",),  # `ray up` asks with it whether a host is there
 }
 UNSHARE = ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc"]
 SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
@@ -57,8 +55,7 @@ def missing() -> str:
     """Why there can be no hosts here; empty where there can."""
     if os.geteuid() != 0:
         return "needs root, for network namespaces"
-    packages = sorted({package for program, package in PROGRAMS.items() if not shutil.which(program, path=SEARCH)})
-    if packages:
+    if packages := [name for name in PROGRAMS if not all(shutil.which(each, path=SEARCH) for each in PROGRAMS[name])]:
         return f"needs apt-get install {' '.join(packages)}"
     done = subprocess.run([*UNSHARE, "true"], capture_output=True)
     return "" if done.returncode == 0 else "needs leave to make namespaces (in Docker: --privileged)"
@@ -195,5 +192,4 @@ def switch(folder: Path, keep: list[Path]) -> Host:
     host.run("ip", "link", "add", "switch", "type", "bridge")
     host.run("ip", "address", "add", "10.77.0.1/24", "dev", "switch")
     host.run("ip", "link", "set", "switch", "up")
-    host.address = "10.77.0.1"
     return host
