@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -135,29 +136,24 @@ def cluster() -> Iterator[Callable[..., tuple[str, subprocess.Popen]]]:
     """
     from tracked import free_port
 
-    nodes: list[subprocess.Popen] = []
-    folders = []  # in a user's own, `ray start` would name another head as the current one; paths of sockets are short
+    with contextlib.ExitStack() as stack:
 
-    def node(cpus: int, address: str = "", **environment: str) -> tuple[str, subprocess.Popen]:
-        port = free_port()
-        where = [f"--address={address}"]
-        if not address:
-            folders.append(tempfile.mkdtemp(prefix="gridsim-", dir="/tmp"))
-            where = ["--head", f"--port={port}", "--include-dashboard=false", f"--temp-dir={folders[-1]}"]
-        nodes.append(
-            subprocess.Popen(
+        def node(cpus: int, address: str = "", **environment: str) -> tuple[str, subprocess.Popen]:
+            port, where = free_port(), [f"--address={address}"]
+            if not address:
+                # In a user's own, `ray start` would name another head as the current one; paths of sockets are short.
+                kept = tempfile.TemporaryDirectory(prefix="gridsim-", dir="/tmp", ignore_cleanup_errors=True)
+                where = ["--head", f"--port={port}", "--include-dashboard=false"]
+                where.append(f"--temp-dir={stack.enter_context(kept)}")
+            process = subprocess.Popen(
                 [str(BIN / "ray"), "start", "--block", f"--num-cpus={cpus}", "--object-store-memory=100000000", *where],
                 env=os.environ | {"RAY_USAGE_STATS_ENABLED": "0"} | environment,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
             )
-        )
-        if not address:
-            wait_until(lambda: answers(f"127.0.0.1:{port}"), 60)
-        return address or f"127.0.0.1:{port}", nodes[-1]
+            stack.callback(end, process)
+            if not address:
+                wait_until(lambda: answers(f"127.0.0.1:{port}"), 60)
+            return address or f"127.0.0.1:{port}", process
 
-    yield node
-    for process in nodes:
-        end(process)
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
+        yield node

@@ -8,21 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster.workers.dispatch import MAX_KILLS, QUEUE, Dispatch
-from cluster.workers.pool import Chunk, Parcel
-
-
-def rows(*sizes: int) -> list[Parcel]:
-    """Parcels of so many whole members, on one episode; from the second member on in a chunk of their own."""
-    ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
-    spans = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    return [
-        tuple(Chunk(slice(a, b), slice(0, 1)) for a, b in ((first, first + 1), (first + 1, stop)) if a < b)
-        for first, stop in spans
-    ]
+from cluster.workers.pool import Chunk
 
 
 def new(*sizes: int) -> Dispatch:
-    return Dispatch(rows(*sizes))
+    """Of parcels of so many whole members, on one episode; from the second member on in a chunk of their own."""
+    ends = [sum(sizes[: k + 1]) for k in range(len(sizes))]
+    spans = [(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    parcels = [
+        tuple(Chunk(slice(a, b), slice(0, 1)) for a, b in ((first, first + 1), (first + 1, stop)) if a < b)
+        for first, stop in spans
+    ]
+    return Dispatch(parcels)
 
 
 class World:
@@ -33,31 +30,39 @@ class World:
         self.queues: dict[int, deque[int]] = {worker: deque() for worker in range(workers)}
         self.answered: Counter[int] = Counter()  # members
         self.lost: set[int] = set()
-        self.deaths = 0
+        self.suspects: set[int] = set()  # members that a dead worker held
+        self.deaths = self.in_a_row = 0
 
-    def units(self, parcel: int) -> list[int]:
-        return [unit for part in self.dispatch.parcels[parcel] for unit in range(part.rows.start, part.rows.stop)]
+    def units(self, *parcels: int) -> list[int]:
+        parts = [part for parcel in parcels for part in self.dispatch.parcels[parcel]]
+        return [unit for part in parts for unit in range(part.rows.start, part.rows.stop)]
 
     def give(self) -> None:
+        """Nothing is queued with a suspect, so that the next time it is clear which killed."""
         idle = [worker for worker, queue in self.queues.items() if not queue]
         for worker, parcel in self.dispatch.give(idle):
-            self.queues[worker].append(parcel)
-            assert len(self.queues[worker]) <= QUEUE
+            queue = self.queues[worker]
+            queue.append(parcel)
+            assert len(queue) <= (1 if self.suspects.intersection(self.units(*queue)) else QUEUE)
 
     def bury(self, worker: int, blamed: bool = True) -> None:
         self.deaths += 1
+        self.in_a_row += blamed
+        self.suspects.update(self.units(*self.queues[worker]))
         self.queues[worker].clear()
-        for parcel in self.dispatch.died(worker, blamed):
-            self.lost.update(self.units(parcel))
+        self.lost.update(self.units(*self.dispatch.died(worker, blamed)))
+        assert self.dispatch.deaths == self.in_a_row
 
     def work(self, worker: int) -> None:
         """The worker does its first parcel, or dies of it."""
-        parcel = self.queues[worker].popleft()
-        if self.killers & set(self.units(parcel)):
+        units = self.units(self.queues[worker][0])
+        if self.killers.intersection(units):
             self.bury(worker)
-        elif (settled := self.dispatch.answered(worker)) is not None:
-            assert settled == parcel
-            self.answered.update(self.units(parcel))
+        else:
+            assert self.dispatch.answered(worker) == self.queues[worker].popleft()
+            self.answered.update(units)
+            self.in_a_row = 0
+            assert self.dispatch.deaths == 0
 
 
 @given(
@@ -121,28 +126,3 @@ def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
 def test_the_worker_with_the_smallest_parcel_is_the_first_to_get_another() -> None:
     """Parcels come largest first: a small one behind the largest would be the last to be done."""
     assert list(new(*[5] * 9).give([0, 1, 2])) == [(0, 0), (1, 1), (2, 2), (2, 3), (1, 4), (0, 5)]
-
-
-def test_nothing_is_queued_with_a_suspect() -> None:
-    """So that the next time it is clear which killed. What waited behind a dead worker's parcel is a suspect too."""
-    dispatch = new(*[5] * 9)
-    assert list(dispatch.give([0, 1])) == [(0, 0), (1, 1), (1, 2), (0, 3)]
-    dispatch.died(0)
-    assert list(dispatch.give([0])) == [(0, 0)]
-    assert list(dispatch.give([])) == []
-    assert dispatch.answered(1) == 1
-    assert dispatch.answered(1) == 2
-    assert list(dispatch.give([1])) == [(1, 3)]
-    assert dispatch.answered(0) == 0
-    assert list(dispatch.give([0])) == [(0, 4), (0, 5)]
-
-
-def test_deaths_in_a_row_are_counted_until_a_worker_answers() -> None:
-    dispatch = new(9, 9, 9)
-    for k in range(4):
-        list(dispatch.give([0]))
-        dispatch.died(0)
-        assert dispatch.deaths == k + 1
-    list(dispatch.give([0]))
-    dispatch.answered(0)
-    assert dispatch.deaths == 0

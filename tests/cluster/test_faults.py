@@ -10,19 +10,16 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from commands import BIN, answers, end, finish, rows, running, same_run, wait_until
-from test_pool import Answering, Evaluated, make_recipes, make_task, never_built
+from commands import BIN, answers, end, finish, ray_workers, rows, running, same_run, wait_until
+from test_pool import Answering, make_recipes, make_task, never_built
 
 from cluster.workers.pool import SerialPool
 from cluster.workers.ray_pool import RayPool
-from cluster.workers.worker import Task
-from gridsim.maps.map import Map
 
 pytestmark = [pytest.mark.e2e, pytest.mark.usefixtures("stand_ins")]
 
@@ -35,10 +32,10 @@ REFERENCE = ("gridsim-evolve", *SMALL)
 class Stopping(Answering):
     """Stops its own process where it is told to, in a parcel or while it is prepared: nobody hears of it again."""
 
-    def __init__(self, folder: Path, prepared: bool = True):
+    def __init__(self, folder: Path, prepared: bool):
         self._folder, self._prepared = folder, prepared
 
-    def evaluate(self, task: Task, maps: Sequence[Map], recipes: np.ndarray) -> Evaluated:
+    def evaluate(self, task, maps, recipes):
         if bool(len(recipes)) is self._prepared:
             with contextlib.suppress(FileNotFoundError):
                 (self._folder / "stop").rename(self._folder / f"stopped-{os.getpid()}")
@@ -46,41 +43,30 @@ class Stopping(Answering):
         return super().evaluate(task, maps, recipes)
 
 
-def test_what_a_stopped_worker_holds_is_done_by_the_others(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("workers", "prepared"), [(2, True), (1, False)], ids=["one of two", "an only one"])
+def test_what_a_stopped_worker_holds_is_done_by_others(tmp_path: Path, workers: int, prepared: bool) -> None:
     """As a host that is cut off: Ray says nothing. When patience is at its end the worker is replaced."""
     wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(512)).results.tobytes()
-    worker = functools.partial(Stopping, tmp_path)
-    with contextlib.closing(RayPool(2, never_built, worker_factory=worker)) as pool:
-        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and len(pool.pids()) == 2, 60)
-        pool._patience_s = 5.0
+    worker = functools.partial(Stopping, tmp_path, prepared)
+    with contextlib.closing(RayPool(workers, never_built, worker_factory=worker)) as pool:
+
+        def all_work() -> bool:
+            return pool.evaluate(make_task(), make_recipes(512)).done > 0 and len(pool.pids()) == workers
+
+        if prepared:
+            wait_until(all_work, 60)
+        pool._patience_s = 5.0 if prepared else 15.0
         (tmp_path / "stop").touch()
         outcome = pool.evaluate(make_task(), make_recipes(512))
         assert outcome.results.tobytes() == wanted
-        assert 1 <= outcome.retries <= 2
+        assert prepared <= outcome.retries <= 2 * prepared
         (said,) = outcome.warnings
-        assert re.fullmatch(r"a worker did not answer for [5-9] s \(--patience\) and is replaced", said)
+        assert re.fullmatch(r"a worker did not answer for \d+ s \(--patience\) and is replaced", said)
         pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
         assert pid not in pool.pids()
         pool._patience_s = 60.0
-        wait_until(lambda: pool.evaluate(make_task(), make_recipes(512)) and len(pool.pids()) == 2, 60)
+        wait_until(all_work, 60)
     wait_until(lambda: not psutil.pid_exists(pid), 30)
-
-
-def test_an_only_worker_that_stops_while_it_is_prepared_is_replaced(tmp_path: Path) -> None:
-    (tmp_path / "stop").touch()
-    worker = functools.partial(Stopping, tmp_path, prepared=False)
-    with contextlib.closing(RayPool(1, never_built, worker_factory=worker, patience_s=15.0)) as pool:
-        outcome = pool.evaluate(make_task(), make_recipes(8))
-        wanted = SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(8))
-        assert outcome.results.tobytes() == wanted.results.tobytes()
-        pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
-        assert pid not in pool.pids()
-    wait_until(lambda: not psutil.pid_exists(pid), 30)
-
-
-def below(node: subprocess.Popen, name: str) -> list[psutil.Process]:
-    """Processes of a host whose names begin so."""
-    return [p for p in psutil.Process(node.pid).children(recursive=True) if p.name().startswith(name)]
 
 
 @pytest.mark.usefixtures("database")
@@ -96,7 +82,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
         wait_until(lambda: rows(run) or process.poll() is not None, LONG_S)
         process.send_signal(signal.SIGSTOP)  # or it may be done before the second host is up
         _, second = cluster(1, address)
-        wait_until(lambda: below(second, "ray::Actor"), LONG_S)
+        wait_until(lambda: ray_workers(second.pid), LONG_S)
         done = len(rows(run))
         end(first)
         process.send_signal(signal.SIGCONT)
@@ -109,9 +95,8 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     assert answers(address), "the run left, the cluster stays"
     # The dead host's worker may first be reported as silent.
     said = [line for line in err.splitlines() if "a worker did not answer for" not in line]
-    assert said[0].startswith(
-        f"gridsim-evolve: error: there has been no worker for {PATIENCE_S} s (--patience): Ray has"
-    )
+    no_worker = f"gridsim-evolve: error: there has been no worker for {PATIENCE_S} s (--patience): Ray has"
+    assert said[0].startswith(no_worker)
     assert said[1:] == [f"continue with: {BIN}/gridsim-evolve --resume runs/h"]
     finish("gridsim-evolve", "--workers", "0", "--resume", "runs/h", cwd=tmp_path)
     assert same_run(run, reference)

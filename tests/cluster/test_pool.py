@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from driving import to_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -39,6 +38,7 @@ from gridsim.maps.scenarios import build
 from gridsim.traffic.world import FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
+GROUPS = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
 Evaluated = tuple[np.ndarray, np.ndarray, np.ndarray]  # what `Worker.evaluate` returns
 
 
@@ -49,11 +49,7 @@ class Answering(Worker):
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
         results["distance"] = recipes["seed"][:, None] * 16.0 + task.episodes["start"][:, 4]
         results["paced"] = task.parents[recipes["a"], 0][:, None]
-        results["steps"] = sum(m.seed for m in maps)
-        back = task.episodes["start"][task.episodes["rewind"] > 0]
-        rewound = np.repeat(back[None], len(recipes), axis=0)
-        worlds = np.repeat(task.worlds[task.episodes["rewind"] > 0][None], len(recipes), axis=0)
-        return results, rewound, worlds
+        return results, np.zeros(0), np.zeros(0)  # nothing is rewound
 
     def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
         """Episodes of key % 5 steps whose rows are all marked by their keys."""
@@ -93,13 +89,12 @@ def make_collect_task(n: int) -> CollectTask:
 
 def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:
     """A small real task on two maps, and the maps."""
-    scenarios = [build(*name) for name in MAPS]
-    rng = np.random.default_rng(1)
-    episodes, worlds = lane_starts(scenarios, np.arange(n) % 2, rng, 2)
+    maps, rng = [build(*name) for name in MAPS], np.random.default_rng(1)
+    episodes, worlds = lane_starts(maps, np.arange(n) % 2, rng, 2)
     weights = (rng.standard_normal(311) * 0.4).astype(np.float32)
     keys, epsilons = rng.integers(1 << 63, size=n, dtype=np.uint64), np.full(n, 0.2, dtype=np.float32)
     limits = Limits(150.0, 300)
-    return CollectTask("mlp:6,7", episodes, worlds, MAPS, limits, SimConfig(), weights, epsilons, keys), scenarios
+    return CollectTask("mlp:6,7", episodes, worlds, MAPS, limits, SimConfig(), weights, epsilons, keys), maps
 
 
 def make_recipes(n: int) -> np.ndarray:
@@ -119,9 +114,9 @@ def never_built(name: str, seed: int) -> Map:
 
 def drive_task() -> tuple[Task, list[Map]]:
     """A small real task on two maps, and the maps."""
-    scenarios = [build(*name) for name in MAPS]
-    episodes, _ = lane_starts(scenarios, np.array([0, 1, 1]), np.random.default_rng(1))
-    return make_task(MAPS, episodes), scenarios
+    maps = [build(*name) for name in MAPS]
+    episodes, _ = lane_starts(maps, np.array([0, 1, 1]), np.random.default_rng(1))
+    return make_task(MAPS, episodes), maps
 
 
 def goals(*metres: float) -> np.ndarray:
@@ -135,10 +130,8 @@ def goals(*metres: float) -> np.ndarray:
 def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[float], workers: int) -> None:
     """Also where some members drive some episodes and others drive others."""
     e = len(targets)
-    for asked in (
-        rectangle(n, e),
-        [Chunk(slice(n // 3, n), slice(e // 2, e)), Chunk(slice(0, n // 3), slice(0, e // 2))],
-    ):
+    two = [Chunk(slice(n // 3, n), slice(e // 2, e)), Chunk(slice(0, n // 3), slice(0, e // 2))]
+    for asked in (rectangle(n, e), two):
         wanted, seen = np.zeros((n, e), dtype=int), np.zeros((n, e), dtype=int)
         for part in asked:
             wanted[part] += 1
@@ -177,27 +170,18 @@ def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers(
 
 def test_a_parcel_holds_members_of_several_groups() -> None:
     """So that the number of parcels does not grow with the number of groups."""
-    groups = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]
     task = make_task(episodes=goals(*[400.0] * 16))
-    assert len(cut(task, groups, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
-    pool = SerialPool(never_built, Answering)
-    outcome = pool.evaluate(make_task(episodes=task.episodes), make_recipes(512), asked=groups)
-    assert np.array_equal(outcome.results["distance"].sum(axis=1), make_recipes(512)["seed"] * 32.0)
+    assert len(cut(task, GROUPS, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
 
 
-def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
-    """Of a large network, 1 ms a metre, before any of it is measured."""
-    task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
-    assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
-
-
-def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
-    progress: list[tuple[int, int]] = []
-    pool = SerialPool(never_built, Answering)
-    recipes = make_recipes(512)
-    outcome = pool.evaluate(make_task(), recipes, lambda done, of: progress.append((done, of)))
-    assert np.array_equal(outcome.results["distance"][:, 1], recipes["seed"] * 16.0 + 1)
+def test_what_is_asked_for_is_driven_and_nothing_else_and_progress_is_reported() -> None:
+    pool, recipes = SerialPool(never_built, Answering), make_recipes(512)
+    progress, wanted = [(0, 0)], np.zeros((512, 16))
+    for group in GROUPS:
+        wanted[group] = recipes["seed"][group.rows, None] * 16.0
+    task = make_task(episodes=goals(*[400.0] * 16))
+    outcome = pool.evaluate(task, recipes, lambda *done: progress.append(done), GROUPS)
+    assert np.array_equal(outcome.results["distance"], wanted)
     assert progress == sorted(progress)
     assert progress[-1] == (512, 512)
     assert len(progress) > 5
@@ -208,84 +192,41 @@ def test_results_are_in_the_recipes_order_and_progress_is_reported() -> None:
         pool.close()
 
 
-def test_only_what_is_asked_for_is_driven() -> None:
-    recipes, progress = make_recipes(20), [(0, 0)]
-    asked = [Chunk(slice(15, 20), slice(1, 2)), Chunk(slice(0, 10), slice(0, 1))]
-    pool = SerialPool(never_built, Answering)
-    outcome = pool.evaluate(make_task(), recipes, lambda *done: progress.append(done), asked)
-    wanted = np.zeros((20, 2))
-    wanted[15:, 1], wanted[:10, 0] = recipes["seed"][15:] * 16.0 + 1, recipes["seed"][:10] * 16.0
-    assert np.array_equal(outcome.results["distance"], wanted)
-    assert outcome.done == outcome.total
-    assert progress[-1] == (20, 20)
+def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
+    """Of a large network, 1 ms a metre, before any of it is measured."""
+    task = make_task(episodes=goals(100.0, 100.0))
+    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
+    assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
 
 
 def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
-    """By both calls, also where there is nothing else to do; and what it raises ends the call."""
-    pool = SerialPool(never_built, Answering)
-    for count in (0, 40):
-        for call in (
-            lambda of: pool.evaluate(make_task(), make_recipes(count), meanwhile=of),  # noqa: B023
-            lambda of: pool.collect(make_collect_task(count), meanwhile=of),  # noqa: B023
-        ):
-            left = [1, 2, 3, 4]
-            called = call(lambda: bool(left.pop() and left))  # noqa: B023
-            assert called.done == called.total
-            assert left == []
-    with pytest.raises(KeyboardInterrupt):
-        pool.collect(make_collect_task(9), meanwhile=interrupted)
+    """By both calls, also where there is nothing else to do."""
+    pool, left = SerialPool(never_built, Answering), list(range(8))
+    pool.evaluate(make_task(), make_recipes(0), meanwhile=lambda: left.pop() > 4)
+    assert left == [0, 1, 2, 3]
+    pool.collect(make_collect_task(40), meanwhile=lambda: bool(left.pop()))
+    assert left == []
 
 
-def interrupted() -> None:
-    raise KeyboardInterrupt
-
-
-def test_experience_from_any_worker_in_any_order_is_the_same() -> None:
-    task, maps = collect_drive_task(9)
-    whole = SerialPool(lambda *name: maps[name[1]]).collect(task)
-    collected = Collected(task)
-    for first, stop in ((5, 9), (0, 2), (2, 5)):
-        answer = Worker().answer(task, maps, make_recipes(0), first, stop)
-        collected.add(first, Chunk(slice(first, stop), slice(0, 1)), *answer)
-    assert collected.done == collected.total
-    assert to_bytes(collected.experience) == to_bytes(whole.experience)
-    assert collected.results.tobytes() == whole.results.tobytes()
-    assert set(collected.busy_s) == {0, 2, 5}
-
-
-def test_a_lost_member_has_no_results_not_even_those_that_were_there() -> None:
-    """A member whose first episode came back and whose second kills; and an episode of a batch."""
-    task, recipes = make_task(), make_recipes(3)
-    outcome = Outcome(task, recipes, rectangle(3, 2))
-    none, no_cars = np.zeros((2, 0, 5), dtype=np.float32), np.zeros((2, 0, 0, FIELDS), dtype=np.float32)
-    outcome.add(0, Chunk(slice(0, 2), slice(0, 2)), np.ones((2, 2), dtype=RESULT), none, no_cars, 0.1)
-    outcome.add(0, Chunk(slice(2, 3), slice(0, 1)), np.ones((1, 1), dtype=RESULT), none[:1], no_cars[:1], 0.1)
+def test_a_lost_member_has_no_results_and_experience_is_in_order() -> None:
+    """A member whose first episode came back and whose second kills; an episode of a batch whose end came first."""
+    outcome = Outcome(make_task(), make_recipes(3), rectangle(3, 2))
+    for rows, columns in ((slice(0, 2), slice(0, 2)), (slice(2, 3), slice(0, 1))):
+        outcome.add(0, Chunk(rows, columns), np.ones((), dtype=RESULT), np.zeros(0), np.zeros(0), 0.1)
     assert outcome.done < outcome.total
     outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
     assert outcome.done == outcome.total
     assert outcome.lost.tolist() == [False, False, True]
     assert (outcome.results["distance"] == [[1, 1], [1, 1], [0, 0]]).all()
 
-    task_of_10 = make_collect_task(10)
-    collected = Collected(task_of_10)
+    task = make_collect_task(10)
+    collected = Collected(task)
     for first, stop in ((4, 10), (0, 3)):
-        answer = Answering().answer(task_of_10, [], make_recipes(0), first, stop)
+        answer = Answering().answer(task, [], make_recipes(0), first, stop)
         collected.add(0, Chunk(slice(first, stop), slice(0, 1)), *answer)
     collected.lose(Chunk(slice(3, 4), slice(0, 1)))
     assert collected.done == collected.total
-    assert np.flatnonzero(collected.lost).tolist() == [3]
-    assert sorted(set(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
-
-
-def test_a_member_is_identified_by_its_recipe() -> None:
-    recipes = make_recipes(9)
-    recipes["kind"][8] = Kind.MIRRORED
-    outcome = Outcome(make_task(), recipes, [])
-    assert [outcome.identify(k) for k in (1, 7, 8)] == [
-        "member 1 (copy of rows 1 and 3, seed 0, key 0x3039)",
-        "member 7 (cross of rows 7 and 5, seed 7, key 0x3039)",
-        "member 8 (mirrored of rows 0 and 0, seed 8, key 0x3039)",
-    ]
+    assert list(dict.fromkeys(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 @pytest.mark.parametrize("what", ["members", "episodes"])
@@ -328,44 +269,38 @@ class Megabyte:
         return {"field": np.zeros(1 << 20, dtype=np.uint8)}
 
 
+def store() -> Shared:
+    """One of maps of a megabyte each, in which references are what they refer to."""
+    return Shared(lambda value: value, lambda *_: Megabyte())  # type: ignore[arg-type]
+
+
+def of(scenario: str, seeds: list[int]) -> Task:
+    return make_task(tuple((scenario, seed) for seed in seeds))
+
+
 def test_the_store_keeps_one_scenarios_maps_and_a_worker_gets_each_once() -> None:
-    built: list[int] = []
-
-    def build(_: str, seed: int) -> Megabyte:
-        built.append(seed)
-        return Megabyte()
-
-    shared = Shared(lambda value: value, build)  # type: ignore[arg-type]
-    known: set[tuple[str, int]] = set()
+    shared, known = store(), set[tuple[str, int]]()
     for scenario, seeds, new, gone in (
         ("seamless", [0, 1, 2], [0, 1, 2], []),
         ("seamless", [3, 1], [3], []),
         ("city", [3], [3], [0, 1, 2, 3]),
         ("seamless", [0], [0], [3]),  # it was forgotten
     ):
-        task = make_task(tuple((scenario, seed) for seed in seeds))
-        before = len(built)
-        sent = shared.put(task)
-        assert built[before:] == new
-        assert sent >> 20 == len(new)
+        assert shared.put(of(scenario, seeds)) >> 20 == len(new)
         lacking, forgotten, *refs = shared.update(known)
         assert [seed for _, seed in lacking] == new
         assert sorted(seed for _, seed in forgotten) == gone
         assert len(refs) == 1 + len(new)
     shared.put_maps([("seamless", 0), ("seamless", 7)])  # ahead of the task that needs them
-    assert built[-1] == 7
-    assert shared.put(make_task((("seamless", 7),))) >> 20 == 1
-    assert len(built) == before + 2
-    lacking, *_ = shared.update(known)
-    assert lacking == [("seamless", 7)]
+    assert shared.put(of("seamless", [7])) >> 20 == 1
+    assert shared.update(known)[0] == [("seamless", 7)]
 
 
 def test_the_store_forgets_the_maps_that_were_not_used_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cluster.workers.actor.MOST_MAPS", 4)
-    shared = Shared(lambda value: value, lambda *_: Megabyte())  # type: ignore[arg-type]
-    known: set[tuple[str, int]] = set()
+    shared, known = store(), set[tuple[str, int]]()
     for seeds, gone in (([0, 1, 2, 3], []), ([0, 4], [1]), ([0, 1, 2], [3]), ([5, 6, 7], [0, 1, 4])):
-        shared.put(make_task(tuple(("city", seed) for seed in seeds)))
+        shared.put(of("city", seeds))
         assert {seed for _, seed in shared.update(known)[1]} == set(gone)
 
 

@@ -5,6 +5,8 @@ import sys
 import threading
 from pathlib import Path
 
+from commands import wait_until
+
 from cluster.workers.tickets import Tickets, abandoned
 
 
@@ -39,15 +41,11 @@ def test_tickets_that_an_interrupted_call_left_are_void(tmp_path: Path) -> None:
 
 def test_a_queue_is_abandoned_once_all_that_had_it_open_are_gone(tmp_path: Path) -> None:
     path = tmp_path / "tickets"
-    code = (
-        f"from cluster.workers.tickets import Tickets; t = Tickets({str(path)!r}, new=True); print(flush=True); input()"
-    )
-    owner = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert owner.stdout is not None
-    owner.stdout.readline()
-    assert not abandoned(path)
-    owner.kill()
-    owner.communicate()
+    code = "import sys; from cluster.workers.tickets import Tickets; t = Tickets(sys.argv[1], new=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE) as owner:
+        wait_until(path.exists)
+        assert not abandoned(path)
+        owner.kill()
     assert abandoned(path)
     assert not abandoned(tmp_path / "no queue")
     reader = Tickets(str(path))

@@ -96,7 +96,6 @@ def test_addresses_become_absolute(tmp_path, monkeypatch, empty_database):
     ("uri", "reason"),
     [
         ("mlruns", "no runs in folders"),
-        ("./mlruns", "no runs in folders"),
         ("file:///tmp/mlruns", "no runs in folders"),
         ("sqlite://", "names no file"),
         ("sqlite:///:memory:", "names no file"),
@@ -104,11 +103,9 @@ def test_addresses_become_absolute(tmp_path, monkeypatch, empty_database):
         ("sqlite:///.", "is a folder"),
         ("sqlite:///text.db", "file is not a database"),
         ("ftp://host/x", "not a tracking address"),
-        ("http://", "no MLflow server"),
         ("http://no-such-host.invalid:5000", "no MLflow server"),
         ("postgresql://someone:secret@127.0.0.1:1/db", "Connection refused"),
         ("http://someone:secret@127.0.0.1:1", "Connection refused"),
-        ("https://127.0.0.1:1", "Connection refused"),
         ("http://127.0.0.1:99999", "no MLflow server"),
     ],
 )
@@ -140,24 +137,20 @@ def test_what_else_may_answer(silent, impatient):
         def log_message(self, *_):
             pass
 
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    uri = f"http://127.0.0.1:{server.server_port}"
     page = "/api/2.0/mlflow/experiments/search"
-    for answer, reason in (
-        ((404, b"<html>not here</html>"), "something else answers"),
-        ((200, b"<html>a page of somebody's own</html>"), "something else answers"),
-        ((502, b"bad gateway"), "error 502"),
-        ((403, b"Invalid Host header - possible DNS rebinding attack detected"), "refuses this host name"),
-    ):
-        pages[page] = answer
-        assert reason in refused(uri)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        uri = f"http://127.0.0.1:{server.server_port}"
+        for status, body, problem in (
+            (404, b"<html>not here</html>", "something else answers"),
+            (200, b"<html>a page of somebody's own</html>", "something else answers"),
+            (502, b"bad gateway", "error 502"),
+            (403, b"Invalid Host header - possible DNS rebinding attack detected", "refuses this host name"),
+        ):
+            pages = {page: (status, body)}
+            assert problem in refused(uri)
+        for path, status, body in (("", 401, b"You are not authenticated"), ("", 403, b""), ("/prefix", 200, b"{}")):
+            pages = {f"{path}{page}": (status, body)}
+            assert check_uri(f"{uri}{path}/") == f"{uri}{path}"
+        server.shutdown()
     assert "no answer in time" in refused(silent)
-    for answer in ((200, b'{"experiments": []}'), (401, b"You are not authenticated"), (403, b"")):
-        pages[page] = answer
-        assert check_uri(uri + "/") == uri
-    pages.clear()
-    pages[f"/prefix{page}"] = (200, b"{}")
-    assert check_uri(f"{uri}/prefix/") == f"{uri}/prefix"
-    server.shutdown()
-    server.server_close()

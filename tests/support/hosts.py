@@ -4,7 +4,6 @@ A host is a process in namespaces of its own (`unshare`). Its first process read
 end, however that is, it ends too, and the kernel removes the host's processes, mounts and network with it.
 """
 
-import importlib.util
 import os
 import pwd
 import shutil
@@ -18,14 +17,12 @@ from commands import command_line, descendants, wait_until
 
 HOME = Path(pwd.getpwuid(os.geteuid()).pw_dir)
 PROGRAMS = {
-    "unshare": "util-linux",
-    "nsenter": "util-linux",
-    "ip": "iproute2",
-    "sshd": "openssh-server",
-    "ssh": "openssh-client",
-    "ssh-keygen": "openssh-client",
-    "rsync": "rsync",
-    "uptime": "procps",  # `ray up` asks with it whether a host is there
+    "util-linux": ("unshare", "nsenter"),
+    "iproute2": ("ip", "ss"),
+    "openssh-server": ("sshd",),
+    "openssh-client": ("ssh", "ssh-keygen"),
+    "rsync": ("rsync",),
+    "procps": ("uptime",),  # `ray up` asks with it whether a host is there
 }
 UNSHARE = ["unshare", "--net", "--pid", "--fork", "--mount", "--mount-proc"]
 SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
@@ -58,8 +55,7 @@ def missing() -> str:
     """Why there can be no hosts here; empty where there can."""
     if os.geteuid() != 0:
         return "needs root, for network namespaces"
-    packages = sorted({package for program, package in PROGRAMS.items() if not shutil.which(program, path=SEARCH)})
-    if packages:
+    if packages := [name for name in PROGRAMS if not all(shutil.which(each, path=SEARCH) for each in PROGRAMS[name])]:
         return f"needs apt-get install {' '.join(packages)}"
     done = subprocess.run([*UNSHARE, "true"], capture_output=True)
     return "" if done.returncode == 0 else "needs leave to make namespaces (in Docker: --privileged)"
@@ -71,9 +67,7 @@ def package_folders() -> set[str]:
     code = f"import importlib.util as u; [print(*u.find_spec(n).submodule_search_locations) for n in {names}]"
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     installed = subprocess.run([sys.executable, "-c", code], cwd="/", env=environment, capture_output=True, text=True)
-    ours = [importlib.util.find_spec(name) for name in names]
-    here = {folder for spec in ours for folder in (spec and spec.submodule_search_locations) or ()}
-    return {*here, *installed.stdout.split()}
+    return {*(str(Path(__file__).parents[2] / name) for name in names), *installed.stdout.split()}
 
 
 class Command:
@@ -119,12 +113,10 @@ class Host:
             env=self.environment(),
         )
         assert self._process.stdout is not None
-        said = b""
-        while not said.endswith(b"ready\n"):
-            line = self._process.stdout.readline()
-            if not line:
-                raise RuntimeError(f"the host could not be set up: {said.decode()}")
-            said += line
+        said = [line := self._process.stdout.readline()]
+        while line not in (b"ready\n", b""):
+            said.append(line := self._process.stdout.readline())
+        assert line, f"the host could not be set up: {b''.join(said).decode()}"
         self.pid = descendants(self._process.pid)[0]
 
     @staticmethod
@@ -168,16 +160,11 @@ class Host:
         """Let in who has the key."""
         (self.home / ".ssh" / "authorized_keys").write_text(authorized)
         self.run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", HOME / ".ssh/host")
-        options = {
-            "HostKey": HOME / ".ssh/host",
-            "ListenAddress": self.address,
-            "PasswordAuthentication": "no",
-            "PermitRootLogin": "prohibit-password",
-            "PidFile": "none",
-            "StrictModes": "no",
-            "UsePAM": "no",
-        }
-        flags = [flag for name, value in options.items() for flag in ("-o", f"{name}={value}")]
+        options = (
+            f"HostKey={HOME}/.ssh/host ListenAddress={self.address} PasswordAuthentication=no "
+            "PermitRootLogin=prohibit-password PidFile=none StrictModes=no UsePAM=no"
+        )
+        flags = [flag for option in options.split() for flag in ("-o", option)]
         self.run(shutil.which("sshd", path=SEARCH), "-f", "/dev/null", "-E", "/tmp/sshd.log", *flags)
 
     def processes(self) -> list[str]:
@@ -205,5 +192,4 @@ def switch(folder: Path, keep: list[Path]) -> Host:
     host.run("ip", "link", "add", "switch", "type", "bridge")
     host.run("ip", "address", "add", "10.77.0.1/24", "dev", "switch")
     host.run("ip", "link", "set", "switch", "up")
-    host.address = "10.77.0.1"
     return host

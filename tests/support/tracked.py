@@ -14,7 +14,6 @@ from cluster.tracking import mlflow_run
 from cluster.tracking.address import server_problem
 from cluster.tracking.mlflow_run import Identity
 from cluster.tracking.tracker import Tracker
-from gridsim.car.ego import End
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
 PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}
@@ -83,23 +82,3 @@ def mlflow_server(folder, port):
     finally:
         os.killpg(server.pid, signal.SIGKILL)
         server.wait(10)
-
-
-def drive_both(champion, network, traffic):
-    """Drive one episode by a champion and by its torch model, which act alike: steps, how it ended, metres."""
-    import torch
-
-    def drive(act):
-        env = champion.make_env(traffic=traffic)
-        observation, _ = env.reset(seed=2_000_001)
-        actions, over = [], False
-        while not over:
-            actions.append(act(observation))
-            observation, _, terminated, truncated, info = env.step(actions[-1])
-            over = terminated or truncated
-        return actions, info
-
-    mine = drive(champion.act)
-    theirs = drive(lambda seen: int(network(torch.from_numpy(seen[None])).argmax()))
-    assert mine == theirs, (mine[1], theirs[1])
-    return len(mine[0]), End(mine[1]["end"]).name.lower(), mine[1]["distance_m"]
