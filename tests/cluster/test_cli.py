@@ -47,6 +47,9 @@ def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
     assert "Traceback" not in out + err
     assert "--resume runs/c" in err
     wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 30)
+    (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "c")
+    assert logged.status == "KILLED"
+    assert (logged.end_time - logged.start_time) / 1000.0 == pytest.approx(float(rows(run)[-1]["wall_s"]), abs=0.01)
     evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
     assert same_run(run, reference)
 

@@ -153,7 +153,10 @@ def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_
 
     short = tempfile.mkdtemp(prefix="gs-", dir="/tmp")  # the path of a socket in it must be short
     with running("gridsim-compare", *asked.split(), "--name", "c", *at_once, cwd=tmp_path, TMPDIR=short) as process:
-        wait_until(lambda: all((cell.path / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll(), 240)
+        wait_until(
+            lambda: all((cell.path / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None,
+            240,
+        )
         children = processes()
         os.killpg(process.pid, signal.SIGTERM)
         errors = process.communicate(timeout=120)[1]

@@ -142,3 +142,12 @@ def test_seeds_differ_and_repeat():
     assert not np.array_equal(one, other)
     first = one[: 33 * 5]
     assert 0.9 / math.sqrt(32) < np.abs(first).max() <= 1 / math.sqrt(32)
+
+
+def test_a_network_that_diverged_is_reported_and_left_as_it_was():
+    learner, batch = learner_of(), random_batch(0)
+    batch.rewards[3] = np.inf
+    before = learner.weights
+    with pytest.raises(FloatingPointError, match="diverged at update 0"):
+        learner.update(batch)
+    assert np.array_equal(learner.weights, before)

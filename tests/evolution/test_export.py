@@ -33,6 +33,12 @@ def test_the_module_acts_as_the_kernel_does(text, config):
     assert not any(p.requires_grad for p in module.parameters())
 
 
+@pytest.mark.parametrize("genome", [np.zeros(312, dtype=F), np.zeros(311), np.zeros((1, 311), dtype=F)])
+def test_another_genome_is_refused(genome):
+    with pytest.raises(ValueError, match=r"a genome of mlp:6,7 is float32 \[311\], not float"):
+        to_torch(PolicySpec.parse("mlp:6,7"), genome, SimConfig())
+
+
 def test_the_example_sees_nothing_at_standstill_and_at_10_mps():
     shown = example(PolicySpec.parse("mlp:3+motion+steering"), OTHER)
     assert shown == pytest.approx(np.array([[1.0] * 31 + [0.0] * 31 + [share, 0.0] for share in (0.0, 10.0 / 20.0)]))

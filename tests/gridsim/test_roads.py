@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import read, small_map
 
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, Strips, clearance_nodes
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, FIELD_UNITS, Strips, clearance_nodes
 
 SIDE = 64.0  # m, of the small maps
+CEILING = FIELD_FLOOR + 255 / FIELD_UNITS  # m, the greatest clearance a field can hold
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +63,12 @@ def test_sides_that_do_not_fit_are_refused():
     for width, height in ((96.0, 64.0), (64.0, 100.0), (0.0, 64.0)):
         with pytest.raises(ValueError, match="powers of two"):
             clearance_nodes(Strips.of(), width, height)
+
+
+def test_clearance_on_a_straight_edge_is_exact_to_rounding_and_saturates():
+    road_map, exact = small_map(lines=[[0, 30.3, 64, 30.3, 8.0]])
+    y = np.concatenate([np.linspace(37.0, 39.9, 200), [30.3, 2.0]])  # from 1.3 m inside to 1.6 m outside; far off
+    points = np.stack([np.linspace(0, 64, len(y)), y], axis=1)
+    expected = np.clip(exact.clearance(points), FIELD_FLOOR, CEILING)
+    assert read(road_map.road, points) == pytest.approx(expected, abs=0.5 / FIELD_UNITS + 2e-4)
+    assert expected[-2:].tolist() == [CEILING, FIELD_FLOOR]

@@ -17,7 +17,7 @@ from gridsim.config import CROSSING_GAP
 from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.generators import curved, highway, roundabout
-from gridsim.maps.lanes import Path, lay_lanes
+from gridsim.maps.lanes import Path, beside, lay_lanes
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, TRAINING_SEED, VALIDATION_SEED, build
@@ -306,3 +306,20 @@ def test_parked_cars_stand_beside_the_lanes():
 def test_a_lane_that_leads_nowhere_is_refused():
     with pytest.raises(ValueError, match="another begins"):
         lay_lanes([Path(0.0, 0.0, 0.0, ((10.0, 0.0),))], 64.0, 64.0)
+
+
+def test_beside_a_path_lengths_are_those_of_the_parallel_arcs():
+    (straight,), (left,) = (p.pieces for p in beside(Path(0, 0, 0, ((10.0, 0.0), (16.0, 1 / 8.0))), 2.0))
+    assert straight == (10.0, 0.0)
+    assert left == pytest.approx((16.0 * 6 / 8, 1 / 6))
+
+
+@pytest.mark.parametrize("name", sorted(REGISTRY))
+def test_boxes_are_as_large_as_their_lanes(name):
+    """What is nowhere near a lane's box is not looked for on the lane."""
+    network = build(name, HELD_OUT_SEED).network
+    for first, stop, (x, y, half_x, half_y) in zip(network.offsets, network.offsets[1:], network.boxes, strict=False):
+        points = network.points[first:stop].astype(float)
+        reach = np.abs(points - [x, y]).max(axis=0)
+        assert (reach <= [half_x, half_y]).all()
+        assert [half_x, half_y] == pytest.approx(reach, abs=2e-3)

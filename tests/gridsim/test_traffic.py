@@ -469,3 +469,9 @@ def test_traffic_alone_neither_crashes_nor_stops(scenario, seed, cars):
     # Each car is always on its lane.
     for lane, along in zip(history[::50, there, LANE].ravel(), history[::50, there, ALONG].ravel(), strict=True):
         assert 0.0 <= along < lane_length(network, int(lane))
+
+
+def test_the_ego_car_beside_the_lane_is_passed(ring):
+    history = watch(ring, cars_on(ring, (0, 400.0, 12.0, 1.0)), 20, ego(500.0, 32.0 + 2.6))
+    assert history[-1, 0, ALONG] == pytest.approx(640.0, abs=1.0)
+    assert history[:, 0, SPEED].min() > 11.9
