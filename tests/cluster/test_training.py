@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-import tracked
 from commands import rows
 
 from cluster.runs import checkpoint
@@ -260,13 +259,12 @@ def test_an_interrupt_between_history_and_tracker_loses_no_row(maps, stopped, mo
             monkeypatch.setattr(checkpoint, "write_atomic", write)
             raise KeyboardInterrupt
 
+    logged: list[int] = []
+    monkeypatch.setattr(resumed.tracker, "log_row", lambda step, *_: logged.append(step))
     monkeypatch.setattr(checkpoint, "write_atomic", interrupted)
     with pytest.raises(KeyboardInterrupt):
         resumed.learn()
-    assert resumed.tracker.close("KILLED") is None
-    (logged,) = tracked.runs(resumed.tracker.uri)
-    took_s = (logged.info.end_time - logged.info.start_time) / 1000
-    assert took_s == pytest.approx(float(rows(stopped)[2]["wall_s"]), abs=0.002)
+    assert logged == [0, 1, 2]
 
 
 def test_a_history_without_its_last_row_is_mended(maps, stopped):
