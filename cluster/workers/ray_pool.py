@@ -49,6 +49,7 @@ from cluster.workers.worker import AnyTask, CollectTask, Worker
 from evolution.episodes.rollout import Limits
 
 CONNECT_S = 60.0
+ENDING_S = 5.0  # for the last of Ray's processes to end
 PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
@@ -315,13 +316,13 @@ class RayPool(WorkerPool):
         self._thread.join(1.0)
         if self._tickets:
             self._tickets.close()
-            mark = Path(self._tickets.path)
+            mark, self._tickets = Path(self._tickets.path), None
             if self._named:
                 mark.unlink(missing_ok=True)
-            else:
-                _remove_session(mark)  # Ray itself never removes its logs
-            self._tickets = None
-            self._remove_abandoned()
+            ends = time.monotonic() + ENDING_S
+            while mark.exists() and not abandoned(mark) and time.monotonic() < ends:
+                time.sleep(0.01)  # its last processes might make the folder anew
+            _remove_abandoned(mark.parents[1])
 
     def _boot(self) -> None:
         """Bring up Ray and ask it for the workers; then wait, since Ray's processes die with this thread."""
@@ -333,7 +334,7 @@ class RayPool(WorkerPool):
             if self._leaving:
                 return
             if self.address is None:
-                self._begin(ray_session.start_own(self._asked, self._begin))
+                ray_session.start_own(self._asked, self._begin)
             else:
                 ray_session.join(self.address)
             self._connected = True
@@ -346,18 +347,12 @@ class RayPool(WorkerPool):
             self._booted.set()
         self._closed.wait()
 
-    def _begin(self, session: str) -> None:
-        """Mark the folder of our own Ray by the queue in it, before Ray starts: it may be killed at any moment."""
-        if self._session is None:
-            self._session = session
-            self._tickets = Tickets(f"{session}/tickets", new=True)
-            self._remove_abandoned()
-
-    def _remove_abandoned(self) -> None:
-        """Remove the Ray session folders that killed runs have left on this machine."""
-        for tickets in Path(self._session or "").parent.glob("session_*/tickets"):
-            if abandoned(tickets):
-                _remove_session(tickets)
+    def _begin(self, session: str) -> int:
+        """Make the queue in the folder of our own Ray. Its processes hold it open: the folder may go when they have."""
+        self._session = session
+        self._tickets = Tickets(f"{session}/tickets", new=True)
+        _remove_abandoned(Path(session).parent)
+        return self._tickets.fileno()
 
     def _wait_for_ray(self) -> None:
         if self._closed.is_set():
@@ -403,12 +398,13 @@ class RayPool(WorkerPool):
             slot.hello = None if preparing else slot.actor.prepare.remote(*self._update(slot))
 
 
-def _remove_session(tickets: Path) -> None:
-    """Remove a Ray session folder; the queue in it goes last, so that the next run goes on if this is cut short."""
-    with contextlib.suppress(OSError):  # another run removes it, too
-        for path in set(tickets.parent.iterdir()) - {tickets}:
-            if path.is_dir():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-    shutil.rmtree(tickets.parent, ignore_errors=True)
+def _remove_abandoned(folder: Path) -> None:
+    """Remove, in Ray's folder, what Rays that have ended or were killed have left: their logs, above all."""
+    for tickets in filter(abandoned, folder.glob("session_*/tickets")):
+        with contextlib.suppress(OSError):  # another run removes it, too
+            for path in set(tickets.parent.iterdir()) - {tickets}:
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
+        shutil.rmtree(tickets.parent, ignore_errors=True)  # the queue at the end: should this be cut short, it is found

@@ -65,10 +65,10 @@ def check_address(address: str) -> str:
     return address
 
 
-def start_own(workers: int, begun: Callable[[str], None]) -> str:
+def start_own(workers: int, begun: Callable[[str], int]) -> None:
     """Start Ray on this machine with one CPU for each worker.
 
-    Returns: its session folder, which `begun` gets before any of Ray's processes starts.
+    Args: `begun` gets Ray's session folder, and returns a file descriptor, which all of Ray's processes inherit.
     """
     import ray
 
@@ -78,7 +78,7 @@ def start_own(workers: int, begun: Callable[[str], None]) -> str:
         os.environ["RAY_AUTH_TOKEN"] = TOKEN
     _be_quiet()
     with _lean_head(begun):
-        context: Any = ray.init(
+        ray.init(
             address="local",  # whatever RAY_ADDRESS says
             num_cpus=workers,
             num_gpus=0,
@@ -87,7 +87,6 @@ def start_own(workers: int, begun: Callable[[str], None]) -> str:
             log_to_driver=False,
             logging_level=logging.CRITICAL,
         )
-    return context.address_info["session_dir"]
 
 
 def join(address: str) -> None:
@@ -174,12 +173,12 @@ def _be_quiet() -> None:
 
 
 @contextlib.contextmanager
-def _lean_head(begun: Callable[[str], None]) -> Iterator[None]:
+def _lean_head(begun: Callable[[str], int]) -> Iterator[None]:
     """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
 
-    `begun` gets its session folder before its processes start. They get groups of their own: a signal to our whole
-    group would end them half started, and `ray.init` would then wait for a minute. Ray has no settings for these, so
-    meanwhile this replaces private names, and sets variables for its processes.
+    `begun` gets its session folder before its processes start, and they inherit what it opens. They get groups of
+    their own: a signal to our whole group would end them half started, and `ray.init` would then wait for a minute. Ray
+    has no settings for these, so meanwhile this replaces private names, and sets variables for its processes.
     """
     with contextlib.ExitStack() as undo:
         for name in OWN_ENVIRONMENT.keys() - os.environ.keys():
@@ -189,11 +188,12 @@ def _lean_head(begun: Callable[[str], None]) -> Iterator[None]:
             node, parameter, services = _private("node").Node, _private("parameter"), _private("services")
             lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
             lean()
-            init_temp = node._init_temp
+            init_temp, popen = node._init_temp, services.ConsolePopen
+            inherited: list[int] = []
 
             def make_folder(self: Any, *arguments: Any) -> None:
                 init_temp(self, *arguments)
-                begun(self._session_dir)
+                inherited.append(begun(self._session_dir))
 
             replaced: list[tuple[Any, str, Any]] = [
                 (node, "_init_temp", make_folder),
@@ -201,7 +201,7 @@ def _lean_head(begun: Callable[[str], None]) -> Iterator[None]:
                 (parameter, "RayParams", lean),
             ]
             if sys.platform == "linux":  # elsewhere Ray ends its processes by our group
-                replaced.append((services, "ConsolePopen", partial(services.ConsolePopen, process_group=0)))
+                replaced.append((services, "ConsolePopen", partial(popen, process_group=0, pass_fds=inherited)))
             for owner, name, value in replaced:
                 undo.callback(setattr, owner, name, getattr(owner, name))
                 setattr(owner, name, value)

@@ -39,6 +39,10 @@ class Tickets:
                     return
                 yield index
 
+    def fileno(self) -> int:
+        """The pipe's file descriptor."""
+        return self._pipe
+
     def close(self) -> None:
         """Close this process's end; the pipe stays where it is."""
         os.close(self._pipe)
