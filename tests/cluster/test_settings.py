@@ -47,6 +47,11 @@ def test_a_file_that_does_not_fit_is_refused(change, said):
         from_dict(EvolveSettings, asdict(EvolveSettings()) | change)
 
 
+def test_training_is_a_little_faster_than_the_pace_that_is_asked_for():
+    curriculum = EvolveSettings(pace=8.0).curriculum()
+    assert curriculum.champion_pace == 8.0 < curriculum.pace
+
+
 def test_what_is_not_given_suits_the_observation():
     rays, grid = DqnSettings(), DqnSettings(observation="grid", batch=32)
     assert (rays.batch, rays.updates, rays.replay) == (256, 4.0, 1_000_000)

@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from unittest.mock import Mock, PropertyMock
 
 import pytest
-from commands import call
+from commands import call, rows
 from tracked import client, free_port, steps
 
 from cluster.commands.cli import evolve_main
@@ -60,6 +60,8 @@ def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raise
     assert read_config(run.path / "config.json")[0] == SETTINGS
     (found,) = client(uri).search_runs([client(uri).get_experiment_by_name("driving").experiment_id])
     assert found.info.status == status
+    took_s = (found.info.end_time - found.info.start_time) / 1000.0
+    assert took_s == pytest.approx(float(rows(run.path)[-1]["wall_s"]), abs=0.01)
     assert steps(uri, found.info.run_id, ["leader/success_rate"]) == [0, 1]
     assert open_run(run.path).tracking_key == found.data.tags["gridsim.key"]
 

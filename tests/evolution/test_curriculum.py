@@ -37,6 +37,12 @@ def test_a_leader_s_episodes_are_longer_and_rewound(curriculum):
     assert (curriculum.episodes(0).rows["rewind"] == 0).all()
 
 
+def test_a_training_episode_lasts_as_long_as_its_target_takes_at_the_pace_and_some_seconds(curriculum):
+    limits = curriculum.limits()
+    seconds = limits.target / CONFIG.pace + CONFIG.slack
+    assert limits.steps * curriculum.period == pytest.approx(seconds, abs=curriculum.period)
+
+
 def test_only_who_crashed_or_stood_still_on_the_way_is_remembered(curriculum):
     ends = [End.COLLISION, End.SUCCESS, End.TIME, End.IDLE, End.COLLISION, End.IDLE, End.SUCCESS, End.TIME]
     steps = [50, 50, 50, 50, 10, 11, 50, 50]  # the fifth crashed at its start

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,11 +17,13 @@ from commands import finish, refused, running, wait_until
 from pictures import record_drive
 
 from cluster.commands.watch import drive_main
+from gridsim.car.ego import X, Y
 from gridsim.car.vehicle import Action
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.view.drive import COLUMNS, action_for, read_drive, replay
+from gridsim.traffic.world import LANE
+from gridsim.view.drive import COLUMNS, Recorder, action_for, drive, read_drive, replay
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +73,22 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
     again, *_ = replay(drive, build(drive.scenario, drive.map_seed))
     assert again.tobytes() == poses.tobytes()
     assert np.ptp(again[:, 0]) > 1.0
+
+
+def test_a_drive_that_is_begun_anew_in_traffic_replays_among_the_same_cars(scenario, tmp_path):
+    pressed, shown = iter([set()] * 5 + [{"r"}] + [set()] * 5 + [{"q"}]), []
+    window = SimpleNamespace(closed=False, keys=lambda: (next(pressed), {"up"}), show=lambda *_: None)
+    renderer = SimpleNamespace(draw=lambda car, boxes, **_: shown.append(boxes))
+    start = sample_starts(scenario, 1, np.random.default_rng(0))[0]
+    with contextlib.closing(Recorder(tmp_path / "drive.csv", scenario, traffic=6)) as recorder:
+        drive(scenario, start, window, renderer, recorder, traffic=6)
+    recorded = read_drive(tmp_path / "drive.csv")
+    assert recorded.episodes.tolist() == [0] * 5 + [1] * 6
+    *_, worlds = replay(recorded, scenario)
+    after = shown[len(shown) // len(recorded) - 1 :: len(shown) // len(recorded)]  # the last picture of each step
+    for k in (0, 3, 5, 9):
+        assert after[k][:, [X, Y]] == pytest.approx(worlds[k + 1][worlds[k + 1][:, LANE] >= 0][:, [X, Y]], abs=1e-3)
+    assert np.abs(worlds[0] - worlds[5]).max() > 1.0, "other cars than at first"
 
 
 DAMAGES = {

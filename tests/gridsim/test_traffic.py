@@ -22,7 +22,19 @@ from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.sensing.boxes import boxes_touch, hits_box
 from gridsim.traffic.behaviour import drivers, flow, idm
-from gridsim.traffic.world import ALONG, DRAWS, FIELDS, LANE, LANE_TIMER, NEXT, PERMIT, SECOND_NEXT, SPEED_FACTOR, spawn
+from gridsim.traffic.world import (
+    ALONG,
+    DRAWS,
+    FIELDS,
+    LANE,
+    LANE_TIMER,
+    NEXT,
+    PERMIT,
+    SECOND_NEXT,
+    SEED,
+    SPEED_FACTOR,
+    spawn,
+)
 
 F = np.float32
 CONFIG = SimConfig()
@@ -128,6 +140,14 @@ def test_spawned_cars_keep_their_distance(scenario):
         assert np.hypot(*road_map.shortest(here - start[:2]).T).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
         for k in range(1, len(here)):
             assert np.hypot(*road_map.shortest(here[:k] - here[k]).T).min() >= CONFIG.traffic.spawn_gap - 1e-3
+
+
+def test_cars_of_other_episodes_and_of_one_turn_elsewhere():
+    road_map = build("city", 2)
+    starts, keys = np.tile(FAR, (8, 1)), np.arange(8, dtype=np.uint64)
+    worlds = spawn(road_map.network, starts, 6, keys, CONFIG)
+    assert len(np.unique(worlds[..., SEED])) == worlds[..., SEED].size
+    assert spawn(road_map.network, starts, 6, keys, CONFIG).tobytes() == worlds.tobytes()
 
 
 def test_no_car_keeps_further_right_than_there_is_room():
