@@ -137,6 +137,16 @@ def expected(n: int) -> bytes:
     return SerialPool(never_built, Answering).evaluate(make_task(), make_recipes(n)).results.tobytes()
 
 
+def test_a_worker_that_had_nothing_to_do_for_longer_than_patience_is_kept(
+    pool: RayPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pool, "_patience_s", 1.0)
+    pids = pool.pids()
+    time.sleep(1.5)
+    assert pool.evaluate(make_task(), make_recipes(512)).warnings == []
+    assert pool.pids() == pids
+
+
 def test_results_progress_and_what_is_sent(pool: RayPool, way: str) -> None:
     progress: list[tuple[int, int]] = []
     outcome = pool.evaluate(make_task(), make_recipes(512), lambda *done: progress.append(done))
