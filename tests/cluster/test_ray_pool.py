@@ -138,9 +138,10 @@ def expected(n: int) -> bytes:
 
 
 def test_a_worker_that_had_nothing_to_do_for_longer_than_patience_is_kept(
-    pool: RayPool, monkeypatch: pytest.MonkeyPatch
+    pool: RayPool, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pool, "_patience_s", 1.0)
+    (folder / "sleep-5").write_text("0.5")
     pids = pool.pids()
     time.sleep(1.5)
     assert pool.evaluate(make_task(), make_recipes(512)).warnings == []
