@@ -199,7 +199,9 @@ class RayPool(WorkerPool):
             if self.pids():
                 alone_since = time.monotonic()
             elif time.monotonic() - alone_since > self._patience_s:
-                why = ray_session.capacity() + self._last_failure
+                why = ray_session.capacity()
+                if self._last_failure:
+                    why += f"; the last one: {self._last_failure}{self._logs}"
                 raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
         return meanwhile
 
@@ -390,7 +392,7 @@ class RayPool(WorkerPool):
             if blamed:
                 if ray_session.failed_as_it_began(error) and not self.pids():
                     raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
-                self._last_failure = f"; the last one: {reason}{self._logs}"
+                self._last_failure = reason
             self._replace(slot)
         else:
             self._last_failure = ""
