@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,9 +77,10 @@ def test_recorded_drive_replays_to_the_same_poses(scenario, recorded):
 
 
 def test_a_drive_that_is_begun_anew_in_traffic_replays_among_the_same_cars(scenario, tmp_path):
-    pressed, shown = iter([set()] * 5 + [{"r"}] + [set()] * 5 + [{"q"}]), []
-    window = SimpleNamespace(closed=False, keys=lambda: (next(pressed), {"up"}), show=lambda *_: None)
-    renderer = SimpleNamespace(draw=lambda car, boxes, **_: shown.append(boxes))
+    shown: list[np.ndarray] = []
+    pressed = iter([*[set()] * 5, {"r"}, *[set()] * 5, {"q"}])
+    window: Any = SimpleNamespace(closed=False, keys=lambda: (next(pressed), {"up"}), show=lambda *_: None)
+    renderer: Any = SimpleNamespace(draw=lambda car, boxes, **_: shown.append(boxes))
     start = sample_starts(scenario, 1, np.random.default_rng(0))[0]
     with contextlib.closing(Recorder(tmp_path / "drive.csv", scenario, traffic=6)) as recorder:
         drive(scenario, start, window, renderer, recorder, traffic=6)
