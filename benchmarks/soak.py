@@ -96,8 +96,10 @@ def soak(generations: int, workers: int, policy: str = "") -> dict[str, list[flo
         def timed() -> None:
             begun = time.perf_counter()
             save()
-            seen["save"].append(time.perf_counter() - begun)
-            seen["checkpoint"].append((this.run.path / "checkpoint.npz").stat().st_size)
+            seconds, checkpoint = time.perf_counter() - begun, this.run.path / "checkpoint.npz"
+            if checkpoint.exists():  # before the first generation there is nothing to save
+                seen["save"].append(seconds)
+                seen["checkpoint"].append(checkpoint.stat().st_size)
 
         this.learning.save_every_s = 0.0  # type: ignore[misc]
         this.save = timed  # type: ignore[method-assign]

@@ -242,7 +242,8 @@ class Session:
                 self.report_outage()
             self.save()
         except BaseException:
-            self.save()
+            with undisturbed():
+                self.save()
             raise
 
     def report_outage(self) -> None:

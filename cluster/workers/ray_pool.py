@@ -303,8 +303,6 @@ class RayPool(WorkerPool):
         return bool(lost)
 
     def close(self) -> None:
-        if self._closed.is_set():
-            return
         self._leaving = True
         self._booted.wait(CONNECT_S)  # Ray cannot be stopped while it starts
         if self._connected:
@@ -313,6 +311,7 @@ class RayPool(WorkerPool):
             for slot in self._slots:
                 ray.kill(slot.actor)
             ray_session.leave()
+            self._connected = False
         self._slots = []
         self._closed.set()
         self._thread.join(1.0)
@@ -350,7 +349,7 @@ class RayPool(WorkerPool):
         self._closed.wait()
 
     def _begin(self, session: str) -> int:
-        """Make the queue in the folder of our own Ray. Its processes hold it open: the folder may go when they have."""
+        """Make the queue in our own Ray's folder, which is removed once no process of Ray's holds that open."""
         self._session = session
         self._tickets = Tickets(f"{session}/tickets", new=True)
         _remove_abandoned(Path(session).parent)
@@ -365,7 +364,7 @@ class RayPool(WorkerPool):
             raise self._failure
         if self._failure:
             where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
-            raise PoolError(f"{where}: {ray_session.reason(self._failure)}") from self._failure
+            raise PoolError(f"{where}: {ray_session.reason(self._failure)}{self._logs}") from self._failure
 
     def _start(self, number: int) -> _Slot:
         actor: Any = self._actor_class.remote(self._factory)
@@ -403,6 +402,8 @@ class RayPool(WorkerPool):
 def _remove_abandoned(folder: Path) -> None:
     """Remove, in Ray's folder, what Rays that have ended or were killed have left: their logs, above all."""
     for tickets in filter(abandoned, folder.glob("session_*/tickets")):
+        if tickets.parent.is_symlink():  # session_latest, which another Ray may have replaced by now
+            continue
         with contextlib.suppress(OSError):  # another run removes it, too
             for path in set(tickets.parent.iterdir()) - {tickets}:
                 if path.is_dir():

@@ -200,8 +200,9 @@ def _lean_head(begun: Callable[[str], int]) -> Iterator[None]:
                 (node, "start_api_server", _no_api_server),
                 (parameter, "RayParams", lean),
             ]
-            if sys.platform == "linux":  # elsewhere Ray ends its processes by our group
-                replaced.append((services, "ConsolePopen", partial(popen, process_group=0, pass_fds=inherited)))
+            # Elsewhere Ray ends its processes by our group.
+            group: dict[str, Any] = {"process_group": 0} if sys.platform == "linux" else {}
+            replaced.append((services, "ConsolePopen", partial(popen, pass_fds=inherited, **group)))
             for owner, name, value in replaced:
                 undo.callback(setattr, owner, name, getattr(owner, name))
                 setattr(owner, name, value)
