@@ -155,18 +155,8 @@ class Campaign:
         self.cluster = Cluster(folder / "nodes", dict(os.environ)) if clustered else None
 
     def _start_server(self, port: int) -> subprocess.Popen:
-        command = [
-            sys.executable,
-            "-m",
-            "mlflow",
-            "server",
-            "--workers",
-            "1",
-            "--host",
-            "127.0.0.1",
-            "--port",
-            str(port),
-        ]
+        command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1"]
+        command += ["--port", str(port)]
         command += ["--backend-store-uri", f"sqlite:///{self.folder}/served.db"]
         command += ["--artifacts-destination", f"{self.folder}/served"]
         environment = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"}
@@ -502,7 +492,7 @@ def main() -> int:
         print(f"{wrong}\nits files: {folder}", file=sys.stderr)
         return 1
     shutil.rmtree(folder, ignore_errors=True)
-    # Of a thousand faults one or two leave a folder with logs, which counts as a figure, not as a failure.
+    # One or two of a thousand faults leave a folder of Ray's: it is printed, and no failure yet.
     return 1 if left["processes_left"] or left["shared_memory_left"] else 0
 
 

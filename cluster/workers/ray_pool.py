@@ -322,7 +322,7 @@ class RayPool(WorkerPool):
                 mark.unlink(missing_ok=True)
             ends = time.monotonic() + ENDING_S
             while mark.exists() and not abandoned(mark) and time.monotonic() < ends:
-                time.sleep(0.01)  # its last processes might make the folder anew
+                time.sleep(0.01)  # Ray's last processes would create the folder again
             _remove_abandoned(mark.parents[1])
 
     def _boot(self) -> None:
@@ -349,7 +349,7 @@ class RayPool(WorkerPool):
         self._closed.wait()
 
     def _begin(self, session: str) -> int:
-        """Make the queue in our own Ray's folder, which is removed once no process of Ray's holds that open."""
+        """Make the queue in Ray's session folder. Ray's processes keep it open, to show that it is in use."""
         self._session = session
         self._tickets = Tickets(f"{session}/tickets", new=True)
         _remove_abandoned(Path(session).parent)
@@ -400,7 +400,7 @@ class RayPool(WorkerPool):
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove, in Ray's folder, what Rays that have ended or were killed have left: their logs, above all."""
+    """Remove from Ray's folder, such as /tmp/ray, the session folders that no process uses any more."""
     for tickets in filter(abandoned, folder.glob("session_*/tickets")):
         if tickets.parent.is_symlink():  # session_latest, which another Ray may have replaced by now
             continue
@@ -410,4 +410,4 @@ def _remove_abandoned(folder: Path) -> None:
                     shutil.rmtree(path, ignore_errors=True)
                 else:
                     path.unlink(missing_ok=True)
-        shutil.rmtree(tickets.parent, ignore_errors=True)  # the queue at the end: should this be cut short, it is found
+        shutil.rmtree(tickets.parent, ignore_errors=True)  # the queue last: the next run goes on if this is cut short
