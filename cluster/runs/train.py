@@ -30,7 +30,7 @@ from cluster.runs.run import ELITES, HISTORY, PAGE, SUMMARY, RunError, RunFolder
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
 from cluster.tracking.address import TrackingError, check_uri, shown, with_password
-from cluster.tracking.mlflow_run import Identity, Status
+from cluster.tracking.mlflow_run import Identity, Status, quiet
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
 from cluster.training.trainer import Learning, Maps, State, held_out_episodes
@@ -120,6 +120,7 @@ def train(
     settings = run.settings
     status: Status = "KILLED"
     session: Session | None = None
+    quiet()
     maps = Maps(settings.scenario, SimConfig())
     warming = kernels.Warming(settings)
     try:

@@ -67,9 +67,13 @@ _LOGGERS = ("mlflow", "alembic", "sqlalchemy", "urllib3", "torch")
 
 
 def quiet() -> None:
-    """Keep MLflow from writing to the terminal: its errors reach the caller. What the user has set stays."""
+    """Keep MLflow from writing to the terminal: its errors reach the caller. What the user has set stays.
+
+    To be called before there are threads, as `ray_session.prepare`.
+    """
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{tempfile.gettempdir()}/torchinductor_{os.getuid()}")  # as torch
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         if not logger.handlers:

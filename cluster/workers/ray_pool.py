@@ -105,7 +105,7 @@ class RayPool(WorkerPool):
     ):  # fmt: skip
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
-        os.environ.update(ray_session.ENVIRONMENT | os.environ)
+        ray_session.prepare(own=address is None)
         self.address = None if address is None else ray_session.check_address(address)
         self._asked = workers
         self._build_map = build_map
@@ -129,7 +129,7 @@ class RayPool(WorkerPool):
 
     @property
     def _logs(self) -> str:
-        """Where the logs are, in words. Logs that a message names are kept."""
+        """Where the logs are, in words, for an error that is raised now. Logs that an error names are kept."""
         self._named = self._session is not None
         return f" (logs: {self._session}/logs)" if self._named else ""
 
@@ -312,6 +312,7 @@ class RayPool(WorkerPool):
                 ray.kill(slot.actor)
             ray_session.leave()
             self._connected = False
+        ray_session.restore()
         self._slots = []
         self._closed.set()
         self._thread.join(1.0)

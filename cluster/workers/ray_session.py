@@ -24,14 +24,16 @@ import gridsim
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_address import AUTH_ENVIRONMENT, has_token, probe
 
-# Read when Ray is imported and when it connects.
+# Read when Ray is imported and when it connects; it sets the last two itself.
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
     "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",  # no C++ stack trace on the terminal at SIGTERM
     "RAY_OVERRIDE_JOB_RUNTIME_ENV": "1",  # a job that was submitted with files of its own keeps them beside ours
+    "RAY_CLIENT_MODE": "0",
+    "PYTHONBREAKPOINT": "ray.util.rpdb._driver_set_trace",
 }
-# Read by the processes of a Ray of our own.
+# Read by the processes of a Ray of our own, besides the token.
 OWN_ENVIRONMENT = {
     "RAY_raylet_client_connect_timeout_milliseconds": "20",  # it first just misses its object store, then sleeps 1 s
     "RAY_raylet_client_num_connect_attempts": "500",
@@ -39,7 +41,9 @@ OWN_ENVIRONMENT = {
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
 }
-TOKEN = secrets.token_hex(32)
+# Ray listens on all interfaces and lets in whoever has its token. Ours must not outlive the run in ~/.ray, where it
+# would change what `ray start` does from then on.
+OWN_TOKEN = {"RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_AUTH_MODE": "token"}
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses /tmp
 PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
 ELSEWHERE = ("ActorUnavailableError", "NodeDiedError", "ObjectLostError", "OwnerDiedError", "ObjectFetchTimedOutError")
@@ -65,6 +69,32 @@ def check_address(address: str) -> str:
     return address
 
 
+def prepare(own: bool) -> None:
+    """Set Ray's variables for a Ray of our `own` or a cluster; to be called before there are threads.
+
+    A new variable may move the environment, and a thread that reads it at this moment, in C, crashes the process.
+    """
+    new = ENVIRONMENT
+    if own:
+        new = new | OWN_ENVIRONMENT | ({} if any(name in os.environ for name in AUTH_ENVIRONMENT) else OWN_TOKEN)
+    for name, value in new.items():
+        os.environ.setdefault(name, value)
+
+
+def restore() -> None:
+    """Remove our Ray's variables: with our token, a cluster that is joined next could not call us."""
+    ours = [name for name, value in (OWN_ENVIRONMENT | OWN_TOKEN).items() if os.environ.get(name) == value]
+    if "RAY_AUTH_TOKEN" not in ours:
+        ours = [name for name in ours if name not in OWN_TOKEN]  # the mode is the user's
+    for name in ours:
+        del os.environ[name]
+    if "RAY_AUTH_TOKEN" in ours and "ray" in sys.modules:
+        with contextlib.suppress(ImportError, AttributeError):
+            raylet = importlib.import_module("ray._raylet")
+            raylet.Config.initialize("")
+            raylet.AuthenticationTokenLoader.instance().reset_cache()
+
+
 def start_own(workers: int, begun: Callable[[str], int]) -> None:
     """Start Ray on this machine with one CPU for each worker.
 
@@ -72,10 +102,6 @@ def start_own(workers: int, begun: Callable[[str], int]) -> None:
     """
     import ray
 
-    if not any(name in os.environ for name in AUTH_ENVIRONMENT):
-        # Ray listens on all interfaces and lets in whoever has its token. Ours must not outlive the run in ~/.ray,
-        # where it would change what `ray start` does from then on.
-        os.environ["RAY_AUTH_TOKEN"] = TOKEN
     _be_quiet()
     with _lean_head(begun):
         ray.init(
@@ -113,7 +139,7 @@ def runtime_env() -> dict[str, Any]:
 
 
 def leave() -> None:
-    """Leave Ray, and restore the environment: with our token, a cluster that is joined next could not call us."""
+    """Leave Ray."""
     import ray
 
     collecting = gc.isenabled()
@@ -123,13 +149,6 @@ def leave() -> None:
     finally:
         if collecting:
             gc.enable()
-    if os.environ.get("RAY_AUTH_TOKEN") == TOKEN:
-        del os.environ["RAY_AUTH_TOKEN"]
-        os.environ.pop("RAY_AUTH_MODE", None)  # set by Ray
-        with contextlib.suppress(ImportError, AttributeError):
-            raylet = importlib.import_module("ray._raylet")
-            raylet.Config.initialize("")
-            raylet.AuthenticationTokenLoader.instance().reset_cache()
 
 
 def capacity() -> str:
@@ -178,12 +197,9 @@ def _lean_head(begun: Callable[[str], int]) -> Iterator[None]:
 
     `begun` gets its session folder before its processes start, and they inherit what it opens. They get groups of
     their own: a signal to our whole group would end them half started, and `ray.init` would then wait for a minute. Ray
-    has no settings for these, so meanwhile this replaces private names, and sets variables for its processes.
+    has no settings for these, so meanwhile this replaces private names.
     """
     with contextlib.ExitStack() as undo:
-        for name in OWN_ENVIRONMENT.keys() - os.environ.keys():
-            os.environ[name] = OWN_ENVIRONMENT[name]
-            undo.callback(os.environ.pop, name)
         with contextlib.suppress(ImportError, AttributeError, TypeError):  # a version of Ray without these names
             node, parameter, services = _private("node").Node, _private("parameter"), _private("services")
             lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)

@@ -100,3 +100,29 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
     assert said[1:] == [f"continue with: {BIN}/gridsim-evolve --resume runs/h"]
     finish("gridsim-evolve", "--workers", "0", "--resume", "runs/h", cwd=tmp_path)
     assert same_run(run, reference)
+
+
+AUDIT = """
+import os, sys, threading
+known = set(os.environ)
+
+def hook(event, arguments):
+    if event == "os.unsetenv":
+        known.discard(os.fsdecode(arguments[0]))
+    elif event == "os.putenv" and (name := os.fsdecode(arguments[0])) not in known:
+        known.add(name)
+        if threading.active_count() > 1 and "gridsim-" in " ".join(sys.argv):
+            print("LATE", name, file=sys.stderr)
+
+sys.addaudithook(hook)
+"""
+
+
+@pytest.mark.parametrize("program", ["gridsim-evolve", "gridsim-dqn"])
+def test_no_variable_is_added_while_threads_may_read_the_environment(tmp_path: Path, program: str) -> None:
+    """One of 613 faults met the C library's `getenv` in the environment that had just moved, and the process ended."""
+    (tmp_path / "sitecustomize.py").write_text(AUDIT)
+    short = ["--scenario", "curved", "--workers", "2"]
+    short += ["--generations", "2"] if program == "gridsim-evolve" else ["--car-steps", "2000"]
+    done = finish(program, *short, cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    assert [line for line in done.stderr.splitlines() if "LATE" in line] == []
