@@ -78,7 +78,7 @@ class Actor:
         self, names: Sequence[Name] = (), gone: Sequence[Name] = (), shared: bytes | None = None, *maps: Any
     ) -> None:
         if shared is not None:
-            self._maps |= {name: Map.from_arrays(arrays) for name, arrays in zip(names, maps, strict=True)}
+            self._maps |= dict(zip(names, maps, strict=True))
             for name in gone:
                 self._maps.pop(name, None)
             self._task = pickle.loads(shared)
@@ -111,9 +111,9 @@ class Shared:
             if name in self._maps:
                 self._maps[name] = self._maps.pop(name)
             else:
-                arrays = self._build_map(*name).arrays()
-                self._maps[name] = self._put(arrays)
-                self._sent += sum(array.nbytes for array in arrays.values())
+                road_map = self._build_map(*name)
+                self._maps[name] = self._put(road_map)
+                self._sent += road_map.nbytes
 
     def update(self, known: set[Name]) -> list[Any]:
         """What an actor with the maps `known` needs to take up the task; `known` is updated to what it then has.

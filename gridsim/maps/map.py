@@ -46,33 +46,25 @@ class Map:
         length[self.network.offsets[1:-1] - 1] = 0.0  # between lanes there is no road
         return freeze(np.concatenate([[0.0], np.cumsum(length)]))
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The map as plain arrays, which processes can share without copying."""
-        own = {"name": self.name, "seed": self.seed, "torus": self.torus, "starts": self.starts}
-        parts = (own, self.strips._asdict(), self.road._asdict(), self.network._asdict())
-        return {name: np.asarray(value) for part in parts for name, value in part.items()}
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its arrays."""
+        return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts))
 
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray]) -> Map:
-        """The inverse of `arrays`. The arrays are not copied; the map has read-only views of them."""
-        values: dict[str, Any] = {name: freeze(array) if array.ndim else array[()] for name, array in arrays.items()}
-        return cls(
-            name=str(values["name"]),
-            seed=int(values["seed"]),
-            road=Road(**{name: values[name] for name in Road._fields}),
-            strips=Strips(**{name: values[name] for name in Strips._fields}),
-            network=Network(**{name: values[name] for name in Network._fields}),
-            torus=bool(values["torus"]),
-            starts=values["starts"],
-        )
-
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickle with read-only arrays: for writable ones, Numba would compile the kernels again."""
-        return Map.from_arrays, (self.arrays(),)
+        vars(self).update({name: _frozen(part) for name, part in state.items()})
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Map:
         """Copies share the map, because it cannot be changed."""
         return self
+
+
+def _frozen(part: Any) -> Any:
+    """A part of a map, its arrays read-only; they are not copied."""
+    if isinstance(part, tuple):
+        return type(part)(*map(_frozen, part))
+    return freeze(part) if isinstance(part, np.ndarray) else part
 
 
 def without_lanes(

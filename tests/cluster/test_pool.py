@@ -265,8 +265,7 @@ def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
 
 
 class Megabyte:
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {"field": np.zeros(1 << 20, dtype=np.uint8)}
+    nbytes = 1 << 20
 
 
 def store() -> Shared:
@@ -316,7 +315,7 @@ def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_
     def run(rows: slice, *update: Any) -> np.ndarray:
         return pickle.loads(actor.run([(recipes[rows].tobytes(), 0, len(task.episodes))], *update))[0][0]
 
-    first = run(slice(0, 8), MAPS, (), pickle.dumps(task, protocol=5), *(each.arrays() for each in maps))
+    first = run(slice(0, 8), MAPS, (), pickle.dumps(task, protocol=5), *pickle.loads(pickle.dumps(maps)))
     assert np.concatenate([first, run(slice(8, 20))]).tobytes() == wanted.tobytes()
     assert run(slice(0, 20), (), (), pickle.dumps(task)).tobytes() == wanted.tobytes()
     assert [len(kernel.signatures) for kernel in (_breed, _rollout)] == compiled, "nor for read-only arrays once more"

@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.generators import curved, highway, roundabout
 from gridsim.maps.lanes import Path, beside, lay_lanes
-from gridsim.maps.map import Map, sample_starts
+from gridsim.maps.map import sample_starts
 from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, TRAINING_SEED, VALIDATION_SEED, build
 
@@ -48,6 +49,10 @@ def laid(name):
 @pytest.fixture(scope="module")
 def built(name, maps):
     return maps[name]
+
+
+def parts(scenario):
+    return scenario.road, scenario.strips, scenario.network
 
 
 def wrapped(away, sides):
@@ -185,21 +190,21 @@ def test_starts_are_at_rest_all_over_the_road_and_not_in_a_wall(built):
         assert tiles >= 0.85 * roads  # points lie on the sides of tiles, too
 
 
-def test_a_map_is_small_and_survives_as_arrays(built):
+def test_a_map_is_small_and_survives_pickling(built):
     for scenario in built:
-        arrays = scenario.arrays()
-        assert sum(array.nbytes for array in arrays.values()) <= MEMORY
-        again = Map.from_arrays({key: value.copy() for key, value in arrays.items()})
+        assert scenario.nbytes <= MEMORY
+        again = pickle.loads(pickle.dumps(scenario))
         assert (again.name, again.seed, again.torus) == (scenario.name, scenario.seed, True)
         for mine, other in ((scenario.road, again.road), (scenario.network, again.network)):
             assert [type(part) for part in mine] == [type(part) for part in other]
-        np.testing.assert_equal(again.arrays(), arrays)
+            assert not any(part.flags.writeable for part in other)
+        np.testing.assert_equal(parts(again), parts(scenario))
 
 
 def test_the_same_seed_is_the_same_map_and_another_is_another(name, built):
-    again = build(name, built[0].seed).arrays()
-    np.testing.assert_equal(again, built[0].arrays())
-    assert again["field"].tobytes() != built[1].arrays()["field"].tobytes()
+    again = build(name, built[0].seed)
+    np.testing.assert_equal(parts(again), parts(built[0]))
+    assert again.road.field.tobytes() != built[1].road.field.tobytes()
 
 
 def test_no_road_can_be_driven_without_steering(name):
@@ -241,10 +246,10 @@ SEAMLESS = {0: "3cd0fb77519132c6", 7: "b23c0c627ab8ed64", 2_000_000: "6214ddc76e
 
 @pytest.mark.parametrize("seed", SEAMLESS)
 def test_seamless_maps_are_what_they_were(seed):
-    arrays = build("seamless", seed).arrays()
+    scenario = build("seamless", seed)
     digest = hashlib.sha256()
-    for key in ("field", "lines", "arcs", "successors"):
-        digest.update(arrays[key].tobytes())
+    for part in (scenario.road.field, scenario.strips.lines, scenario.strips.arcs, scenario.network.successors):
+        digest.update(part.tobytes())
     assert digest.hexdigest()[:16] == SEAMLESS[seed]
 
 
