@@ -37,7 +37,7 @@ from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.episodes import Episodes
-from gridsim.envs.observing import Observer, rewards_of, row
+from gridsim.envs.observing import Observer, row
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture per control period: real time
 
-_F, _U = np.float32, np.uint64
+_U = np.uint64
 _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
 #: bool [ends]: which ends terminate, and which truncate, an episode.
 TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])
@@ -137,11 +137,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self.metadata["render_modes"].append("human")
         self.config = config or SimConfig()
         traffic = default_traffic(scenario) if traffic is None else traffic
-        self.simulator = Simulator([], num_envs, self.config, max_steps=max_episode_steps, traffic=traffic)
+        self.simulator = Simulator(num_envs, self.config, max_steps=max_episode_steps, traffic=traffic)
         self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
-        self.simulator.scenarios = self._episodes.maps
         self.render_mode = render_mode
-        self._views: dict[int, Renderer] = {}  # by map
+        self._views: dict[Map, Renderer] = {}
         self._window: Window | None = None
         self._paths: list[list[np.ndarray]] = [[] for _ in range(num_envs)]  # where each car has been, for pictures
         self._observer = Observer(self.simulator, observation, frames, motion, steering)
@@ -153,7 +152,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         #: float32 [n, rays], m: the ranges behind the last observations.
         self.ranges = np.zeros((num_envs, self.config.sensors.rays), dtype=np.float32)
-        self._fastest = np.ones(num_envs, dtype=np.float32)  # m/s, upper speed of each car's scenario
         self._seeded = self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -186,14 +184,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         which = np.flatnonzero(mask)
         self._started &= len(which) < self.num_envs
         self._seed(seed, which)
-        if map_seed is not None and len(which) == self.num_envs:
-            self._episodes.keep_own_maps()
+        if map_seed is not None:
+            self._views.clear()  # of maps that may not be seen again
         self.ranges = self.ranges.copy()
-        self.ranges[which], _ = self._begin(which, map_seed, start)
+        self.ranges[which] = self._begin(which, map_seed, start)
         self._started = True
         self._note(which, mask)
-        info = self._info()
-        return self._observer.look(self.ranges, info["speed_mps"]), {name: part * mask for name, part in info.items()}
+        return self._observer.look(self.ranges), {name: part * mask for name, part in self._info().items()}
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
@@ -212,17 +209,14 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if np.shape(actions) != self.action_space.shape:
             each = f"{self.num_envs} cars, each with an action of {self.single_action_space}"
             raise ValueError(f"there are {each}, not actions of shape {np.shape(actions)}")
-        ranges, speeds, progress, ends = self.simulator.step(actions)
+        self.ranges, rewards, ends = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
             self._episodes.numbers[which] += _U(1)
-            ranges[which], speeds[which] = self._begin(which)
+            self.ranges[which] = self._begin(which)
             ends[which] = End.RUNNING
-        self.ranges = ranges
-        reach, dt = _F(self.config.sensors.range), _F(self.config.episode.control_period)
-        rewards = rewards_of(ranges, speeds, progress, ends, self._fastest, begun, reach, dt)
         self._note(slice(None), begun)
-        observations, info = self._observer.look(ranges, speeds), self._info()
+        observations, info = self._observer.look(self.ranges), self._info()
         terminations, truncations = TERMINATES[ends], TRUNCATES[ends]
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ends.any():
             info = self._begin_anew(observations, info, ends != 0)
@@ -250,12 +244,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             if given is not None:
                 episodes.keys[i], episodes.numbers[i] = int(given) % (1 << 64), 0
 
-    def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Begin the current episodes of cars `which`. Returns: ranges [k, rays] and speeds [k]."""
+    def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> np.ndarray:
+        """Begin the current episodes of cars `which`. Returns: ranges [k, rays]."""
         maps, starts, worlds = self._episodes.draw(which, map_seed, start)
-        ranges, speeds = self.simulator.reset(starts, maps, which, worlds)
-        self._fastest[which] = [self._episodes.maps[m].road.speed_high for m in maps]
-        return ranges, speeds
+        return self.simulator.reset(maps, starts, which, worlds)
 
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Begin the next episodes of cars `over` [n]; changes `observations`. Returns: info of both episodes."""
@@ -264,9 +256,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         for i in which.tolist():
             last[i] = copy.deepcopy(row(observations, i))
         self._episodes.numbers[which] += _U(1)
-        self.ranges[which], speeds = self._begin(which)
+        self.ranges[which] = self._begin(which)
         self._note(which, over)
-        seen = self._observer.look(self.ranges[which], speeds, which)
+        seen = self._observer.look(self.ranges[which], which)
         if isinstance(seen, dict):
             for name, part in seen.items():
                 observations[name][which] = part
@@ -303,10 +295,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         from gridsim.view.render import Renderer  # here, because only pictures need it
 
         state = self.simulator.state
-        m = int(state.maps[i])
-        view = self._views.get(m)
-        if view is None or view.road_map is not self.simulator.scenarios[m]:
-            view = self._views[m] = Renderer(self.simulator.scenarios[m], RENDER_SIZE, config=self.config)
+        road_map = self.simulator.map_of(i)
+        view = self._views.get(road_map)
+        if view is None:
+            view = self._views[road_map] = Renderer(road_map, RENDER_SIZE, config=self.config)
         others = state.worlds[i][state.worlds[i][:, LANE] >= 0.0]
         speed, distance = float(state.cars[i, SPEED]), float(state.cars[i, DISTANCE])
         return view.draw(

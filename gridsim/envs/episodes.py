@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 from weakref import WeakValueDictionary
@@ -36,7 +37,6 @@ class Episodes:
     """The episodes of a batch of cars.
 
     Attributes:
-        maps: the maps built so far; a simulator's scenarios.
         keys: uint64 [n], each car's seed.
         numbers: uint64 [n], each car's current episode, counted from its seeding.
     """
@@ -51,17 +51,17 @@ class Episodes:
         self.scenario, self.traffic, self.config = scenario, traffic, config
         if isinstance(maps, int) and is_map_file(scenario):
             maps = [build(scenario, map_seed, config)] * min(maps, 1)
-        self.maps: list[Map] = [] if isinstance(maps, int) else list(maps)
-        self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [s.seed for s in maps]
+        self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [each.seed for each in maps]
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
-        self._index = {seed: k for k, seed in enumerate(self._seeds) if self.maps}  # of the maps built so far
+        # The maps of `_seeds` that were built so far.
+        self._own: dict[int, Map] = {} if isinstance(maps, int) else {each.seed: each for each in maps}
         self.keys = np.zeros(cars, dtype=np.uint64)
         self.numbers = np.zeros(cars, dtype=np.uint64)
 
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[list[Map], np.ndarray, np.ndarray]:
         """Maps [k], starts [k, 5] and worlds [k, traffic, FIELDS] of the current episodes of `which`, unless given."""
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
@@ -72,36 +72,33 @@ class Episodes:
             if given.dtype.kind not in "iu" or given.shape not in ((), every) or given.min() < 0:
                 raise ValueError(f"map_seed must be a whole number from 0, or {every[0]} of them, not {map_seed!r}")
             seeds = np.broadcast_to(given, every)[which].tolist()
-        maps = np.array([self._map(seed) for seed in seeds])
+        maps = [self._map(seed) for seed in seeds]
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is not None:
             starts[:] = self._checked_start(start, which, maps)
         worlds = np.empty((len(which), self.traffic, FIELDS), dtype=np.float32)
-        for m in np.unique(maps):
-            of = np.flatnonzero(maps == m)
+        on_each: defaultdict[Map, list[int]] = defaultdict(list)
+        for k, road_map in enumerate(maps):
+            on_each[road_map].append(k)
+        for road_map, of in on_each.items():
             if start is None:
-                starts[of] = starts_at(self.maps[m], numbers[of, 1])
+                starts[of] = starts_at(road_map, numbers[of, 1])
             if self.traffic:
-                worlds[of] = spawn(self.maps[m].network, starts[of], self.traffic, keys[of], self.config)
+                worlds[of] = spawn(road_map.network, starts[of], self.traffic, keys[of], self.config)
         return maps, starts, worlds
 
-    def keep_own_maps(self) -> None:
-        """Forget maps that a reset asked for, unless episodes are drawn from them."""
-        kept = [seed for seed in self._seeds if seed in self._index]
-        self.maps[:] = [self.maps[self._index[seed]] for seed in kept]
-        self._index = {seed: k for k, seed in enumerate(kept)}
-
-    def _map(self, seed: int) -> int:
-        """Index in `maps` of the map with a seed; built if missing."""
+    def _map(self, seed: int) -> Map:
+        """The map with a seed, built if missing; it is kept if episodes are drawn from it."""
         seed = seed_of_map(self.scenario, seed)
-        if seed not in self._index:
-            key = self.scenario, seed, self.config
-            found = _SHARED[key] = _SHARED.get(key) or build(*key)
-            self.maps.append(found)
-            self._index[seed] = len(self.maps) - 1
-        return self._index[seed]
+        if seed in self._own:
+            return self._own[seed]
+        key = self.scenario, seed, self.config
+        found = _SHARED[key] = _SHARED.get(key) or build(*key)
+        if seed in self._seeds:
+            self._own[seed] = found
+        return found
 
-    def _checked_start(self, start: Any, which: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    def _checked_start(self, start: Any, which: np.ndarray, maps: list[Map]) -> np.ndarray:
         """A caller's start, float32 [k, 5]."""
         vehicle, cars = self.config.vehicle, len(self.keys)
         try:
@@ -112,11 +109,11 @@ class Episodes:
             ) from None
         if not np.isfinite(starts).all():
             raise ValueError(f"start must be five finite numbers, not {start!r}")
-        for m, (x, y, _, speed, steering) in zip(maps, starts, strict=True):
+        for road_map, (x, y, _, speed, steering) in zip(maps, starts, strict=True):
             if not -vehicle.reverse_limit <= speed <= vehicle.speed_limit:
                 raise ValueError(f"a start's speed must be within the car's limits, not {speed:g} m/s")
             if abs(steering) > np.radians(vehicle.steering_limit) + 1e-6:
                 raise ValueError(f"a start's steering must be within the car's limits, not {steering:g} rad")
-            if clearance(self.maps[m].road, x, y) < 0.0:
+            if clearance(road_map.road, x, y) < 0.0:
                 raise ValueError(f"a start must be on the road, not at {x:g} m, {y:g} m")
         return starts

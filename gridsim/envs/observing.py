@@ -1,12 +1,11 @@
-"""What cars see, as arrays of Gymnasium's spaces, and their rewards."""
+"""What cars see, as arrays of Gymnasium's spaces."""
 
 from __future__ import annotations
 
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from gridsim.car.ego import STEERING
-from gridsim.car.reward import reward
+from gridsim.car.ego import SPEED, STEERING
 from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS, grid_table, grids
@@ -28,16 +27,6 @@ def _observe(ranges, closing, speeds, reach, slowest, limit, observations):
                 observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
         last = rays if closing is None else 2 * rays
         observations[i, last] = min(max(speeds[i] / limit, slowest), _F(1.0))
-
-
-@njit
-def rewards_of(ranges, speeds, progress, ends, fastest, begun, reach, dt):
-    """The rewards float32 [n] of a step, 0 where an episode has `begun`; the other arguments are `reward`'s, [n]."""
-    made = np.zeros(ranges.shape[0], dtype=np.float32)
-    for i in range(ranges.shape[0]):
-        if not begun[i]:
-            made[i] = reward(ranges[i], reach, speeds[i], progress[i], ends[i], fastest[i], dt)
-    return made
 
 
 def row(observations: Seen, i: int) -> Seen:
@@ -82,8 +71,9 @@ class Observer:
         if not isinstance(which, slice):  # then it is a copy
             self._stack[which] = stack
 
-    def look(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
-        """Observations of cars `which` from ranges [k, rays] and speeds [k], after `take`; the caller owns them."""
+    def look(self, ranges: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
+        """Observations of cars `which` from ranges [k, rays], after `take`; the caller owns them."""
+        speeds = np.ascontiguousarray(self._simulator.state.cars[which, SPEED])
         if self._observation == "rays":
             return self._rays(ranges, speeds, which)
         one = self._stack.shape[1] == 1

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place, visit_cells
+from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
@@ -32,7 +33,6 @@ class State(NamedTuple):
 
     cars: np.ndarray  # float32 [n, ego.FIELDS]
     visits: np.ndarray  # float32 [n, cells], odometer (m) when the car was last in each visit cell of its map
-    maps: np.ndarray  # int32 [n], index of the car's map among the simulator's scenarios
     ends: np.ndarray  # uint8 [n], End
     worlds: np.ndarray  # float32 [n, traffic, world.FIELDS], the other cars around each
 
@@ -54,17 +54,18 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
     """One control period of every car; one whose episode has ended stands still.
 
     `order` lists the cars map by map; runs int64 [maps, 3]: a map's row in the atlas, and its cars' range in `order`.
-    seen: ranges and closing speeds [n, rays], speeds [n] and progress [n], to be filled.
+    seen: ranges and closing speeds [n, rays] and rewards [n], to be filled.
     """
     constants, drivers = physics.constants, physics.drivers
-    ranges, closing, speeds, progress = seen
+    ranges, closing, rewards = seen
     for row, first, last in runs:
         road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
         for i in order[first:last]:
             car = cars[i]
             world = None if worlds is None else worlds[i]
             before = car[DISTANCE]
-            if ends[i] == 0:
+            runs_on = ends[i] == 0
+            if runs_on:
                 if actions.ndim == 1:
                     acceleration, steering = act(constants, actions[i], car[SPEED], car[STEERING])
                 else:
@@ -73,9 +74,10 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 if world is not None:
                     flow(network, drivers, world, car)
                 ends[i] = control(road, constants, car, visits[i], world, acceleration, steering, target, max_steps)
-            progress[i] = car[DISTANCE] - before
             look(road, constants, physics.fan, car, world, ranges[i], closing[i])
-            speeds[i] = car[SPEED]
+            if runs_on:
+                gained, fastest = car[DISTANCE] - before, road.speed_high
+                rewards[i] = reward(ranges[i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
 
 
 def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -86,15 +88,13 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Simulator:
-    """A batch of cars on one or several maps, each in an episode of its own: arrays in, arrays out.
+    """A batch of cars, each on a map and in an episode of its own: arrays in, arrays out.
 
-    A car's behaviour depends only on its own map, start and actions, not on the batch it is in. Maps may be added to
-    `scenarios` at any time; a reset refers to them by index. Replace one only before all cars are reset.
+    A car's behaviour depends only on its own map, start and actions, not on the batch it is in.
     """
 
     def __init__(
         self,
-        scenarios: Sequence[Map],
         cars: int,
         config: SimConfig | None = None,
         target: float | None = None,
@@ -117,12 +117,10 @@ class Simulator:
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode needs a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
         constants(self.config)  # raises for a wrong configuration
-        self.scenarios = list(scenarios)
         rays = self.config.sensors.rays
         self.state = State(
             cars=np.zeros((cars, FIELDS), dtype=np.float32),
             visits=np.zeros((cars, 0), dtype=np.float32),
-            maps=np.full(cars, -1, dtype=np.int32),  # -1 before a car's first reset
             ends=np.zeros(cars, dtype=np.uint8),
             worlds=np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32),  # all are absent
         )
@@ -130,7 +128,8 @@ class Simulator:
         self.closing = np.zeros((cars, rays), dtype=np.float32)
         self._physics: Physics | None = None  # made when a kernel first needs it
         self._charted: list[Map] = []  # the maps in the atlas
-        self._groups = _by_map(self.state.maps)
+        self._rows = np.full(cars, -1)  # of each car's map in the atlas; -1 before its first reset
+        self._groups = _by_map(self._rows)
 
     def __getstate__(self) -> dict[str, Any]:
         """Without read-only arrays: their copies would be writable, and kernels would be compiled again for them."""
@@ -141,42 +140,28 @@ class Simulator:
 
     def reset(
         self,
+        maps: Map | Sequence[Map],
         starts: np.ndarray,
-        maps: np.ndarray | int = 0,
         cars: np.ndarray | None = None,
         worlds: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> np.ndarray:
         """Begin episodes.
 
         Args:
+            maps: the map of each car [k], or one for all.
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
-            maps: indices [k] into `scenarios`, or one for all.
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
 
-        Returns: (ranges float32 [k, rays] in m, speeds float32 [k] in m/s).
-        Raises: ValueError with one line for a wrong shape, a number that is not finite, or a missing map. Nothing is
-        changed then.
+        Returns: ranges float32 [k, rays] in m.
         """
-        n = len(self)
-        cars = np.arange(n) if cars is None else np.asarray(cars, dtype=np.intp)
-        starts = np.array(starts, dtype=np.float32)
-        maps = np.broadcast_to(np.asarray(maps, dtype=np.int32), cars.shape)
-        if starts.shape != (len(cars), 5) or not np.isfinite(starts).all():
-            raise ValueError(f"starts must be {len(cars)} rows of finite x, y, heading, speed, steering")
-        if maps.size and not 0 <= maps.min() <= maps.max() < len(self.scenarios):
-            raise ValueError(f"maps must be indices into the {len(self.scenarios)} scenarios")
-        if cars.ndim != 1 or (cars.size and not 0 <= cars.min() <= cars.max() < n):
-            raise ValueError(f"cars must be indices from 0 to {n - 1}")
-        shape = (len(cars), *self.state.worlds.shape[1:])
-        if worlds is not None and np.shape(worlds) != shape:
-            raise ValueError(f"traffic must be {shape[0]} worlds of {shape[1]} cars, not {np.shape(worlds)}")
+        cars = np.arange(len(self)) if cars is None else cars
+        maps = [maps] * len(cars) if isinstance(maps, Map) else maps
+        starts = starts.astype(np.float32)
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
-        if not len(cars):
-            return ranges, starts[:, 3]
         self.state.worlds[cars] = -1.0 if worlds is None else worlds
         rows = self._chart(maps)
-        cells = max(visit_cells(self.scenarios[m].road) for m in np.unique(maps))
+        cells = max(visit_cells(each.road) for each in set(maps))
         if cells > self.state.visits.shape[1]:
             more = ((0, 0), (0, cells - self.state.visits.shape[1]))
             self.state = self.state._replace(visits=np.pad(self.state.visits, more, constant_values=-1e6))
@@ -184,10 +169,14 @@ class Simulator:
         physics, around = self._kernel_physics(), self._kernel_worlds()
         _place_all(physics, *_by_map(rows), cars, starts, state.cars, state.visits, around, ranges, self.closing)
         state.ends[cars] = End.RUNNING
-        if (state.maps[cars] != maps).any():
-            state.maps[cars] = maps
-            self._groups = _by_map(state.maps if n > 1 else rows)
-        return ranges, starts[:, 3].copy()
+        if (self._rows[cars] != rows).any():
+            self._rows[cars] = rows
+            self._groups = _by_map(self._rows)
+        return ranges
+
+    def map_of(self, car: int) -> Map:
+        """The map on which a car drives."""
+        return self._charted[self._rows[car]]
 
     def _kernel_worlds(self) -> np.ndarray | None:
         return self.state.worlds if self.state.worlds.shape[1] else None
@@ -199,36 +188,28 @@ class Simulator:
             self._physics = Physics(atlas, k, drivers(self.config), fan(rays, k.ray_first, k.ray_step))
         return self._physics
 
-    def _chart(self, maps: np.ndarray) -> np.ndarray:
-        """Rows of maps [k] in the atlas, which has all scenarios; for one car alone its map, which is not copied."""
-        alone = len(self) == 1
-        wanted = [self.scenarios[maps[0]]] if alone else self.scenarios
-        if [id(scenario) for scenario in wanted] != [id(scenario) for scenario in self._charted]:
-            self._charted, self._physics = list(wanted), None
-        return np.zeros_like(maps) if alone else maps
+    def _chart(self, maps: Sequence[Map]) -> np.ndarray:
+        """Rows of maps [k] in the atlas. It gets those that it lacks; where all cars are reset, it keeps no others."""
+        if not set(maps) <= set(self._charted):
+            kept = self._charted if len(maps) < len(self) else []
+            self._charted, self._physics = list(dict.fromkeys([*kept, *maps])), None
+        row_of = {each: row for row, each in enumerate(self._charted)}
+        return np.array([row_of[each] for each in maps])
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
-        Returns: (ranges float32 [n, rays] in m, speeds float32 [n] in m/s, progress float32 [n], m of new ground in
-        this step, ends uint8 [n], End); the caller owns the arrays.
-        Raises: ValueError with one line for invalid actions; RuntimeError before the first reset.
+        Returns: (ranges float32 [n, rays] in m, rewards float32 [n], 0 for a car that stood still, ends uint8 [n],
+        End); the caller owns the arrays.
+        Raises: ValueError with one line for invalid actions.
         """
-        n, state = len(self), self.state
-        if state.maps.min() < 0:
-            raise RuntimeError("step() was called before every car was reset; call reset() first")
-        if np.shape(actions) not in ((n,), (n, 2)):
-            raise ValueError(f"there are {n} cars, not actions of shape {np.shape(actions)}")
-        actions = checked_actions(actions)
-        ranges = np.empty_like(self.closing)
-        speeds, progress = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.float32)
+        state, actions = self.state, checked_actions(actions)
+        ranges, rewards = np.empty_like(self.closing), np.zeros(len(self), dtype=np.float32)
         physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
-        seen = ranges, self.closing, speeds, progress
-        _control_all(
-            physics, *self._groups, actions, target, self.max_steps, state.cars, state.visits, around, state.ends, seen
-        )
-        return ranges, speeds, progress, state.ends.copy()
+        arrays = state.cars, state.visits, around, state.ends, (ranges, self.closing, rewards)
+        _control_all(physics, *self._groups, actions, target, self.max_steps, *arrays)
+        return ranges, rewards, state.ends.copy()
 
 
 def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:

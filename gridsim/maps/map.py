@@ -16,9 +16,9 @@ from gridsim.maps.network import Network
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, freeze, make_road
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Map:
-    """One map."""
+    """One map; equal to itself alone."""
 
     name: str  # its scenario's, or a file's path
     seed: int  # from which it was built

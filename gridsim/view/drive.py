@@ -60,18 +60,17 @@ class Drive:
         return len(self.actions)
 
 
-def manual(road_map: Map, traffic: int = 0) -> Simulator:
+def manual(traffic: int = 0) -> Simulator:
     """A simulator of one car in traffic, whose episode ends only with a collision."""
     config = SimConfig(episode=EpisodeConfig(patience=_ENDLESS))
-    return Simulator([road_map], 1, config, target=math.inf, max_steps=_ENDLESS, traffic=traffic)
+    return Simulator(1, config, target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
-def _begin(simulator: Simulator, start: np.ndarray, episode: int) -> np.ndarray:
+def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> np.ndarray:
     """Begin an episode at start float32 [5], among its traffic. Returns: ranges float32 [1, rays], m."""
-    (road_map,), traffic = simulator.scenarios, simulator.state.worlds.shape[1]
     key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
-    worlds = spawn(road_map.network, start[None], traffic, key, simulator.config)
-    return simulator.reset(start[None], worlds=worlds)[0]
+    worlds = spawn(road_map.network, start[None], simulator.state.worlds.shape[1], key, simulator.config)
+    return simulator.reset(road_map, start[None], worlds=worlds)
 
 
 def poses_of(states: np.ndarray) -> np.ndarray:
@@ -184,15 +183,15 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     traffic float32 [n, others, world.FIELDS]).
     Raises: GridSimError with one line if an episode ends too early, which means that the map is another one.
     """
-    simulator = manual(road_map, drive.traffic)
+    simulator = manual(drive.traffic)
     n = len(drive)
     begins = np.diff(drive.episodes, prepend=-1) != 0
     rows = []
     for k in range(n):
         if begins[k]:
-            ranges = _begin(simulator, drive.poses[k], int(drive.episodes[k]))
+            ranges = _begin(simulator, road_map, drive.poses[k], int(drive.episodes[k]))
         else:
-            ranges, _, _, ends = simulator.step(drive.actions[k - 1 : k])
+            ranges, _, ends = simulator.step(drive.actions[k - 1 : k])
             if ends[0] != End.RUNNING:
                 raise GridSimError(f"the replay ends at row {k} of {n}: the drive was recorded on another map")
         rows.append((simulator.state.cars[0].copy(), ranges[0].copy(), simulator.state.worlds[0].copy()))
@@ -220,11 +219,11 @@ def drive(
     Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
     Raises: GridSimError with one line if the recording cannot be written.
     """
-    simulator = manual(road_map, traffic)
+    simulator = manual(traffic)
     pictures = round(PERIOD * FPS)  # a control step
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
-    ranges = _begin(simulator, start, 0)
+    ranges = _begin(simulator, road_map, start, 0)
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
@@ -233,7 +232,7 @@ def drive(
         if "r" in pressed:
             if simulator.state.cars[0, STEPS] > 0:
                 episode += 1
-            ranges = _begin(simulator, start, episode)
+            ranges = _begin(simulator, road_map, start, episode)
             path = [start[:2].copy()]
         before, view, there = simulator.state.cars[0].copy(), ranges[0], _present(simulator.state.worlds[0])
         ended = simulator.state.ends[0] != End.RUNNING
@@ -242,7 +241,7 @@ def drive(
             action = action_for(held, float(before[SPEED]))
             if recorder is not None:
                 recorder.write(step, start if step == 0 else poses_of(before), action, episode)
-            ranges, _, _, _ = simulator.step(np.array([int(action)]))
+            ranges, _, _ = simulator.step(np.array([int(action)]))
             steps += 1
         after, then = simulator.state.cars[0], _present(simulator.state.worlds[0])
         best = max(best, float(after[DISTANCE]))

@@ -13,9 +13,8 @@ from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.rollout import Limits, collect, evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode
-from gridsim.car.ego import STEERING, End
-from gridsim.car.reward import reward
-from gridsim.config import SimConfig, constants
+from gridsim.car.ego import SPEED, STEERING, End
+from gridsim.config import SimConfig
 from gridsim.envs.simulator import Simulator
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
@@ -65,22 +64,22 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
     of = ask(policy, 8, 0.3, cars)
     experience, results = collect(*of)
     inputs = unpack(of.spec, experience.observations, np.arange(len(experience.actions)), ages(experience))
-    row, table, k, seen = 0, grid_table(CONFIG), constants(CONFIG), np.zeros(64, dtype=F)
+    row, table, seen = 0, grid_table(CONFIG), np.zeros(64, dtype=F)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
-        simulator = Simulator([road], 1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
-        ranges, speeds = simulator.reset(episode["start"][None], worlds=world[None] if cars else None)
+        simulator = Simulator(1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
+        ranges = simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
+        car = simulator.state.cars[0]
         for step in range(int(result["steps"]) + 1):
-            encode(ranges[0], simulator.closing[0], speeds[0], simulator.state.cars[0, STEERING], seen)
+            encode(ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
             shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
             assert np.abs(inputs[row, -len(shown) :] - shown).max() < 0.6 / 4096
             row += 1
             if step == result["steps"]:
                 assert (experience.actions[row - 1], experience.rewards[row - 1]) == (NO_ACTION, 0.0)
                 break
-            ranges, speeds, progress, ends = simulator.step(experience.actions[row - 1 : row].astype(int))
-            gained = reward(ranges[0], k.ray_range, speeds[0], progress[0], ends[0], road.road.speed_high, k.dt)
-            assert experience.rewards[row - 1] == pytest.approx(gained, abs=2e-6)
+            ranges, rewards, ends = simulator.step(experience.actions[row - 1 : row].astype(int))
+            assert experience.rewards[row - 1] == pytest.approx(rewards[0], abs=2e-6)
             assert experience.ends[row - 1] == ends[0]
         assert ends[0] == result["end"]
     assert row == len(experience.actions) > 150

@@ -58,15 +58,17 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     assert all(row.tobytes() == results[0].tobytes() for row in shared)
 
     for cars in (np.arange(9), np.array([4])):
-        simulator = Simulator(maps, len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
-        ranges, speeds = simulator.reset(episodes["start"][cars], episodes["map"][cars], worlds=worlds[cars])
+        simulator = Simulator(len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
+        own = [maps[m] for m in episodes["map"][cars]]
+        ranges = simulator.reset(own, episodes["start"][cars], worlds=worlds[cars])
         for step in range(1 + max(int(paths[k][0]["steps"]) for k in cars)):
             for i, k in enumerate(cars):
                 row, states, traffic = paths[k]
                 at = min(step, int(row["steps"]))
                 assert simulator.state.cars[i].tobytes() == states[at].tobytes()
                 assert simulator.state.worlds[i].tobytes() == traffic[at].tobytes()
-            ranges, speeds, _, ends = simulator.step(actions_of(spec, genome, ranges, speeds))
+            speeds = simulator.state.cars[:, SPEED].copy()
+            ranges, _, ends = simulator.step(actions_of(spec, genome, ranges, speeds))
         assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
 
 
@@ -95,14 +97,13 @@ def test_what_is_rewound_goes_on_as_it_did(among):
         assert start == pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]])
         if not crashed[k]:
             continue
-        original, again = (
-            Simulator([maps[episodes["map"][k]]], 1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2)
-        )
-        ranges, speeds = original.reset(episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
-        again.reset(start[None], worlds=world[None])
+        original, again = (Simulator(1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2))
+        road_map = maps[episodes["map"][k]]
+        ranges = original.reset(road_map, episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
+        again.reset(road_map, start[None], worlds=world[None])
         for step in range(last):
-            action = actions_of(spec, genome, ranges, speeds)
-            ranges, speeds, *_ = original.step(action)
+            action = actions_of(spec, genome, ranges, original.state.cars[:, SPEED].copy())
+            ranges, *_ = original.step(action)
             if step >= first:
                 assert not again.state.ends[0]
                 again.step(action)

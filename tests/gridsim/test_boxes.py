@@ -142,8 +142,8 @@ def cross():
 def meet(scenario, start, lane, along):
     """Drive in a `BLIND` world of one car, `along` m along a lane, until the episode ends; (simulator, End)."""
     world = cars_on(scenario.network, (lane, along, 30.0, 1.0))
-    simulator = Simulator([scenario], 1, BLIND, traffic=1)
-    simulator.reset(np.array([start], dtype=F), worlds=world[None])
+    simulator = Simulator(1, BLIND, traffic=1)
+    simulator.reset(scenario, np.array([start], dtype=F), worlds=world[None])
     for _ in range(40):
         *_, ends = simulator.step(np.array([Action.NONE]))
         if ends[0]:
@@ -173,11 +173,11 @@ def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
 def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, steering, heading, pace):
     """It comes towards us, drives away, stands, crosses. By finite differences of the middle of the front axle, which a
     turning car moves sideways."""
-    simulator = Simulator([cross], 1, CONFIG, traffic=1)
+    simulator = Simulator(1, CONFIG, traffic=1)
     world = parked((116.0, 128.0, heading))
     world[0, SPEED] = pace
     simulator.closing[:] = 99.0
-    ranges, _ = simulator.reset(np.array([[100.0, 128.0, 0.0, speed, steering]]), worlds=world[None])
+    ranges = simulator.reset(cross, np.array([[100.0, 128.0, 0.0, speed, steering]]), worlds=world[None])
     kappa, step = oracle.curvature(CONFIG, speed, steering), 1e-4
     poses = [oracle.on_arc(CONFIG, (0.0, 0.0, 0.0), kappa, way) for way in (-step * speed, step * speed)]
     before, after = (np.array([x + 1.25 * math.cos(turn), y + 1.25 * math.sin(turn)]) for x, y, turn in poses)
@@ -203,12 +203,12 @@ def test_nothing_tunnels_through_crosswise(cross, offset):
 @pytest.mark.parametrize(("gap", "ends"), [(3.0, False), (9.5, False), (11.0, True), (None, True)])
 def test_waiting_behind_a_standing_car_is_not_idle(cross, gap, ends):
     """Standing 5 s, bumper to bumper so many m behind a car that stands, and alone."""
-    simulator = Simulator([cross], 1, BLIND, traffic=1)
+    simulator = Simulator(1, BLIND, traffic=1)
     world = cars_on(cross.network, (0, 100.0, 0.0, 1.0))
     if gap is None:
         world[0, LANE] = -1.0
     start = [SIDE - 100.0 + 4.0 + (gap or 3.0), 128.0, math.pi, 0.0, 0.0]
-    simulator.reset(np.array([start], dtype=F), worlds=world[None])
+    simulator.reset(cross, np.array([start], dtype=F), worlds=world[None])
     for step in range(50):
         *_, now = simulator.step(np.array([Action.NONE]))
         assert now[0] == (End.IDLE if ends and step >= 14 else End.RUNNING)

@@ -20,7 +20,7 @@ from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.sensing import grid
 
-KERNELS = [simulator._control_all, simulator._place_all, observing._observe, observing.rewards_of, grid.grids]
+KERNELS = [simulator._control_all, simulator._place_all, observing._observe, grid.grids]
 KERNELS += [episodes._draw, map._starts_at]
 
 
@@ -121,4 +121,4 @@ def test_a_copied_environment_goes_on_alike_with_the_same_kernels(
     assert [len(kernel.signatures) for kernel in KERNELS] == compiled
     maps = [each.unwrapped.cars if single else each.unwrapped for each in (env, other)]
     if clone is copy.deepcopy:
-        assert maps[0].simulator.scenarios[0] is maps[1].simulator.scenarios[0]
+        assert maps[0].simulator.map_of(0) is maps[1].simulator.map_of(0)

@@ -138,7 +138,7 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
     starts = np.zeros((200, 5), dtype=np.float32)
     starts[:, :2] = 40 + offset - away[:, None] * left
     starts[:, 2] = angle + math.pi / 2 + tilt
-    ranges, _ = Simulator([scenario], 200).reset(starts)
+    ranges = Simulator(200).reset(scenario, starts)
     error = (ranges[:, 15] + 1.25) * np.cos(tilt) - away + 0.4  # the wall is 0.8 m thick in the field
     assert np.abs(error).max() < 0.3
 
@@ -247,7 +247,7 @@ def test_environments_and_champions_drive_on_it(track):
     for _ in range(10):
         observation, *_ = env.step(0)
     assert np.isfinite(observation).all()
-    assert [s.name for s in env.cars.simulator.scenarios] == [track.name]
+    assert env.cars.simulator.map_of(0).name == track.name
     champion = Champion(np.zeros(PolicySpec.parse("mlp:2").size, np.float32), "mlp:2", track.name, SimConfig())
     assert evaluate(champion, episodes=8)["episodes"] == 8
 

@@ -22,8 +22,8 @@ def scenario():
 @pytest.fixture(scope="module")
 def state(scenario):
     """A car that stands at a start, and what it sees."""
-    simulator = Simulator([scenario], 1)
-    ranges, _ = simulator.reset(sample_starts(scenario, 1, np.random.default_rng(5)))
+    simulator = Simulator(1)
+    ranges = simulator.reset(scenario, sample_starts(scenario, 1, np.random.default_rng(5)))
     return simulator.state.cars[0].copy(), ranges[0]
 
 

@@ -12,7 +12,7 @@ from pictures import crashes
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from gridsim.car.ego import End
+from gridsim.car.ego import SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import CROSSING_GAP
 from gridsim.envs.simulator import Simulator
@@ -211,12 +211,13 @@ def test_no_road_can_be_driven_without_steering(name):
     """64 drives on each of eight maps that accelerate up to a speed and never steer."""
     eight = [build(name, seed) for seed in range(8)]
     starts = np.concatenate([sample_starts(scenario, 64, np.random.default_rng(scenario.seed)) for scenario in eight])
-    simulator = Simulator(eight, 512)
+    simulator = Simulator(512)
     for pace in (5.5, 7.0, 12.0):
-        _, speeds = simulator.reset(starts, np.repeat(np.arange(8), 64))
+        simulator.reset([scenario for scenario in eight for _ in range(64)], starts)
         ends = simulator.state.ends
         while (ends == End.RUNNING).any():
-            _, speeds, _, ends = simulator.step(np.where(speeds < pace, Action.ACCELERATE, Action.NONE))
+            speeds = simulator.state.cars[:, SPEED]
+            *_, ends = simulator.step(np.where(speeds < pace, Action.ACCELERATE, Action.NONE))
         assert (ends == End.SUCCESS).mean() <= 0.02
 
 

@@ -98,15 +98,15 @@ def cars_on(network, *rows):
 
 def record_drive(path, scenario, start, episodes):
     """Record a person's drive: episodes from one start, of these actions, until they end; the states in the file."""
-    simulator, states = manual(scenario), []
+    simulator, states = manual(), []
     with closing(Recorder(path, scenario)) as recorder:
         for episode, actions in enumerate(episodes):
-            simulator.reset(start[None])
+            simulator.reset(scenario, start[None])
             for step, action in enumerate(actions):
                 states.append(start if step == 0 else poses_of(simulator.state.cars[0]))
                 recorder.write(step, states[-1], action, episode)
                 assert path.read_text().count("\n") == recorder.rows + 1  # whatever happens next, it is kept
-                _, _, _, ends = simulator.step(np.array([action]))
+                *_, ends = simulator.step(np.array([action]))
                 if ends[0] != End.RUNNING:
                     break
     return np.array(states)
