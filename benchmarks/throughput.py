@@ -107,7 +107,7 @@ def vector_env(
     _, info = env.reset(seed=0)
     # As in a long run, the cars are spread over the length of their episodes, so that resets come evenly.
     spread = np.random.default_rng(0).uniform(0.0, champion.sim.episode.target, CARS)
-    env.simulator.state.cars[:, DISTANCE] = spread
+    env.simulator.cars[:, DISTANCE] = spread
     rates, speeds = [], []
     over = np.zeros(CARS, dtype=bool)
     for run in range(runs + 1):

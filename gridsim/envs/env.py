@@ -202,7 +202,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
-        begun = self.simulator.state.ends != 0
+        begun = self.simulator.ends != 0
         if self.autoreset_mode is AutoresetMode.DISABLED and begun.any():
             over = f"episodes of {begun.sum()} of {self.num_envs} cars"
             raise ResetNeeded(f"step() was called after the end of the {over}; call reset() with a reset_mask first")
@@ -275,7 +275,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._observer.take(self.ranges[which], begun[which], which)
         if self.render_mode is None:
             return
-        for path, car, new in zip(self._paths, self.simulator.state.cars, begun, strict=True):
+        for path, car, new in zip(self._paths, self.simulator.cars, begun, strict=True):
             if new:
                 path.clear()
             path.append(car[:2].copy())
@@ -294,19 +294,17 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """What car i's world looks like: uint8 [height, width, 3]."""
         from gridsim.view.render import Renderer  # here, because only pictures need it
 
-        state = self.simulator.state
+        car, world = self.simulator.cars[i], self.simulator.worlds[i]
         road_map = self.simulator.map_of(i)
         view = self._views.get(road_map)
         if view is None:
             view = self._views[road_map] = Renderer(road_map, RENDER_SIZE, config=self.config)
-        others = state.worlds[i][state.worlds[i][:, LANE] >= 0.0]
-        speed, distance = float(state.cars[i, SPEED]), float(state.cars[i, DISTANCE])
         return view.draw(
-            state.cars[i],
-            boxes=others,
+            car,
+            boxes=world[world[:, LANE] >= 0.0],
             ranges=self.ranges[i],
             path=np.array(self._paths[i]),
-            text=(f"{speed:.1f} m/s    {distance:,.0f} m",),
+            text=(f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m",),
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -331,7 +329,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     def _info(self) -> dict[str, Any]:
         """Distance, speed, success and end of every car; in Gymnasium's form, each with a mask of cars."""
-        cars, ends = self.simulator.state.cars, self.simulator.state.ends.copy()
+        cars, ends = self.simulator.cars, self.simulator.ends.copy()
         info = {
             "distance_m": cars[:, DISTANCE].copy(),
             "speed_mps": cars[:, SPEED].copy(),
@@ -389,7 +387,7 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError with one line for an
         invalid action.
         """
-        if self.cars.simulator.state.ends[0] != End.RUNNING:
+        if self.cars.simulator.ends[0] != End.RUNNING:
             raise ResetNeeded("step() was called after the episode's end; call reset() first")
         observations, rewards, terminations, truncations, info = self.cars.step(np.asarray(action)[None])
         return row(observations, 0), float(rewards[0]), bool(terminations[0]), bool(truncations[0]), self._own(info)

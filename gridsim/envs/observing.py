@@ -73,7 +73,7 @@ class Observer:
 
     def look(self, ranges: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
         """Observations of cars `which` from ranges [k, rays], after `take`; the caller owns them."""
-        speeds = np.ascontiguousarray(self._simulator.state.cars[which, SPEED])
+        speeds = np.ascontiguousarray(self._simulator.cars[which, SPEED])
         if self._observation == "rays":
             return self._rays(ranges, speeds, which)
         one = self._stack.shape[1] == 1
@@ -94,6 +94,6 @@ class Observer:
         reach, limit = _F(self.config.sensors.range), _F(vehicle.speed_limit)
         _observe(ranges, closing, speeds, reach, self._slowest, limit, observations)
         if self._steering:
-            angles = self._simulator.state.cars[which, STEERING]
+            angles = self._simulator.cars[which, STEERING]
             observations[:, -1] = np.clip(angles / np.radians(vehicle.steering_limit), -1.0, 1.0)
         return observations

@@ -28,15 +28,6 @@ class Physics(NamedTuple):
     fan: np.ndarray
 
 
-class State(NamedTuple):
-    """A batch of cars; arrays with one leading axis, one row a car. Copy the arrays to keep a state."""
-
-    cars: np.ndarray  # float32 [n, ego.FIELDS]
-    visits: np.ndarray  # float32 [n, cells], odometer (m) when the car was last in each visit cell of its map
-    ends: np.ndarray  # uint8 [n], End
-    worlds: np.ndarray  # float32 [n, traffic, world.FIELDS], the other cars around each
-
-
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; fills `ranges` [k, rays]."""
@@ -91,6 +82,13 @@ class Simulator:
     """A batch of cars, each on a map and in an episode of its own: arrays in, arrays out.
 
     A car's behaviour depends only on its own map, start and actions, not on the batch it is in.
+
+    Attributes, which steps and resets change:
+        cars: float32 [n, ego.FIELDS].
+        visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
+        ends: uint8 [n], End.
+        worlds: float32 [n, traffic, world.FIELDS], the other cars around each.
+        closing: float32 [n, rays], m/s: closing speeds at the last step or reset, as in `boxes.cast_boxes`.
     """
 
     def __init__(
@@ -117,15 +115,11 @@ class Simulator:
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode needs a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
         constants(self.config)  # raises for a wrong configuration
-        rays = self.config.sensors.rays
-        self.state = State(
-            cars=np.zeros((cars, FIELDS), dtype=np.float32),
-            visits=np.zeros((cars, 0), dtype=np.float32),
-            ends=np.zeros(cars, dtype=np.uint8),
-            worlds=np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32),  # all are absent
-        )
-        #: float32 [n, rays], m/s: closing speeds at the last step or reset, as in `boxes.cast_boxes`.
-        self.closing = np.zeros((cars, rays), dtype=np.float32)
+        self.cars = np.zeros((cars, FIELDS), dtype=np.float32)
+        self.visits = np.zeros((cars, 0), dtype=np.float32)
+        self.ends = np.zeros(cars, dtype=np.uint8)
+        self.worlds = np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32)  # all are absent
+        self.closing = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self._physics: Physics | None = None  # made when a kernel first needs it
         self._charted: list[Map] = []  # the maps in the atlas
         self._rows = np.full(cars, -1)  # of each car's map in the atlas; -1 before its first reset
@@ -136,7 +130,7 @@ class Simulator:
         return {**vars(self), "_physics": None}
 
     def __len__(self) -> int:
-        return len(self.state.ends)
+        return len(self.ends)
 
     def reset(
         self,
@@ -159,16 +153,15 @@ class Simulator:
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
         starts = starts.astype(np.float32)
         ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
-        self.state.worlds[cars] = -1.0 if worlds is None else worlds
+        self.worlds[cars] = -1.0 if worlds is None else worlds
         rows = self._chart(maps)
         cells = max(visit_cells(each.road) for each in set(maps))
-        if cells > self.state.visits.shape[1]:
-            more = ((0, 0), (0, cells - self.state.visits.shape[1]))
-            self.state = self.state._replace(visits=np.pad(self.state.visits, more, constant_values=-1e6))
-        state = self.state
+        if cells > self.visits.shape[1]:
+            more = ((0, 0), (0, cells - self.visits.shape[1]))
+            self.visits = np.pad(self.visits, more, constant_values=-1e6)
         physics, around = self._kernel_physics(), self._kernel_worlds()
-        _place_all(physics, *_by_map(rows), cars, starts, state.cars, state.visits, around, ranges, self.closing)
-        state.ends[cars] = End.RUNNING
+        _place_all(physics, *_by_map(rows), cars, starts, self.cars, self.visits, around, ranges, self.closing)
+        self.ends[cars] = End.RUNNING
         if (self._rows[cars] != rows).any():
             self._rows[cars] = rows
             self._groups = _by_map(self._rows)
@@ -179,7 +172,7 @@ class Simulator:
         return self._charted[self._rows[car]]
 
     def _kernel_worlds(self) -> np.ndarray | None:
-        return self.state.worlds if self.state.worlds.shape[1] else None
+        return self.worlds if self.worlds.shape[1] else None
 
     def _kernel_physics(self) -> Physics:
         if self._physics is None:
@@ -204,12 +197,12 @@ class Simulator:
         End); the caller owns the arrays.
         Raises: ValueError with one line for invalid actions.
         """
-        state, actions = self.state, checked_actions(actions)
+        actions = checked_actions(actions)
         ranges, rewards = np.empty_like(self.closing), np.zeros(len(self), dtype=np.float32)
         physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
-        arrays = state.cars, state.visits, around, state.ends, (ranges, self.closing, rewards)
+        arrays = self.cars, self.visits, around, self.ends, (ranges, self.closing, rewards)
         _control_all(physics, *self._groups, actions, target, self.max_steps, *arrays)
-        return ranges, rewards, state.ends.copy()
+        return ranges, rewards, self.ends.copy()
 
 
 def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -69,7 +69,7 @@ def manual(traffic: int = 0) -> Simulator:
 def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> np.ndarray:
     """Begin an episode at start float32 [5], among its traffic. Returns: ranges float32 [1, rays], m."""
     key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
-    worlds = spawn(road_map.network, start[None], simulator.state.worlds.shape[1], key, simulator.config)
+    worlds = spawn(road_map.network, start[None], simulator.worlds.shape[1], key, simulator.config)
     return simulator.reset(road_map, start[None], worlds=worlds)
 
 
@@ -194,7 +194,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
             ranges, _, ends = simulator.step(drive.actions[k - 1 : k])
             if ends[0] != End.RUNNING:
                 raise GridSimError(f"the replay ends at row {k} of {n}: the drive was recorded on another map")
-        rows.append((simulator.state.cars[0].copy(), ranges[0].copy(), simulator.state.worlds[0].copy()))
+        rows.append((simulator.cars[0].copy(), ranges[0].copy(), simulator.worlds[0].copy()))
     cars, views, worlds = (np.stack(column) for column in zip(*rows, strict=True))
     return np.where(begins[:, None], drive.poses, poses_of(cars)), cars, views, worlds
 
@@ -230,12 +230,12 @@ def drive(
         if window.closed or pressed & {"escape", "q"} or steps * PERIOD >= seconds:
             return {"seconds": steps * PERIOD, "episodes": episode + 1, "distance_m": best}
         if "r" in pressed:
-            if simulator.state.cars[0, STEPS] > 0:
+            if simulator.cars[0, STEPS] > 0:
                 episode += 1
             ranges = _begin(simulator, road_map, start, episode)
             path = [start[:2].copy()]
-        before, view, there = simulator.state.cars[0].copy(), ranges[0], _present(simulator.state.worlds[0])
-        ended = simulator.state.ends[0] != End.RUNNING
+        before, view, there = simulator.cars[0].copy(), ranges[0], _present(simulator.worlds[0])
+        ended = simulator.ends[0] != End.RUNNING
         if not ended:
             step = int(before[STEPS])
             action = action_for(held, float(before[SPEED]))
@@ -243,7 +243,7 @@ def drive(
                 recorder.write(step, start if step == 0 else poses_of(before), action, episode)
             ranges, _, _ = simulator.step(np.array([int(action)]))
             steps += 1
-        after, then = simulator.state.cars[0], _present(simulator.state.worlds[0])
+        after, then = simulator.cars[0], _present(simulator.worlds[0])
         best = max(best, float(after[DISTANCE]))
         for k in range(1, pictures + 1):
             part = k / pictures

@@ -69,7 +69,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
         road = of.scenarios[episode["map"]]
         simulator = Simulator(1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
         ranges = simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
-        car = simulator.state.cars[0]
+        car = simulator.cars[0]
         for step in range(int(result["steps"]) + 1):
             encode(ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
             shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])

@@ -65,9 +65,9 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
             for i, k in enumerate(cars):
                 row, states, traffic = paths[k]
                 at = min(step, int(row["steps"]))
-                assert simulator.state.cars[i].tobytes() == states[at].tobytes()
-                assert simulator.state.worlds[i].tobytes() == traffic[at].tobytes()
-            speeds = simulator.state.cars[:, SPEED].copy()
+                assert simulator.cars[i].tobytes() == states[at].tobytes()
+                assert simulator.worlds[i].tobytes() == traffic[at].tobytes()
+            speeds = simulator.cars[:, SPEED].copy()
             ranges, _, ends = simulator.step(actions_of(spec, genome, ranges, speeds))
         assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
 
@@ -102,15 +102,15 @@ def test_what_is_rewound_goes_on_as_it_did(among):
         ranges = original.reset(road_map, episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
         again.reset(road_map, start[None], worlds=world[None])
         for step in range(last):
-            action = actions_of(spec, genome, ranges, original.state.cars[:, SPEED].copy())
+            action = actions_of(spec, genome, ranges, original.cars[:, SPEED].copy())
             ranges, *_ = original.step(action)
             if step >= first:
-                assert not again.state.ends[0]
+                assert not again.ends[0]
                 again.step(action)
                 # A start has an angle where the state has its cosine and sine: what differs is rounding.
-                assert (again.state.worlds[0, :, LANE] == traffic[step + 1][:, LANE]).all()
-                assert again.state.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
-        assert again.state.ends[0] == End.COLLISION
+                assert (again.worlds[0, :, LANE] == traffic[step + 1][:, LANE]).all()
+                assert again.worlds[0, :, ALONG] == pytest.approx(traffic[step + 1][:, ALONG], abs=1e-2)
+        assert again.ends[0] == End.COLLISION
 
 
 def test_without_room_for_anybody_there_is_no_traffic(among):

@@ -160,7 +160,7 @@ def test_nothing_tunnels_through_head_on_at_60_mps(cross, aside):
     for phase in np.arange(0.0, 6.0, 0.4):
         simulator, end = meet(cross, [229.0, 128.0 + aside, 0.0, 30.0, 0.0], 0, SIDE - 23.0 - phase)
         assert end == (End.COLLISION if abs(aside) < 2.0 else End.RUNNING)
-        car, other = simulator.state.cars[0], simulator.state.worlds[0, 0]
+        car, other = simulator.cars[0], simulator.worlds[0, 0]
         assert other[SPEED] == pytest.approx(30.0, abs=1e-3)
         if end == End.COLLISION:
             # They met half way; each moves half a metre at most between two looks.
@@ -212,5 +212,5 @@ def test_waiting_behind_a_standing_car_is_not_idle(cross, gap, ends):
     for step in range(50):
         *_, now = simulator.step(np.array([Action.NONE]))
         assert now[0] == (End.IDLE if ends and step >= 14 else End.RUNNING)
-    assert simulator.state.cars[0, DISTANCE] == 0.0
-    assert simulator.state.cars[0, IDLE] == (15 if ends else 0)
+    assert simulator.cars[0, DISTANCE] == 0.0
+    assert simulator.cars[0, IDLE] == (15 if ends else 0)

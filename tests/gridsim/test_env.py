@@ -92,8 +92,8 @@ def test_spaces_and_traffic_are_those_of_the_options(name: str, observation: str
     assert space.shape == ((32,) if observation == "rays" else (frames, CELLS, CELLS))
     assert space.dtype == (np.float32 if observation == "rays" else np.uint8)
     assert env.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
-    assert env.unwrapped.simulator.state.worlds.shape[1] == REGISTRY[ENVIRONMENTS[name]].traffic
-    assert GridSimVectorEnv(1, scenario="city", maps=1, traffic=2).simulator.state.worlds.shape[1] == 2
+    assert env.unwrapped.simulator.worlds.shape[1] == REGISTRY[ENVIRONMENTS[name]].traffic
+    assert GridSimVectorEnv(1, scenario="city", maps=1, traffic=2).simulator.worlds.shape[1] == 2
 
 
 # --- seeds
@@ -117,10 +117,10 @@ def test_an_episode_follows_from_seed_and_number_alone(maps: Maps, name: str, op
 
     def run(env: GridSimVectorEnv, seed: int, actions: np.ndarray, keep: Any) -> list[list[np.ndarray]]:
         observations, info = env.reset(seed=seed)
-        seen = [keep([observations, env.simulator.state.worlds.copy(), *info.values()])]
+        seen = [keep([observations, env.simulator.worlds.copy(), *info.values()])]
         for row in actions:
             observations, *outcome, info = env.step(row)
-            seen.append(keep([observations, env.simulator.state.worlds.copy(), *outcome, *info.values()]))
+            seen.append(keep([observations, env.simulator.worlds.copy(), *outcome, *info.values()]))
         return seen
 
     first = run(env, 50, actions, copy.deepcopy)
@@ -163,9 +163,9 @@ def test_the_reward_among_traffic_is_the_papers(maps: Maps) -> None:
     nearer = collisions = 0
     over = np.zeros(8, dtype=bool)
     for _ in range(300):
-        before = env.simulator.state.cars.astype(np.float64)
+        before = env.simulator.cars.astype(np.float64)
         _, rewards, terminations, truncations, info = env.step(np.full(8, Action.ACCELERATE))
-        state = env.simulator.state
+        state = env.simulator
         for i in range(8):
             cars, road = state.cars[i : i + 1], env.simulator.map_of(i)
             ranges = views(road, cars, state.worlds[i : i + 1], env.config)[0][0]
@@ -221,7 +221,7 @@ def test_rays_motion_speed_and_steering_are_shares(maps: Maps) -> None:
     for step in range(200):
         seen, *_, info = env.step(np.full(8, Action.ACCELERATE if step % 50 else Action.ACCELERATE_LEFT))
         fastest = max(fastest, np.abs(env.simulator.closing).max())
-        cars = env.simulator.state.cars
+        cars = env.simulator.cars
         np.testing.assert_allclose(seen[:, :31] * 50.0, env.ranges, rtol=1e-6)
         np.testing.assert_allclose(seen[:, 31:62] * 30.0, np.clip(env.simulator.closing, -30.0, 30.0), atol=1e-5)
         np.testing.assert_allclose(seen[:, 62] * 30.0, info["speed_mps"], rtol=1e-6)
@@ -234,9 +234,9 @@ def test_pedal_and_wheel_are_clipped_and_do_what_they_say(maps: Maps) -> None:
     env.reset(seed=0, options={"map_seed": 0})
     *_, info = env.step(np.array([[1e300, 0.0], [0.5, 0.0], [0.0, 0.0]]))
     np.testing.assert_allclose(info["speed_mps"], [0.3, 0.15, 0.0], atol=1e-6)  # 3 m/s2 for 0.1 s
-    assert env.simulator.state.cars[:, STEERING] == pytest.approx(0.0)
+    assert env.simulator.cars[:, STEERING] == pytest.approx(0.0)
     env.step(np.array([[0.0, 1.01], [0.0, -math.inf], [0.0, 0.1]]))
-    steering = np.degrees(env.simulator.state.cars[:, STEERING])
+    steering = np.degrees(env.simulator.cars[:, STEERING])
     np.testing.assert_allclose(steering, [6.0, -6.0, 2.7], atol=1e-3)  # 60 degrees/s; 27 at the lock
 
 
@@ -384,13 +384,13 @@ def test_wrong_seeds_and_masks_are_refused_and_a_car_that_has_ended_must_be_rese
 def test_a_wrong_action_is_refused(maps: Maps, actions: Any, action: object, text: str) -> None:
     env = GridSimVectorEnv(3, scenario="city", maps=maps["city"][:1], actions=actions)
     env.reset(seed=0)
-    before, traffic = env.simulator.state.cars.copy(), env.simulator.state.worlds.copy()
+    before, traffic = env.simulator.cars.copy(), env.simulator.worlds.copy()
     with pytest.raises(ValueError, match=rf"^[^\n]*{text}[^\n]*$"):
         env.step(np.array([action] * 3))
     with pytest.raises(ValueError, match="cars"):
         env.step(np.zeros((4, 2)))
-    np.testing.assert_array_equal(env.simulator.state.cars, before)
-    np.testing.assert_array_equal(env.simulator.state.worlds, traffic)
+    np.testing.assert_array_equal(env.simulator.cars, before)
+    np.testing.assert_array_equal(env.simulator.worlds, traffic)
     single = GridSimEnv("city", maps=maps["city"][:1], actions=actions)
     single.reset(seed=0)
     with pytest.raises(ValueError, match=text):

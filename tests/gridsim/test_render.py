@@ -24,7 +24,7 @@ def state(scenario):
     """A car that stands at a start, and what it sees."""
     simulator = Simulator(1)
     ranges = simulator.reset(scenario, sample_starts(scenario, 1, np.random.default_rng(5)))
-    return simulator.state.cars[0].copy(), ranges[0]
+    return simulator.cars[0].copy(), ranges[0]
 
 
 def car_at(x, y, heading=0.0):

@@ -214,9 +214,9 @@ def test_no_road_can_be_driven_without_steering(name):
     simulator = Simulator(512)
     for pace in (5.5, 7.0, 12.0):
         simulator.reset([scenario for scenario in eight for _ in range(64)], starts)
-        ends = simulator.state.ends
+        ends = simulator.ends
         while (ends == End.RUNNING).any():
-            speeds = simulator.state.cars[:, SPEED]
+            speeds = simulator.cars[:, SPEED]
             *_, ends = simulator.step(np.where(speeds < pace, Action.ACCELERATE, Action.NONE))
         assert (ends == End.SUCCESS).mean() <= 0.02
 

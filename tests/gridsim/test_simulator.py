@@ -33,11 +33,11 @@ def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
     ranges = simulator.reset(road_map, start[None])
     actions: list[int] = []
     states = []
-    while simulator.state.ends[0] == End.RUNNING:
-        actions.append(int(choose(len(actions), ranges[0], simulator.state.cars[0])))
+    while simulator.ends[0] == End.RUNNING:
+        actions.append(int(choose(len(actions), ranges[0], simulator.cars[0])))
         ranges, *_ = simulator.step(np.array(actions[-1:]))
-        states.append(simulator.state.cars[0].copy())
-    end = End(simulator.state.ends[0]).name
+        states.append(simulator.cars[0].copy())
+    end = End(simulator.ends[0]).name
     return SimpleNamespace(start=start, actions=np.array(actions), states=np.array(states), end=end)
 
 
@@ -219,7 +219,7 @@ def test_a_start_is_taken_onto_the_torus(straight):
     simulator = Simulator(1)
     for _ in range(2):  # the second time after a step
         simulator.reset(straight, np.array([[-4.0, 32.0 + 128.0, math.pi / 2, 7.0, 0.1]]))
-        car = simulator.state.cars[0].copy()
+        car = simulator.cars[0].copy()
         simulator.step(np.array([Action.ACCELERATE_LEFT]))
     assert (car[X], car[Y]) == (1020.0, 32.0)
     assert (car[COS], car[SIN]) == pytest.approx((0.0, 1.0), abs=1e-6)
@@ -233,7 +233,7 @@ def test_cars_that_begin_without_traffic_have_none():
     worlds = spawn(scenario.network, starts, 3, np.arange(4, dtype=np.uint64), CONFIG)
     simulator = Simulator(4, traffic=3)
     simulator.reset(scenario, starts, worlds=worlds)
-    assert (simulator.state.worlds[:, :, LANE] >= 0).any()
+    assert (simulator.worlds[:, :, LANE] >= 0).any()
     simulator.reset(scenario, starts[:2], cars=np.array([0, 1]))
-    assert (simulator.state.worlds[:2, :, LANE] < 0).all()
-    assert (simulator.state.worlds[2:] == worlds[2:]).all()
+    assert (simulator.worlds[:2, :, LANE] < 0).all()
+    assert (simulator.worlds[2:] == worlds[2:]).all()

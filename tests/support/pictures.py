@@ -103,7 +103,7 @@ def record_drive(path, scenario, start, episodes):
         for episode, actions in enumerate(episodes):
             simulator.reset(scenario, start[None])
             for step, action in enumerate(actions):
-                states.append(start if step == 0 else poses_of(simulator.state.cars[0]))
+                states.append(start if step == 0 else poses_of(simulator.cars[0]))
                 recorder.write(step, states[-1], action, episode)
                 assert path.read_text().count("\n") == recorder.rows + 1  # whatever happens next, it is kept
                 *_, ends = simulator.step(np.array([action]))
