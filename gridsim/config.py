@@ -11,7 +11,6 @@ import numpy as np
 _F = np.float32
 
 FILE_SPEEDS = (5.0, 12.0)  # m/s, speed interval of a map file that gives none
-START_SPEED = 0.0  # m/s; at rest, so that a car that never accelerates or brakes does not get far
 SUBSTEP = _F(1.0)  # m a car moves between collision checks, at most
 REENTRY = _F(12.0)  # m driven; returning to a cell within this distance still counts as the same visit
 

@@ -26,7 +26,7 @@ import numpy as np
 import yaml
 from PIL import Image
 
-from gridsim.config import FILE_SPEEDS, START_SPEED, SimConfig, VehicleConfig
+from gridsim.config import FILE_SPEEDS, SimConfig, VehicleConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, without_lanes
 from gridsim.maps.raster import HALF_WALL, OUTSIDE, check_starts, find_starts, road_length, signed_clearance
@@ -317,5 +317,5 @@ def _load(name: str, _digest: str, config: SimConfig) -> Map:
         raise GridSimError(f"{path}: {error}") from None
     _warn(path.stem, file, free, nodes, config.episode.revisit)
     starts = np.zeros((len(poses), 5), dtype=np.float32)
-    starts[:, :3], starts[:, 3] = poses, START_SPEED
+    starts[:, :3] = poses
     return without_lanes(name, nodes, file.speed, 2.0 * HALF_WALL, starts)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.config import START_SPEED
 from gridsim.jit import njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network
@@ -83,7 +82,7 @@ def blank() -> Map:
 
 
 @njit
-def _starts_at(points, mileage, shares, speed, starts):
+def _starts_at(points, mileage, shares, starts):
     for k in range(shares.shape[0]):
         metres = shares[k] * mileage[-1]
         i = min(np.searchsorted(mileage, metres, side="right"), len(mileage) - 1) - 1
@@ -91,7 +90,7 @@ def _starts_at(points, mileage, shares, speed, starts):
         x, y = points[i, 0], points[i, 1]
         dx, dy = points[i + 1, 0] - x, points[i + 1, 1] - y
         starts[k, 0], starts[k, 1] = x + part * dx, y + part * dy
-        starts[k, 2], starts[k, 3], starts[k, 4] = math.atan2(dy, dx), speed, 0.0
+        starts[k, 2], starts[k, 3], starts[k, 4] = math.atan2(dy, dx), 0.0, 0.0
 
 
 def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
@@ -103,7 +102,7 @@ def starts_at(road_map: Map, shares: np.ndarray) -> np.ndarray:
     if not len(road_map.network.steps):
         return road_map.starts[(np.asarray(shares) * len(road_map.starts)).astype(np.intp)]
     starts = np.empty((len(shares), 5), dtype=np.float32)
-    _starts_at(road_map.network.points, road_map.mileage, shares, np.float32(START_SPEED), starts)
+    _starts_at(road_map.network.points, road_map.mileage, shares, starts)
     return starts
 
 
