@@ -13,21 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.config import (
-    CAUTION,
-    LANE_CHANGE_ALONE,
-    LANE_CHANGE_PERIOD,
-    LANE_CHANGE_SIGHT,
-    LOOK_AHEAD,
-    LOOK_AHEAD_TIME,
-    NEIGHBOUR_WIDENING,
-    STEEPEST_SWERVE,
-    STOP_LINE_GAP,
-    SWERVE_RADIUS,
-    Constants,
-    SimConfig,
-    constants,
-)
+from gridsim import config
+from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
 from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
@@ -127,8 +114,8 @@ def _swerve(drivers, speed, shift, sway, place, way):
 
     The path bends no harder than SWERVE_RADIUS and the lateral acceleration of traffic in bends allow.
     """
-    bend = min(_ONE / SWERVE_RADIUS, drivers.lateral / max(speed * speed, _ONE))
-    steepest = min(STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, _ONE))
+    bend = min(_ONE / config.SWERVE_RADIUS, drivers.lateral / max(speed * speed, _ONE))
+    steepest = min(config.STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, _ONE))
     left = place - shift
     # With this slope it would end up parallel to the lane, using half the bend.
     wanted = math.copysign(min(math.sqrt(bend * abs(left)), steepest), left)
@@ -149,8 +136,8 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
     shift, sway = car[SHIFT], car[SWAY]
     aside_by = furthest > _ZERO or shift != _ZERO
     swerved = _ZERO  # way up to which shift and sway are known
-    half_length = drivers.half_length + drivers.half_width + CAUTION
-    half_width = drivers.half_width + drivers.half_width + CAUTION
+    half_length = drivers.half_length + drivers.half_width + config.CAUTION
+    half_width = drivers.half_width + drivers.half_width + config.CAUTION
     lane = _I(car[LANE])
     travelled = drivers.half_length
     along = car[ALONG] + travelled
@@ -182,7 +169,7 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
                 if free < _ZERO:
                     return travelled
-                hop = max(free, drivers.half_width + CAUTION)  # the path is free for at least this far
+                hop = max(free, drivers.half_width + config.CAUTION)  # the path is free for at least this far
                 along += hop
                 travelled += hop
         along -= length
@@ -229,11 +216,11 @@ def _find_gaps(network, drivers, world, ego):
     cars = world.shape[0]
     for i in range(cars):
         speed = world[i, SPEED]
-        way = speed * (LOOK_AHEAD_TIME + speed / (_F(2.0) * drivers.comfort))  # to notice something and to stop
-        world[i, HORIZON] = drivers.jam + LOOK_AHEAD + way
+        way = speed * (config.LOOK_AHEAD_TIME + speed / (_F(2.0) * drivers.comfort))  # to notice something and to stop
+        world[i, HORIZON] = drivers.jam + config.LOOK_AHEAD + way
         world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
     # The search goes beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
-    beyond = _F(2.0) * (drivers.half_length + CAUTION)
+    beyond = _F(2.0) * (drivers.half_length + config.CAUTION)
     for i in range(cars):
         if world[i, LANE] < _ZERO:
             continue
@@ -265,7 +252,7 @@ def change_lanes(network, drivers, world, i, ego):
     if car[LANE_TIMER] > _ZERO:
         car[LANE_TIMER] -= _ONE
         return
-    car[LANE_TIMER] = LANE_CHANGE_PERIOD - _ONE
+    car[LANE_TIMER] = config.LANE_CHANGE_PERIOD - _ONE
     lane = _I(car[LANE])
     if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
         _choose_neighbour(network, drivers, world, i, ego)
@@ -320,19 +307,19 @@ def _choose_neighbour(network, drivers, world, i, ego):
                 continue
             dx, dy = other[X] - car[X], other[Y] - car[Y]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-            if dx * dx + dy * dy > LANE_CHANGE_SIGHT * LANE_CHANGE_SIGHT:
+            if dx * dx + dy * dy > config.LANE_CHANGE_SIGHT * config.LANE_CHANGE_SIGHT:
                 continue
             if j < world.shape[0]:
                 ahead = _way_between(network, target, along, other)
                 behind = -_way_between(network, lane, car[ALONG], other)
                 changes = ahead > _F(1e8) and behind < _F(-1e8) and other[SHIFT] != _ZERO
-                if changes and dx * dx + dy * dy < LANE_CHANGE_ALONE * LANE_CHANGE_ALONE:
+                if changes and dx * dx + dy * dy < config.LANE_CHANGE_ALONE * config.LANE_CHANGE_ALONE:
                     free = False  # another car is changing lanes, to or from the target lane
                 wish = _desired(network, other)
             else:
                 forward = dx * car[COS] + dy * car[SIN]  # the ego car is on no lane
                 aside = dy * car[COS] - dx * car[SIN]
-                reach = _HALF * apart + drivers.half_width + NEIGHBOUR_WIDENING * forward * forward
+                reach = _HALF * apart + drivers.half_width + config.NEIGHBOUR_WIDENING * forward * forward
                 sideways = apart if side == 0 else -apart
                 ahead = forward if abs(aside - sideways) <= reach else _F(1e9)
                 behind = -forward if abs(aside) <= reach else _F(-1e9)
@@ -431,7 +418,8 @@ def flow(network, drivers, world, ego):
                 if may_enter(network, drivers, world, i, ego):
                     car[PERMIT] = car[NEXT]
                 else:
-                    pace = min(pace, idm(drivers, car[SPEED], desired, line + drivers.jam - STOP_LINE_GAP, _ZERO))
+                    gap = line + drivers.jam - config.STOP_LINE_GAP
+                    pace = min(pace, idm(drivers, car[SPEED], desired, gap, _ZERO))
         car[ACCELERATION] = pace
     for i in range(cars):
         if world[i, LANE] >= _ZERO:

@@ -9,16 +9,7 @@ import math
 
 import numpy as np
 
-from gridsim.config import (
-    CAUTION,
-    CROSSING_TIME,
-    EGO_BEHIND,
-    EGO_CLEARANCE,
-    EGO_INSIDE,
-    EGO_SECTOR_COSINE,
-    JUNCTION_MARGIN,
-    WALKING_PACE,
-)
+from gridsim import config
 from gridsim.jit import leaf
 from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
 from gridsim.traffic.world import (
@@ -45,7 +36,7 @@ def _blocked_by_waiting_car(network, drivers, lane, other):
     """Whether the rear of a car that waits at the end of `other` blocks a lane with the same beginning."""
     step = network.steps[other]
     q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
-    reach = _F(2.0) * drivers.half_width + _F(2.0) * CAUTION
+    reach = _F(2.0) * drivers.half_width + _F(2.0) * config.CAUTION
     for p in range(network.offsets[lane], network.offsets[lane + 1]):
         dx = wrapped_any(network.points[p, 0] - network.points[q, 0], network.width)
         dy = wrapped_any(network.points[p, 1] - network.points[q, 1], network.height)
@@ -77,8 +68,8 @@ def _in_ego_path(network, lane, ego, way):
         squared = dx * dx + dy * dy
         if squared < way * way:
             forward = dx * ego[COS] + dy * ego[SIN]
-            if squared < EGO_CLEARANCE * EGO_CLEARANCE or (
-                forward > _ZERO and forward * forward > EGO_SECTOR_COSINE * EGO_SECTOR_COSINE * squared
+            if squared < config.EGO_CLEARANCE * config.EGO_CLEARANCE or (
+                forward > _ZERO and forward * forward > config.EGO_SECTOR_COSINE * config.EGO_SECTOR_COSINE * squared
             ):
                 return True
     return False
@@ -105,10 +96,10 @@ def may_enter(network, drivers, world, i, ego):
             other = network.crossings[c]
             if permit == other:
                 return False
-            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + JUNCTION_MARGIN:
+            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + config.JUNCTION_MARGIN:
                 return False
             if past == other and lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
-                network.clear[c] + JUNCTION_MARGIN
+                network.clear[c] + config.JUNCTION_MARGIN
             ):
                 return False
         waits = _I(-1)  # lane of this junction at whose end the other car may have to wait
@@ -127,7 +118,7 @@ def may_enter(network, drivers, world, i, ego):
             if there == lane or permit == lane:
                 return False
             for k in range(network.successors.shape[1]):
-                slow = there == network.successors[lane, k] and world[j, SPEED] < WALKING_PACE
+                slow = there == network.successors[lane, k] and world[j, SPEED] < config.WALKING_PACE
                 if slow and world[j, ALONG] < place + drivers.half_length:
                     return False
         elif there == beyond:
@@ -143,11 +134,12 @@ def may_enter(network, drivers, world, i, ego):
     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
     forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
     same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
-    way = EGO_CLEARANCE + CROSSING_TIME * max(ego[SPEED], _ZERO)
+    way = config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[SPEED], _ZERO)
     far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
-    if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < EGO_BEHIND)):
+    if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < config.EGO_BEHIND)):
         if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):
             return False
-        rear = _way_to_point(network, beyond, ego[X], ego[Y], drivers.half_width + EGO_INSIDE) - drivers.half_length
+        within = drivers.half_width + config.EGO_INSIDE
+        rear = _way_to_point(network, beyond, ego[X], ego[Y], within) - drivers.half_length
         room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
     return room >= needed
