@@ -12,13 +12,8 @@ from typing import Any as _Any
 
 from gymnasium.envs.registration import register as _register
 
-ENVIRONMENTS = {
-    "GridSim/Highway-v0": "highway",
-    "GridSim/Curved-v0": "curved",
-    "GridSim/Seamless-v0": "seamless",
-    "GridSim/Roundabout-v0": "roundabout",
-    "GridSim/City-v0": "city",
-}
+_SCENARIOS = ("highway", "curved", "seamless", "roundabout", "city")
+ENVIRONMENTS = {f"GridSim/{name.title()}-v0": name for name in _SCENARIOS}
 """The scenario of each environment id."""
 
 _API_MODULE = "cluster.api"
