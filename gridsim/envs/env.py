@@ -152,7 +152,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         #: float32 [n, rays], m: the ranges behind the last observations.
         self.ranges = np.zeros((num_envs, self.config.sensors.rays), dtype=np.float32)
-        self._seeded = self._started = False
+        self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy has its own renderers and its own window."""
@@ -186,7 +186,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._seed(seed, which)
         if map_seed is not None:
             self._views.clear()  # of maps that may not be seen again
-        self.ranges = self.ranges.copy()
         self.ranges[which] = self._begin(which, map_seed, start)
         self._started = True
         self._note(which, mask)
@@ -234,11 +233,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             seeds = seed
             if len(seeds) != n or not all(s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in seeds):
                 raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
-        if self._seeded:
-            episodes.numbers[which] += _U(1)
-        else:
-            episodes.keys[:] = _U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
-            self._seeded = True
+        episodes.numbers[which] += _U(1)
         for i in which:
             given = seeds[i]
             if given is not None:
@@ -345,14 +340,11 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012, Gymnasium's own form
 
-    def __init__(
-        self, scenario: str = "seamless", *, render_mode: Literal["rgb_array", "human"] | None = None, **options: Any
-    ):
+    def __init__(self, scenario: str = "seamless", **options: Any):
         if "autoreset_mode" in options:
             raise ValueError("autoreset_mode is for vector environments; a single one is reset by its caller")
-        options["autoreset_mode"] = AutoresetMode.DISABLED
-        self.cars = GridSimVectorEnv(1, scenario=scenario, render_mode=render_mode, **options)
-        self.render_mode = render_mode
+        self.cars = GridSimVectorEnv(1, scenario=scenario, autoreset_mode=AutoresetMode.DISABLED, **options)
+        self.render_mode = self.cars.render_mode
         self.metadata = {**self.metadata, "render_modes": self.cars.metadata["render_modes"]}
         self._spec: EnvSpec | None = None
         self.observation_space = self.cars.single_observation_space

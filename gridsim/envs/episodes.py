@@ -37,7 +37,7 @@ class Episodes:
     """The episodes of a batch of cars.
 
     Attributes:
-        keys: uint64 [n], each car's seed.
+        keys: uint64 [n], each car's seed; at first random ones.
         numbers: uint64 [n], each car's current episode, counted from its seeding.
     """
 
@@ -56,7 +56,7 @@ class Episodes:
             raise ValueError("an environment needs 1 map or more")
         # The maps of `_seeds` that were built so far.
         self._own: dict[int, Map] = {} if isinstance(maps, int) else {each.seed: each for each in maps}
-        self.keys = np.zeros(cars, dtype=np.uint64)
+        self.keys = np.random.default_rng().integers(1 << 63, size=cars, dtype=np.uint64)
         self.numbers = np.zeros(cars, dtype=np.uint64)
 
     def draw(
