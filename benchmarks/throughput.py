@@ -113,7 +113,7 @@ def vector_env(
     for run in range(runs + 1):
         spent, driven = 0.0, 0
         for _ in range(steps):
-            _actions(packed, layers, env.ranges, info["speed_mps"], actions)
+            _actions(packed, layers, env.simulator.ranges, info["speed_mps"], actions)
             driven += CARS - int(over.sum())
             start = time.perf_counter()
             _, _, terminations, truncations, info = env.step(actions)

@@ -150,8 +150,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        #: float32 [n, rays], m: the ranges behind the last observations.
-        self.ranges = np.zeros((num_envs, self.config.sensors.rays), dtype=np.float32)
         self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -186,10 +184,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._seed(seed, which)
         if map_seed is not None:
             self._views.clear()  # of maps that may not be seen again
-        self.ranges[which] = self._begin(which, map_seed, start)
+        self._begin(which, map_seed, start)
         self._started = True
         self._note(which, mask)
-        return self._observer.look(self.ranges), {name: part * mask for name, part in self._info().items()}
+        return self._observer.look(), {name: part * mask for name, part in self._info().items()}
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control period of every car, or the beginning of its next episode, as `autoreset_mode` says.
@@ -208,14 +206,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         if np.shape(actions) != self.action_space.shape:
             each = f"{self.num_envs} cars, each with an action of {self.single_action_space}"
             raise ValueError(f"there are {each}, not actions of shape {np.shape(actions)}")
-        self.ranges, rewards, ends = self.simulator.step(actions)
+        rewards = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
             self._episodes.numbers[which] += _U(1)
-            self.ranges[which] = self._begin(which)
-            ends[which] = End.RUNNING
+            self._begin(which)
         self._note(slice(None), begun)
-        observations, info = self._observer.look(self.ranges), self._info()
+        observations, info, ends = self._observer.look(), self._info(), self.simulator.ends
         terminations, truncations = TERMINATES[ends], TRUNCATES[ends]
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ends.any():
             info = self._begin_anew(observations, info, ends != 0)
@@ -239,10 +236,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             if given is not None:
                 episodes.keys[i], episodes.numbers[i] = int(given) % (1 << 64), 0
 
-    def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> np.ndarray:
-        """Begin the current episodes of cars `which`. Returns: ranges [k, rays]."""
+    def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> None:
+        """Begin the current episodes of cars `which`."""
         maps, starts, worlds = self._episodes.draw(which, map_seed, start)
-        return self.simulator.reset(maps, starts, which, worlds)
+        self.simulator.reset(maps, starts, which, worlds)
 
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Begin the next episodes of cars `over` [n]; changes `observations`. Returns: info of both episodes."""
@@ -251,9 +248,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         for i in which.tolist():
             last[i] = copy.deepcopy(row(observations, i))
         self._episodes.numbers[which] += _U(1)
-        self.ranges[which] = self._begin(which)
+        self._begin(which)
         self._note(which, over)
-        seen = self._observer.look(self.ranges[which], which)
+        seen = self._observer.look(which)
         if isinstance(seen, dict):
             for name, part in seen.items():
                 observations[name][which] = part
@@ -267,7 +264,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args: begun bool [n]: whose episode has just begun.
         """
-        self._observer.take(self.ranges[which], begun[which], which)
+        self._observer.take(begun[which], which)
         if self.render_mode is None:
             return
         for path, car, new in zip(self._paths, self.simulator.cars, begun, strict=True):
@@ -297,7 +294,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return view.draw(
             car,
             boxes=world[world[:, LANE] >= 0.0],
-            ranges=self.ranges[i],
+            ranges=self.simulator.ranges[i],
             path=np.array(self._paths[i]),
             text=(f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m",),
         )

@@ -59,11 +59,11 @@ class Observer:
         elif observation == "grid":
             self.space = Dict({"grid": image, "speed": Box(self._slowest, 1.0, (1,), dtype=np.float32)})
 
-    def take(self, ranges: np.ndarray, begun: np.ndarray, which: np.ndarray | slice) -> None:
-        """Add `ranges` [k, rays] as the newest frames of cars `which` [k], or as all frames where they have `begun`."""
+    def take(self, begun: np.ndarray, which: np.ndarray | slice) -> None:
+        """Add the newest frames of cars `which` [k], as all frames of those that have `begun` [k]."""
         if self._observation == "rays" or self._stack.shape[1] == 1:
             return
-        stack, newest = self._stack[which], self._grids(ranges)
+        stack, newest = self._stack[which], self._grids(which)
         for k in range(stack.shape[1] - 1):
             stack[:, k] = stack[:, k + 1]
         stack[:, -1] = newest
@@ -71,24 +71,24 @@ class Observer:
         if not isinstance(which, slice):  # then it is a copy
             self._stack[which] = stack
 
-    def look(self, ranges: np.ndarray, which: np.ndarray | slice = _ALL) -> Seen:
-        """Observations of cars `which` from ranges [k, rays], after `take`; the caller owns them."""
+    def look(self, which: np.ndarray | slice = _ALL) -> Seen:
+        """Observations of cars `which`, after `take`; the caller owns them."""
         speeds = np.ascontiguousarray(self._simulator.cars[which, SPEED])
         if self._observation == "rays":
-            return self._rays(ranges, speeds, which)
+            return self._rays(speeds, which)
         one = self._stack.shape[1] == 1
-        image = self._grids(ranges)[:, None] if one else self._stack[which].copy()
+        image = self._grids(which)[:, None] if one else self._stack[which].copy()
         if self._observation == "image":
             return image
         share = np.clip(speeds / _F(self.config.vehicle.speed_limit), self._slowest, _F(1.0))
         return {"grid": image, "speed": share[:, None]}
 
-    def _grids(self, ranges: np.ndarray) -> np.ndarray:
+    def _grids(self, which: np.ndarray | slice) -> np.ndarray:
         # The table is not stored: copies of it would be writable, and kernels would be compiled again for them.
-        return grids(grid_table(self.config), ranges)
+        return grids(grid_table(self.config), self._simulator.ranges[which])
 
-    def _rays(self, ranges: np.ndarray, speeds: np.ndarray, which: np.ndarray | slice) -> np.ndarray:
-        vehicle = self.config.vehicle
+    def _rays(self, speeds: np.ndarray, which: np.ndarray | slice) -> np.ndarray:
+        vehicle, ranges = self.config.vehicle, self._simulator.ranges[which]
         observations = np.empty((len(ranges), self._width), dtype=np.float32)
         closing = self._simulator.closing[which] if self._motion else None
         reach, limit = _F(self.config.sensors.range), _F(vehicle.speed_limit)

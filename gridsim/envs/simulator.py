@@ -30,14 +30,14 @@ class Physics(NamedTuple):
 
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
-    """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; fills `ranges` [k, rays]."""
+    """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; they look around."""
     for row, first, last in runs:
         road = road_of(physics.atlas, row)
         for k in order[first:last]:
             i = which[k]
             world = None if worlds is None else worlds[i]
             place(road, starts[k], cars[i], visits[i])
-            look(road, physics.constants, physics.fan, cars[i], world, ranges[k], closing[i])
+            look(road, physics.constants, physics.fan, cars[i], world, ranges[i], closing[i])
 
 
 @njit(nogil=True)
@@ -88,7 +88,8 @@ class Simulator:
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         ends: uint8 [n], End.
         worlds: float32 [n, traffic, world.FIELDS], the other cars around each.
-        closing: float32 [n, rays], m/s: closing speeds at the last step or reset, as in `boxes.cast_boxes`.
+        ranges: float32 [n, rays], m, after the last step or reset.
+        closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `boxes.cast_boxes`.
     """
 
     def __init__(
@@ -119,7 +120,8 @@ class Simulator:
         self.visits = np.zeros((cars, 0), dtype=np.float32)
         self.ends = np.zeros(cars, dtype=np.uint8)
         self.worlds = np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32)  # all are absent
-        self.closing = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
+        self.ranges = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
+        self.closing = np.zeros_like(self.ranges)
         self._physics: Physics | None = None  # made when a kernel first needs it
         self._charted: list[Map] = []  # the maps in the atlas
         self._rows = np.full(cars, -1)  # of each car's map in the atlas; -1 before its first reset
@@ -138,7 +140,7 @@ class Simulator:
         starts: np.ndarray,
         cars: np.ndarray | None = None,
         worlds: np.ndarray | None = None,
-    ) -> np.ndarray:
+    ) -> None:
         """Begin episodes.
 
         Args:
@@ -146,13 +148,10 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
-
-        Returns: ranges float32 [k, rays] in m.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
         starts = starts.astype(np.float32)
-        ranges = np.empty((len(cars), self.config.sensors.rays), dtype=np.float32)
         self.worlds[cars] = -1.0 if worlds is None else worlds
         rows = self._chart(maps)
         cells = max(visit_cells(each.road) for each in set(maps))
@@ -160,12 +159,11 @@ class Simulator:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
         physics, around = self._kernel_physics(), self._kernel_worlds()
-        _place_all(physics, *_by_map(rows), cars, starts, self.cars, self.visits, around, ranges, self.closing)
+        _place_all(physics, *_by_map(rows), cars, starts, self.cars, self.visits, around, self.ranges, self.closing)
         self.ends[cars] = End.RUNNING
         if (self._rows[cars] != rows).any():
             self._rows[cars] = rows
             self._groups = _by_map(self._rows)
-        return ranges
 
     def map_of(self, car: int) -> Map:
         """The map on which a car drives."""
@@ -189,20 +187,19 @@ class Simulator:
         row_of = {each: row for row, each in enumerate(self._charted)}
         return np.array([row_of[each] for each in maps])
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def step(self, actions: np.ndarray) -> np.ndarray:
         """One control period of every car. A car whose episode has ended stands still until it is reset.
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
-        Returns: (ranges float32 [n, rays] in m, rewards float32 [n], 0 for a car that stood still, ends uint8 [n],
-        End); the caller owns the arrays.
+        Returns: the rewards float32 [n], 0 where no episode was going on.
         Raises: ValueError with one line for invalid actions.
         """
         actions = checked_actions(actions)
-        ranges, rewards = np.empty_like(self.closing), np.zeros(len(self), dtype=np.float32)
+        rewards = np.zeros(len(self), dtype=np.float32)
         physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
-        arrays = self.cars, self.visits, around, self.ends, (ranges, self.closing, rewards)
+        arrays = self.cars, self.visits, around, self.ends, (self.ranges, self.closing, rewards)
         _control_all(physics, *self._groups, actions, target, self.max_steps, *arrays)
-        return ranges, rewards, self.ends.copy()
+        return rewards
 
 
 def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -66,11 +66,11 @@ def manual(traffic: int = 0) -> Simulator:
     return Simulator(1, config, target=math.inf, max_steps=_ENDLESS, traffic=traffic)
 
 
-def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> np.ndarray:
-    """Begin an episode at start float32 [5], among its traffic. Returns: ranges float32 [1, rays], m."""
+def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int) -> None:
+    """Begin an episode at start float32 [5], among its traffic."""
     key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
     worlds = spawn(road_map.network, start[None], simulator.worlds.shape[1], key, simulator.config)
-    return simulator.reset(road_map, start[None], worlds=worlds)
+    simulator.reset(road_map, start[None], worlds=worlds)
 
 
 def poses_of(states: np.ndarray) -> np.ndarray:
@@ -189,12 +189,12 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     rows = []
     for k in range(n):
         if begins[k]:
-            ranges = _begin(simulator, road_map, drive.poses[k], int(drive.episodes[k]))
+            _begin(simulator, road_map, drive.poses[k], int(drive.episodes[k]))
         else:
-            ranges, _, ends = simulator.step(drive.actions[k - 1 : k])
-            if ends[0] != End.RUNNING:
+            simulator.step(drive.actions[k - 1 : k])
+            if simulator.ends[0] != End.RUNNING:
                 raise GridSimError(f"the replay ends at row {k} of {n}: the drive was recorded on another map")
-        rows.append((simulator.cars[0].copy(), ranges[0].copy(), simulator.worlds[0].copy()))
+        rows.append((simulator.cars[0].copy(), simulator.ranges[0].copy(), simulator.worlds[0].copy()))
     cars, views, worlds = (np.stack(column) for column in zip(*rows, strict=True))
     return np.where(begins[:, None], drive.poses, poses_of(cars)), cars, views, worlds
 
@@ -223,7 +223,7 @@ def drive(
     pictures = round(PERIOD * FPS)  # a control step
     title = f"{road_map.name}, map {road_map.seed:,}    {HELP}"
     episode, steps, best = 0, 0, 0.0
-    ranges = _begin(simulator, road_map, start, 0)
+    _begin(simulator, road_map, start, 0)
     path = [start[:2].copy()]
     while True:
         pressed, held = window.keys()
@@ -232,16 +232,16 @@ def drive(
         if "r" in pressed:
             if simulator.cars[0, STEPS] > 0:
                 episode += 1
-            ranges = _begin(simulator, road_map, start, episode)
+            _begin(simulator, road_map, start, episode)
             path = [start[:2].copy()]
-        before, view, there = simulator.cars[0].copy(), ranges[0], _present(simulator.worlds[0])
+        before, view, there = simulator.cars[0].copy(), simulator.ranges[0].copy(), _present(simulator.worlds[0])
         ended = simulator.ends[0] != End.RUNNING
         if not ended:
             step = int(before[STEPS])
             action = action_for(held, float(before[SPEED]))
             if recorder is not None:
                 recorder.write(step, start if step == 0 else poses_of(before), action, episode)
-            ranges, _, _ = simulator.step(np.array([int(action)]))
+            simulator.step(np.array([int(action)]))
             steps += 1
         after, then = simulator.cars[0], _present(simulator.worlds[0])
         best = max(best, float(after[DISTANCE]))
@@ -254,7 +254,7 @@ def drive(
             trace = np.array([*path, car[[X, Y]]])
             image = renderer.draw(
                 car, boxes=interpolate(there, then, part, road_map),
-                ranges=view + np.float32(part) * (ranges[0] - view), path=trace, text=(text, title),
+                ranges=view + np.float32(part) * (simulator.ranges[0] - view), path=trace, text=(text, title),
             )  # fmt: skip
             window.show(image, FPS)
         path.append(after[[X, Y]].copy())

@@ -68,8 +68,8 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
         simulator = Simulator(1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
-        ranges = simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
-        car = simulator.cars[0]
+        simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
+        car, ranges, ends = simulator.cars[0], simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
             encode(ranges[0], simulator.closing[0], car[SPEED], car[STEERING], seen)
             shown = seen if policy[:3] == "mlp" else np.append(grids(table, ranges) / F(255.0), seen[62])
@@ -78,7 +78,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
             if step == result["steps"]:
                 assert (experience.actions[row - 1], experience.rewards[row - 1]) == (NO_ACTION, 0.0)
                 break
-            ranges, rewards, ends = simulator.step(experience.actions[row - 1 : row].astype(int))
+            rewards = simulator.step(experience.actions[row - 1 : row].astype(int))
             assert experience.rewards[row - 1] == pytest.approx(rewards[0], abs=2e-6)
             assert experience.ends[row - 1] == ends[0]
         assert ends[0] == result["end"]

@@ -24,8 +24,9 @@ CARS = 8
 AMONG = Limits(1000.0, 1700)
 
 
-def actions_of(spec, genome, ranges, speeds):
+def actions_of(spec, genome, simulator):
     """How a genome drives the cars of a `Simulator`."""
+    ranges, speeds = simulator.ranges, simulator.cars[:, SPEED].copy()
     return outputs_of(spec, genome, ranges, ranges, speeds, np.zeros_like(speeds)).argmax(axis=1)
 
 
@@ -60,16 +61,15 @@ def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     for cars in (np.arange(9), np.array([4])):
         simulator = Simulator(len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
         own = [maps[m] for m in episodes["map"][cars]]
-        ranges = simulator.reset(own, episodes["start"][cars], worlds=worlds[cars])
+        simulator.reset(own, episodes["start"][cars], worlds=worlds[cars])
         for step in range(1 + max(int(paths[k][0]["steps"]) for k in cars)):
             for i, k in enumerate(cars):
                 row, states, traffic = paths[k]
                 at = min(step, int(row["steps"]))
                 assert simulator.cars[i].tobytes() == states[at].tobytes()
                 assert simulator.worlds[i].tobytes() == traffic[at].tobytes()
-            speeds = simulator.cars[:, SPEED].copy()
-            ranges, _, ends = simulator.step(actions_of(spec, genome, ranges, speeds))
-        assert ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
+            simulator.step(actions_of(spec, genome, simulator))
+        assert simulator.ends.tolist() == [int(paths[k][0]["end"]) for k in cars]
 
 
 def test_what_is_rewound_goes_on_as_it_did(among):
@@ -99,11 +99,11 @@ def test_what_is_rewound_goes_on_as_it_did(among):
             continue
         original, again = (Simulator(1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2))
         road_map = maps[episodes["map"][k]]
-        ranges = original.reset(road_map, episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
+        original.reset(road_map, episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
         again.reset(road_map, start[None], worlds=world[None])
         for step in range(last):
-            action = actions_of(spec, genome, ranges, original.cars[:, SPEED].copy())
-            ranges, *_ = original.step(action)
+            action = actions_of(spec, genome, original)
+            original.step(action)
             if step >= first:
                 assert not again.ends[0]
                 again.step(action)

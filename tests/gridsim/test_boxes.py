@@ -145,10 +145,10 @@ def meet(scenario, start, lane, along):
     simulator = Simulator(1, BLIND, traffic=1)
     simulator.reset(scenario, np.array([start], dtype=F), worlds=world[None])
     for _ in range(40):
-        *_, ends = simulator.step(np.array([Action.NONE]))
-        if ends[0]:
+        simulator.step(np.array([Action.NONE]))
+        if simulator.ends[0]:
             break
-    return simulator, End(int(ends[0]))
+    return simulator, End(int(simulator.ends[0]))
 
 
 @pytest.mark.parametrize("aside", [0.0, -1.9, 2.1])
@@ -177,13 +177,13 @@ def test_a_ray_tells_how_fast_the_car_that_it_meets_comes_closer(cross, speed, s
     world = parked((116.0, 128.0, heading))
     world[0, SPEED] = pace
     simulator.closing[:] = 99.0
-    ranges = simulator.reset(cross, np.array([[100.0, 128.0, 0.0, speed, steering]]), worlds=world[None])
+    simulator.reset(cross, np.array([[100.0, 128.0, 0.0, speed, steering]]), worlds=world[None])
     kappa, step = oracle.curvature(CONFIG, speed, steering), 1e-4
     poses = [oracle.on_arc(CONFIG, (0.0, 0.0, 0.0), kappa, way) for way in (-step * speed, step * speed)]
     before, after = (np.array([x + 1.25 * math.cos(turn), y + 1.25 * math.sin(turn)]) for x, y, turn in poses)
     velocity = (after - before) / (2 * step) - pace * np.array([math.cos(heading), math.sin(heading)])
     rays = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
-    met = (ranges[0] < 15.0) & (np.abs(ANGLES) < math.radians(9.0))
+    met = (simulator.ranges[0] < 15.0) & (np.abs(ANGLES) < math.radians(9.0))
     assert met.sum() >= 3
     assert simulator.closing[0][met] == pytest.approx(rays[met] @ velocity, abs=1e-3)
     assert (simulator.closing[0][~met] == 0.0).all(), "the road's edge has no motion"
@@ -210,7 +210,7 @@ def test_waiting_behind_a_standing_car_is_not_idle(cross, gap, ends):
     start = [SIDE - 100.0 + 4.0 + (gap or 3.0), 128.0, math.pi, 0.0, 0.0]
     simulator.reset(cross, np.array([start], dtype=F), worlds=world[None])
     for step in range(50):
-        *_, now = simulator.step(np.array([Action.NONE]))
-        assert now[0] == (End.IDLE if ends and step >= 14 else End.RUNNING)
+        simulator.step(np.array([Action.NONE]))
+        assert simulator.ends[0] == (End.IDLE if ends and step >= 14 else End.RUNNING)
     assert simulator.cars[0, DISTANCE] == 0.0
     assert simulator.cars[0, IDLE] == (15 if ends else 0)

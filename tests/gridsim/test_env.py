@@ -195,17 +195,17 @@ def test_grids_are_what_the_last_rays_say_and_begin_anew_with_an_episode(
     rays, table = GridSimVectorEnv(5, **options), grid_table(env.config)
     for seed in (3, None):
         (seen, _), (beside, _) = env.reset(seed=seed), rays.reset(seed=seed)
-        past = [[grid] * frames for grid in grids(table, env.ranges)]
+        past = [[grid] * frames for grid in grids(table, env.simulator.ranges)]
         over = np.zeros(5, dtype=bool)
         for row in drive(env, 28, seed=6):  # in the middle of an episode
-            np.testing.assert_array_equal(env.ranges, rays.ranges)
+            np.testing.assert_array_equal(env.simulator.ranges, rays.simulator.ranges)
             np.testing.assert_array_equal(seen["grid"] if observation == "grid" else seen, np.array(past))
             if observation == "grid":
                 np.testing.assert_allclose(seen["speed"], beside[:, -1:], rtol=1e-6)
             seen, *ours, info = env.step(row)
             beside, *theirs, _ = rays.step(row)
             np.testing.assert_equal(ours, theirs)  # what an observation is made of changes nothing else
-            now = grids(table, env.ranges)
+            now = grids(table, env.simulator.ranges)
             past = [[now[i]] * frames if over[i] else [*past[i][1:], now[i]] for i in range(5)]
             over = ours[1] | ours[2]
         assert any((stack[0] != stack[-1]).any() for stack in past) or frames == 1
@@ -222,7 +222,7 @@ def test_rays_motion_speed_and_steering_are_shares(maps: Maps) -> None:
         seen, *_, info = env.step(np.full(8, Action.ACCELERATE if step % 50 else Action.ACCELERATE_LEFT))
         fastest = max(fastest, np.abs(env.simulator.closing).max())
         cars = env.simulator.cars
-        np.testing.assert_allclose(seen[:, :31] * 50.0, env.ranges, rtol=1e-6)
+        np.testing.assert_allclose(seen[:, :31] * 50.0, env.simulator.ranges, rtol=1e-6)
         np.testing.assert_allclose(seen[:, 31:62] * 30.0, np.clip(env.simulator.closing, -30.0, 30.0), atol=1e-5)
         np.testing.assert_allclose(seen[:, 62] * 30.0, info["speed_mps"], rtol=1e-6)
         np.testing.assert_allclose(seen[:, 63] * 27.0, np.degrees(cars[:, STEERING]), rtol=1e-5)
@@ -274,8 +274,9 @@ def test_options_set_map_and_start(maps: Maps) -> None:
     observations, info = env.reset(seed=0, options={"map_seed": 1, "start": start})
     np.testing.assert_array_equal(observations[0], observations[1])
     np.testing.assert_array_equal(info["speed_mps"], start[3])
-    ranges = Simulator(1).reset(maps["seamless"][1], start[None])
-    np.testing.assert_array_equal(ranges[0], env.ranges[0])
+    simulator = Simulator(1)
+    simulator.reset(maps["seamless"][1], start[None])
+    np.testing.assert_array_equal(simulator.ranges[0], env.simulator.ranges[0])
     plain, _ = env.reset(seed=0)
     env.reset(options={"map_seed": [1, 0]})
     np.testing.assert_array_equal(env.reset(seed=0)[0], plain)

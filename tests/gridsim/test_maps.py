@@ -138,8 +138,9 @@ def test_walls_of_one_pixel_stop_cars_and_rays(tmp_path, degrees, offset):
     starts = np.zeros((200, 5), dtype=np.float32)
     starts[:, :2] = 40 + offset - away[:, None] * left
     starts[:, 2] = angle + math.pi / 2 + tilt
-    ranges = Simulator(200).reset(scenario, starts)
-    error = (ranges[:, 15] + 1.25) * np.cos(tilt) - away + 0.4  # the wall is 0.8 m thick in the field
+    simulator = Simulator(200)
+    simulator.reset(scenario, starts)
+    error = (simulator.ranges[:, 15] + 1.25) * np.cos(tilt) - away + 0.4  # the wall is 0.8 m thick in the field
     assert np.abs(error).max() < 0.3
 
 

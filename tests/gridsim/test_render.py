@@ -23,8 +23,8 @@ def scenario():
 def state(scenario):
     """A car that stands at a start, and what it sees."""
     simulator = Simulator(1)
-    ranges = simulator.reset(scenario, sample_starts(scenario, 1, np.random.default_rng(5)))
-    return simulator.cars[0].copy(), ranges[0]
+    simulator.reset(scenario, sample_starts(scenario, 1, np.random.default_rng(5)))
+    return simulator.cars[0].copy(), simulator.ranges[0]
 
 
 def car_at(x, y, heading=0.0):

@@ -30,12 +30,12 @@ def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
     """
     start = np.asarray(start, dtype=F)
     simulator = Simulator(1, config, target, max_steps)
-    ranges = simulator.reset(road_map, start[None])
+    simulator.reset(road_map, start[None])
     actions: list[int] = []
     states = []
     while simulator.ends[0] == End.RUNNING:
-        actions.append(int(choose(len(actions), ranges[0], simulator.cars[0])))
-        ranges, *_ = simulator.step(np.array(actions[-1:]))
+        actions.append(int(choose(len(actions), simulator.ranges[0], simulator.cars[0])))
+        simulator.step(np.array(actions[-1:]))
         states.append(simulator.cars[0].copy())
     end = End(simulator.ends[0]).name
     return SimpleNamespace(start=start, actions=np.array(actions), states=np.array(states), end=end)

@@ -106,8 +106,8 @@ def record_drive(path, scenario, start, episodes):
                 states.append(start if step == 0 else poses_of(simulator.cars[0]))
                 recorder.write(step, states[-1], action, episode)
                 assert path.read_text().count("\n") == recorder.rows + 1  # whatever happens next, it is kept
-                *_, ends = simulator.step(np.array([action]))
-                if ends[0] != End.RUNNING:
+                simulator.step(np.array([action]))
+                if simulator.ends[0] != End.RUNNING:
                     break
     return np.array(states)
 
