@@ -148,10 +148,16 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
+
+        Raises: ValueError with one line for a wrong shape.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
-        starts = starts.astype(np.float32)
+        starts, traffic = starts.astype(np.float32), (len(cars), *self.worlds.shape[1:])
+        if len(maps) != len(cars) or starts.shape != (len(cars), 5):
+            raise ValueError(f"there are {len(cars)} cars, not {len(maps)} maps and starts of shape {starts.shape}")
+        if worlds is not None and worlds.shape != traffic:
+            raise ValueError(f"traffic must be {traffic[0]} worlds of {traffic[1]} cars, not {worlds.shape}")
         self.worlds[cars] = -1.0 if worlds is None else worlds
         rows = self._chart(maps)
         cells = max(visit_cells(each.road) for each in set(maps))
@@ -192,8 +198,12 @@ class Simulator:
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
         Returns: the rewards float32 [n], 0 where no episode was going on.
-        Raises: ValueError with one line for invalid actions.
+        Raises: ValueError with one line for invalid actions; RuntimeError before the first reset.
         """
+        if self._rows.min() < 0:
+            raise RuntimeError("step() was called before every car was reset; call reset() first")
+        if np.shape(actions) not in ((len(self),), (len(self), 2)):
+            raise ValueError(f"there are {len(self)} cars, not actions of shape {np.shape(actions)}")
         actions = checked_actions(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
         physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)

@@ -227,12 +227,23 @@ def test_a_start_is_taken_onto_the_torus(straight):
     assert not car[[DISTANCE, PACED, ODOMETER, IDLE, STEPS]].any()
 
 
-def test_cars_that_begin_without_traffic_have_none():
+def test_arrays_of_other_shapes_are_refused_and_cars_that_begin_without_traffic_have_none():
     scenario = build("curved", 0)
     starts = sample_starts(scenario, 4, np.random.default_rng(0))
     worlds = spawn(scenario.network, starts, 3, np.arange(4, dtype=np.uint64), CONFIG)
     simulator = Simulator(4, traffic=3)
+    with pytest.raises(RuntimeError, match="before every car was reset"):
+        simulator.step(np.zeros(4, dtype=int))
+    for wrong in (worlds[:1], worlds[:, :2], worlds[0]):
+        with pytest.raises(ValueError, match="traffic must be 4 worlds of 3 cars, not"):
+            simulator.reset(scenario, starts, worlds=wrong)
+    for maps, few in ((scenario, starts[:3]), ([scenario] * 3, starts), (scenario, starts[:, :4])):
+        with pytest.raises(ValueError, match="there are 4 cars, not"):
+            simulator.reset(maps, few)
     simulator.reset(scenario, starts, worlds=worlds)
+    for shape in ((1,), (5,), (4, 1), (1, 2), ()):
+        with pytest.raises(ValueError, match="there are 4 cars, not actions of shape"):
+            simulator.step(np.zeros(shape, dtype=int))
     assert (simulator.worlds[:, :, LANE] >= 0).any()
     simulator.reset(scenario, starts[:2], cars=np.array([0, 1]))
     assert (simulator.worlds[:2, :, LANE] < 0).all()
