@@ -113,7 +113,7 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     maps = Maps(scenario, SimConfig())
     learner = Evolution(settings, SerialPool(maps.build), maps)
     config = dataclasses.replace(settings.curriculum(), promising=2.0, **variant.curriculum)  # so nothing is validated
-    learner.curriculum = Curriculum(config, seed, maps.get, learner.sim.episode, settings.traffic)
+    learner.curriculum = Curriculum(config, seed, maps.get, settings.traffic)
     search = dataclasses.replace(settings.search_config(), groups=config.groups)
     learner.search = variant.search(learner.spec, search, seed)
     found = []

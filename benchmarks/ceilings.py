@@ -31,7 +31,7 @@ from cluster.workers import ray_pool
 from cluster.workers.pool import Chunk, Outcome, WorkerPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.worker import Task, Worker
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, evaluate, targets
+from evolution.episodes.rollout import EPISODE, RESULT, evaluate
 from evolution.networks.policy import PolicySpec
 from evolution.search import fitness
 from evolution.search.base import recipes as some_recipes
@@ -56,7 +56,7 @@ class InstantWorker(Worker):
 
     def evaluate(self, task: Task, maps: Any, recipes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
-        goals = targets(task.episodes, task.limits)
+        goals = task.episodes["target"].astype(np.float64)
         mark = 2 * recipes["seed"].astype(np.int64) + (recipes["kind"] == Kind.MIRRORED)
         share = (mark[:, None] * 7919 + np.arange(len(goals)) * 104_729) % 512 / 160
         results["distance"] = np.floor(np.minimum(share, 1.0) * goals)
@@ -101,8 +101,9 @@ def make_task(parents: np.ndarray, key: int = 1, count: int = EPISODES) -> Task:
     """A generation's task without maps; each episode is marked by its number."""
     episodes = np.zeros(count, EPISODE)
     episodes["start"][:, 4] = np.arange(count)
+    episodes["target"], episodes["steps"] = 150.0, 245
     worlds = np.zeros((count, 0, FIELDS), dtype=np.float32)
-    return Task(POLICY, episodes, worlds, (), Limits(150.0, 245), SimConfig(), parents, key, Mutation())
+    return Task(POLICY, episodes, worlds, (), SimConfig(), parents, key, Mutation())
 
 
 def rows(count: int) -> np.ndarray:
@@ -144,7 +145,7 @@ def children_per_s(pool: WorkerPool, children: int = CHILDREN) -> tuple[float, f
         task = make_task(asked.parents, asked.key, EPISODES * len(parts))
         results = pool.evaluate(task, asked.recipes, asked=parts).results
         driven = np.concatenate([results[part] for part in parts])
-        search.tell(fitness.scalar(driven, task.limits.target) + 1e-6 * rng.random(children))
+        search.tell(fitness.scalar(driven, float(task.episodes["target"][0])) + 1e-6 * rng.random(children))
         rates.append(children / (time.perf_counter() - begun))
         times.append((time.thread_time() - before) / children)
     return statistics.median(rates[1:]), statistics.median(times[1:])
@@ -238,11 +239,12 @@ def step_s(policy: str, members: int = 64) -> float:
     genomes = (rng.normal(size=(members, spec.size)) * 0.3).astype(np.float32)
     episodes = np.zeros(4, EPISODE)
     episodes["start"] = sample_starts(scenario, 4, rng)
+    episodes["target"], episodes["steps"] = 150.0, 245
     worlds = np.zeros((4, 0, FIELDS), dtype=np.float32)
     times = []
     for _ in range(4):
         begun = time.perf_counter()
-        results, _, _ = evaluate(spec, genomes, [scenario], episodes, Limits(150.0, 245), SimConfig(), worlds)
+        results, _, _ = evaluate(spec, genomes, [scenario], episodes, SimConfig(), worlds)
         times.append((time.perf_counter() - begun) / results["steps"].sum())
     return statistics.median(times[1:])
 

@@ -65,7 +65,6 @@ from cluster.training.trainer import Maps
 from cluster.workers.kernels import compile_kernels
 from cluster.workers.ray_pool import RayPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
-from evolution.episodes.rollout import targets
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
@@ -140,7 +139,7 @@ def last_generations(
     this.reporter.row = measure
     begun = time.perf_counter()
     learn(this)
-    n, goals = settings.population, targets(pool.outcome.task.episodes, pool.outcome.task.limits)
+    n, goals = settings.population, pool.outcome.task.episodes["target"].astype(np.float64)
     seconds = pool.outcome.results["steps"] * curriculum.period  # driven; `at` scales them to evaluation
     groups = [part for part in pool.outcome.asked if part.rows.stop <= n]
     leader = next(part for part in pool.outcome.asked if part.rows.start == n)

@@ -23,7 +23,7 @@ import numpy as np
 from cluster.workers.pool import Chunk, Parcel, cut, metres
 from cluster.workers.pool import size as episodes_in
 from cluster.workers.worker import Task
-from evolution.episodes.rollout import EPISODE, RESULT, Limits
+from evolution.episodes.rollout import EPISODE, RESULT
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.config import SimConfig
 from gridsim.traffic.world import FIELDS
@@ -91,7 +91,7 @@ class Call:
         episodes, worlds = np.zeros(e, dtype=EPISODE), np.zeros((e, 0, FIELDS), dtype=np.float32)
         episodes["target"] = self.targets
         task = Task(
-            "mlp:6,7", episodes, worlds, (), Limits(1.0, 1), SimConfig(), np.zeros((1, 1), np.float32), 0,
+            "mlp:6,7", episodes, worlds, (), SimConfig(), np.zeros((1, 1), np.float32), 0,
             Mutation(),
         )  # fmt: skip
         asked = self.asked or [Chunk(slice(0, n), slice(0, e))]

@@ -37,7 +37,7 @@ from peers import NOT_INSTALLED, PEERS  # beside this file
 import gridsim.envs.env
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CheckpointError
-from evolution.episodes.rollout import Limits, evaluate
+from evolution.episodes.rollout import evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, decide, encode, pack, scratch_size
 from evolution.search.base import recipes as some_recipes
@@ -69,10 +69,9 @@ def rollout_rays(champion: Champion, maps: list[Map], runs: int, traffic: int = 
     spec, episode = PolicySpec.parse(champion.policy), champion.sim.episode
     rng = np.random.default_rng(0)
     episodes, worlds = lane_starts(maps, np.arange(EPISODES) % len(maps), rng, traffic, champion.sim)
-    limits = Limits(episode.target, round(episode.time_limit / episode.control_period))
 
     def run() -> np.ndarray:
-        return evaluate(spec, champion.genome[None], maps, episodes, limits, champion.sim, worlds=worlds)[0]
+        return evaluate(spec, champion.genome[None], maps, episodes, champion.sim, worlds)[0]
 
     results = run()
     steps = int(results["steps"].sum())

@@ -16,7 +16,7 @@ from cluster.runs.checkpoint import CHAMPION
 from cluster.runs.run import CONFIG, SUMMARY, read_config
 from cluster.runs.settings import RunSettings
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
-from evolution.episodes.rollout import Limits, trajectory
+from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import PolicySpec
 from gridsim.config import VehicleConfig
 from gridsim.errors import GridSimError
@@ -92,12 +92,11 @@ def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic:
     Args and errors: as for `champion.evaluate`.
     """
     chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
-    sim, spec = champion.sim, PolicySpec.parse(champion.policy)
-    limits = Limits(sim.episode.target, sim.episode.steps)
+    sim, episode, spec = champion.sim, champion.sim.episode, PolicySpec.parse(champion.policy)
     found = []
     for row, world in zip(chosen.rows, chosen.worlds, strict=True):
         road = roads[row["map"]]
-        _, states, _ = trajectory(spec, champion.genome, road, row["start"], limits, sim, world)
+        _, states, _ = trajectory(spec, champion.genome, road, row["start"], episode.target, episode.steps, sim, world)
         with contextlib.suppress(ValueError):  # not a metre forward
             found.append(error_series(poses_of(states), road, sim.vehicle))
     return [part for part in found if len(part.arc) > 1]

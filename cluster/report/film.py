@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cluster.runs.champion import Champion
-from evolution.episodes.rollout import Limits, trajectory
+from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
 from gridsim.car.ego import DISTANCE, SPEED, STEERING, End, X, Y
 from gridsim.envs.simulator import views
@@ -58,11 +58,10 @@ def record(
 
     Args: world float32 [others, world.FIELDS], the traffic at the start.
     """
-    episode = champion.sim.episode
+    episode, spec = champion.sim.episode, PolicySpec.parse(champion.policy)
     steps = max(1, round(min(seconds, episode.time_limit) / episode.control_period))
-    spec, limits = PolicySpec.parse(champion.policy), Limits(episode.target, steps)
-    start = np.asarray(start, dtype=np.float32)
-    result, cars, worlds = trajectory(spec, champion.genome, scenario, start, limits, champion.sim, world)
+    start, goal = np.asarray(start, dtype=np.float32), episode.target
+    result, cars, worlds = trajectory(spec, champion.genome, scenario, start, goal, steps, champion.sim, world)
     end = End(int(result["end"]))
     if end == End.TIME and steps < episode.steps:
         end = End.RUNNING

@@ -169,8 +169,7 @@ def evaluate(
     """
     chosen, roads = held_out(champion, scenario, episodes, seed, traffic)
     spec, sim, genomes = PolicySpec.parse(champion.policy), champion.sim, champion.genome[None]
-    limits = rollout.Limits(sim.episode.target, sim.episode.steps)
-    results = rollout.evaluate(spec, genomes, roads, chosen.rows, limits, sim, worlds=chosen.worlds)[0]
+    results = rollout.evaluate(spec, genomes, roads, chosen.rows, sim, chosen.worlds)[0]
     return summarise(results[0], sim.episode.control_period)
 
 
@@ -187,5 +186,5 @@ def held_out(
         raise GridSimError(f"traffic must be 0 to {MAX_TRAFFIC} cars, not {traffic}")
     seeds = range(seed, seed + max(len(HELD_OUT_SEEDS), episodes // 8))
     roads = {k: build(name, k, champion.sim) for k in seeds}
-    chosen = spread_starts(roads.__getitem__, seeds, episodes, traffic)
+    chosen = spread_starts(roads.__getitem__, seeds, episodes, traffic, champion.sim)
     return chosen, [roads[k] for k in chosen.maps]

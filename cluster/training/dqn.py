@@ -20,7 +20,6 @@ from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, finite
 from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
-from evolution.episodes.rollout import Limits
 
 EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there
 BATCH_STEPS = 32_768  # car-steps of a batch, about
@@ -105,11 +104,11 @@ class Dqn(Learning):
         s, k = self.settings, self.batches
         n = int(np.clip(BATCH_STEPS / self.mean_steps, *EPISODES))
         episodes = self.curriculum.starts(k, n)
+        episodes.rows["steps"] = EPISODE_STEPS
         self.maps.ahead(self.curriculum.map_seeds[: k + 8])
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         weights = finite(self.learner.weights, self.learner.updates)
-        limits = Limits(self.curriculum.goal, EPISODE_STEPS)
-        task = CollectTask(*self._base(episodes, limits), weights, self._epsilons(n), keys)
+        task = CollectTask(*self._base(episodes), weights, self._epsilons(n), keys)
         brought = self.pool.collect(task, partial(self.on_progress, "collect"), self._train)
         self._report("collect", brought)
         check_any_left(brought.lost, "collect")

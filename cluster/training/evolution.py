@@ -16,7 +16,6 @@ from cluster.runs.settings import EvolveSettings
 from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
-from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.search import fitness
 from evolution.search.base import Generation, Search
@@ -64,12 +63,12 @@ class Evolution(Learning):
 
     def step(self) -> dict[str, float]:
         """Evolve one generation."""
-        curriculum, limits, period = self.curriculum, self.curriculum.limits(), self.sim.episode.control_period
+        curriculum, period = self.curriculum, self.sim.episode.control_period
         leader = self.search.leader()
         candidate = leader if self._promising() else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.steps)
         n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
-        goals = targets(episodes.rows, limits)[:e]  # the same in each group
+        goals = episodes.rows["target"][:e].astype(np.float64)  # the same in each group
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.steps + AHEAD)])
 
@@ -79,7 +78,7 @@ class Evolution(Learning):
             leading = call.add(leader, followed)
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
-        driven = self._evaluate("evolve", call.members, call.episodes, limits, call.asked, self._meanwhile)
+        driven = self._evaluate("evolve", call.members, call.episodes, call.asked, self._meanwhile)
         check_any_left(driven.lost[:n], "evolve")
         results = np.concatenate([driven.results[part] for part in groups])
         score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
@@ -92,7 +91,7 @@ class Evolution(Learning):
         else:
             self.elites[self.steps] = leader
             led = driven.results[leading][0]
-            led_score = float(self._score(led[None], curriculum.leader_limits().target)[0])
+            led_score = float(self._score(led[None], float(followed.rows["target"][0]))[0])
             columns = leading.columns
             curriculum.learn_from_leader(followed, led, driven.rewound[columns], driven.worlds[columns])
         self.search.tell(score)
@@ -109,7 +108,7 @@ class Evolution(Learning):
             "distance_m/mean": float(results["distance"].mean()),
             "speed_mps/best": mean_speed(led, period),
             "speed_mps/mean": float((results["distance"].sum(axis=1) / np.maximum(seconds, 1e-9)).mean()),
-            "target_m": limits.target,
+            "target_m": float(goals[0]),
             "leader/success_rate": float(success_rate(led[None])[0]),
             "validation/success_rate": self.champion.success_rate if self.champion else 0.0,
             "car_steps": float(self.car_steps),

@@ -29,7 +29,6 @@ from evolution.episodes.curriculum import (
     spread_starts,
     success_rate,
 )
-from evolution.episodes.rollout import Limits
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, recipes
@@ -118,7 +117,7 @@ class Learning(ABC):
         s = self.settings
         self.sim = SimConfig()
         self.spec = PolicySpec.parse(s.policy)
-        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, self.sim.episode, s.traffic)
+        self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, s.traffic)
         self._lines: list[str] = []  # of history.csv
 
     # ------------------------------------------------------------------------------------------------------ the loop
@@ -188,18 +187,18 @@ class Learning(ABC):
     # ------------------------------------------------------------------------------------------------- evaluating
 
     def _evaluate(
-        self, stage: str, members: Generation, episodes: Episodes, limits: Limits,
-        asked: Sequence[Chunk] | None = None, meanwhile: Meanwhile | None = None,
+        self, stage: str, members: Generation, episodes: Episodes, asked: Sequence[Chunk] | None = None,
+        meanwhile: Meanwhile | None = None,
     ) -> Outcome:  # fmt: skip
-        task = Task(*self._base(episodes, limits), members.parents, members.key, members.mutation)
+        task = Task(*self._base(episodes), members.parents, members.key, members.mutation)
         outcome = self.pool.evaluate(task, members.recipes, partial(self.on_progress, stage), asked, meanwhile)
         self.car_steps += int(outcome.results["steps"].sum())
         self._report(stage, outcome)
         return outcome
 
-    def _base(self, episodes: Episodes, limits: Limits) -> tuple[str, np.ndarray, np.ndarray, Names, Limits, SimConfig]:
+    def _base(self, episodes: Episodes) -> tuple[str, np.ndarray, np.ndarray, Names, SimConfig]:
         """The first fields of a task, which both kinds have."""
-        return self.settings.policy, episodes.rows, episodes.worlds, self._names(episodes.maps), limits, self.sim
+        return self.settings.policy, episodes.rows, episodes.worlds, self._names(episodes.maps), self.sim
 
     def _names(self, seeds: Sequence[int]) -> Names:
         scenario = self.settings.scenario
@@ -211,9 +210,9 @@ class Learning(ABC):
             self.warn(f"{self.settings.step_name} {self.steps}, {stage}: {text}")
 
     def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, meanwhile: Meanwhile | None = None) -> Outcome:
-        """Results [n, e] of given genomes [n, genes], sent as plain copies, in full episodes if these say no less."""
+        """Results [n, e] of given genomes [n, genes], sent as plain copies."""
         copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
-        return self._evaluate(stage, copies, episodes, self.curriculum.goal_limits(), meanwhile=meanwhile)
+        return self._evaluate(stage, copies, episodes, meanwhile=meanwhile)
 
     def add_wall_clock(self, wall_s: float) -> None:
         """Add the wall clock's columns to the last row."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.workers.worker import CollectTask, Task, Worker
-from evolution.episodes.rollout import EPISODE, Limits, trajectory
+from evolution.episodes.rollout import EPISODE, trajectory
 from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import recipes
 from evolution.search.breeding import Kind, Mutation
@@ -74,32 +74,33 @@ def _marker(settings: RunSettings) -> Path:
     return CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}"
 
 
-def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray, Limits]:
-    """The smallest drive: configuration, a map without a road, a genome of zeros, an episode, its traffic, limits."""
+def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray]:
+    """The smallest drive: configuration, a map without a road, a genome of zeros, an episode, its traffic."""
     config, genome = SimConfig(), np.zeros(PolicySpec.parse(policy).size, dtype=np.float32)
     road, episodes = blank(), np.zeros(1, dtype=EPISODE)
+    episodes["target"] = episodes["steps"] = 1
     worlds = spawn(road.network, episodes["start"], traffic, np.zeros(1, dtype=np.uint64), config)
-    return config, road, genome, episodes, worlds, Limits(1.0, 1)
+    return config, road, genome, episodes, worlds
 
 
 def compile_kernels(policy: str, traffic: int, command: str) -> None:
     """Compile, or load from the cache, what evaluates members, and for the DQN also what collects experience."""
-    config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
+    config, road, genome, episodes, worlds = _smallest(policy, traffic)
     made = recipes(2)
     made["kind"] = Kind.NEW
-    task = Task(policy, episodes, worlds, (), limits, config, genome[None], 1, Mutation())
+    task = Task(policy, episodes, worlds, (), config, genome[None], 1, Mutation())
     Worker().answer(task, [road], made, 0, 1)
     if command == DqnSettings.command:
         epsilons, keys = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.uint64)
-        collecting = CollectTask(policy, episodes, worlds, (), limits, config, genome, epsilons, keys)
+        collecting = CollectTask(policy, episodes, worlds, (), config, genome, epsilons, keys)
         Worker().answer(collecting, [road], made, 0, 1)
 
 
 def compile_drive(policy: str, traffic: int) -> None:
     """Compile, or load from the cache, what records and draws a drive."""
-    config, road, genome, episodes, worlds, limits = _smallest(policy, traffic)
+    config, road, genome, episodes, worlds = _smallest(policy, traffic)
     start = episodes["start"][0]
-    _, cars, others = trajectory(PolicySpec.parse(policy), genome, road, start, limits, config, worlds[0])
+    _, cars, others = trajectory(PolicySpec.parse(policy), genome, road, start, 1.0, 1, config, worlds[0])
     views(road, cars, others, config)
     clearances(road.road, freeze(cars[:, :2]))
 

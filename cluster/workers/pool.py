@@ -13,7 +13,7 @@ import numpy as np
 
 from cluster.workers.worker import AnyTask, CollectTask, Task, Worker
 from evolution.dqn.experience import Experience, join
-from evolution.episodes.rollout import RESULT, targets
+from evolution.episodes.rollout import RESULT
 from evolution.search.breeding import RECIPE, Kind
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
@@ -234,7 +234,7 @@ def finish(meanwhile: Meanwhile | None) -> None:
 
 def _goals(task: AnyTask) -> np.ndarray:
     """Target (m) of each column: float64 [columns]. All episodes of a batch of experience have the same."""
-    goals = targets(task.episodes, task.limits)
+    goals = task.episodes["target"].astype(np.float64)
     return goals[:1] if isinstance(task, CollectTask) else goals
 
 

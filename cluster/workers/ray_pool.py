@@ -46,7 +46,6 @@ from cluster.workers.pool import (
 )
 from cluster.workers.tickets import Tickets, abandoned
 from cluster.workers.worker import AnyTask, CollectTask, Worker
-from evolution.episodes.rollout import Limits
 
 CONNECT_S = 60.0
 ENDING_S = 5.0  # for the last of Ray's processes to end
@@ -78,12 +77,12 @@ class _Slot:
         return self.hello or (self.sent[0][1] if self.sent else None)
 
 
-_Kind = tuple[type, Limits, bool]
+_Kind = tuple[type, str, bool]
 
 
 def _kind(task: AnyTask, part: Chunk) -> _Kind:
     """The same for parts that need about as long for a metre: one member drives on where many others crash early."""
-    return type(task), task.limits, part.rows.stop - part.rows.start == 1
+    return type(task), task.policy, part.rows.stop - part.rows.start == 1
 
 
 class RayPool(WorkerPool):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from evolution.dqn.experience import Experience
-from evolution.episodes.rollout import Limits, collect, evaluate
+from evolution.episodes.rollout import collect, evaluate
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import Mutation, breed
 from gridsim.config import SimConfig
@@ -25,7 +25,6 @@ class _Common:
     episodes: np.ndarray  # EPISODE [episodes]
     worlds: np.ndarray  # the traffic that each begins with, float32 [episodes, cars, world.FIELDS]
     maps: tuple[tuple[str, int], ...]  # (scenario, seed) of each map that `episodes` indexes
-    limits: Limits  # where an episode ends if nothing happens
     config: SimConfig
 
 
@@ -76,11 +75,9 @@ class Worker:
         """What `rollout.evaluate` returns for recipes RECIPE [n]."""
         spec = PolicySpec.parse(task.policy)
         genomes = breed(task.parents, recipes, task.key, spec, task.mutation)
-        return evaluate(spec, genomes, maps, task.episodes, task.limits, task.config, task.worlds)
+        return evaluate(spec, genomes, maps, task.episodes, task.config, task.worlds)
 
     def collect(self, task: CollectTask, maps: Sequence[Map]) -> tuple[Experience, np.ndarray]:
         """What `rollout.collect` returns."""
         spec = PolicySpec.parse(task.policy)
-        return collect(
-            spec, task.weights, maps, task.episodes, task.epsilons, task.keys, task.limits, task.config, task.worlds
-        )
+        return collect(spec, task.weights, maps, task.episodes, task.epsilons, task.keys, task.config, task.worlds)

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evolution.episodes.rollout import EPISODE, Limits, with_limits
+from evolution.episodes.rollout import EPISODE
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
 from gridsim.car.ego import End
-from gridsim.config import EpisodeConfig
+from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
 from gridsim.traffic.world import FIELDS, LANE
@@ -59,26 +59,22 @@ class CurriculumConfig:
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
 
 
-def spread_starts(build: Callable[[int], Map], seeds: range, episodes: int, traffic: int = 0) -> Episodes:
-    """Episodes on the maps of `seeds` in turn; they depend only on the scenario, the traffic and the arguments."""
+def spread_starts(
+    build: Callable[[int], Map], seeds: range, episodes: int, traffic: int = 0, config: SimConfig | None = None
+) -> Episodes:
+    """Full episodes on the maps of `seeds` in turn; they depend only on the scenario and the arguments."""
     rng = np.random.default_rng(np.random.SeedSequence([seeds.start, episodes]))
     used = np.arange(episodes) % len(seeds)
-    return Episodes(list(seeds), *lane_starts([build(seed) for seed in seeds], used, rng, traffic))
+    return Episodes(list(seeds), *lane_starts([build(seed) for seed in seeds], used, rng, traffic, config))
 
 
 class Curriculum:
     """The curriculum of one run: its target, crashes, training maps and validation."""
 
-    def __init__(
-        self,
-        config: CurriculumConfig,
-        seed: int,
-        build: Callable[[int], Map],
-        episode: EpisodeConfig,
-        traffic: int = 0,
-    ):
-        self.config, self.seed, self.build, self.episode = config, seed, build, episode
+    def __init__(self, config: CurriculumConfig, seed: int, build: Callable[[int], Map], traffic: int = 0):
+        self.config, self.seed, self.build = config, seed, build
         self.traffic, self.crowd = traffic, round(config.crowd * traffic)
+        episode = SimConfig().episode
         self.goal, self.period = episode.target, episode.control_period
         self.target = min(config.first_target, self.goal)
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
@@ -96,21 +92,10 @@ class Curriculum:
         """Number of training maps in use."""
         return min(self.config.maps, self.config.first_maps + generation)
 
-    def limits(self) -> Limits:
-        """Limits of training episodes."""
-        return self._limits(self.target)
-
-    def leader_limits(self) -> Limits:
-        """Limits of the leader's episodes."""
-        return self._limits(min(self.config.leader_stretch * self.target, self.goal))
-
-    def _limits(self, target: float) -> Limits:
-        """Limits of a training episode with this target (m)."""
-        return Limits(target, math.ceil((target / self.config.pace + self.config.slack) / self.period))
-
-    def goal_limits(self) -> Limits:
-        """Limits of a full episode, in validation and held-out evaluation."""
-        return Limits(self.goal, self.episode.steps)
+    def _limit(self, episodes: np.ndarray, target: float) -> None:
+        """Set the target (m) of training episodes EPISODE [e], and the time limit that follows from it."""
+        episodes["target"] = target
+        episodes["steps"] = math.ceil((target / self.config.pace + self.config.slack) / self.period)
 
     def _some_maps(self, generation: int, count: int, rng: np.random.Generator) -> np.ndarray:
         """Training maps [count] as indices into `map_seeds`; without repetition if there are enough."""
@@ -128,10 +113,12 @@ class Curriculum:
         config, rng = self.config, self._rng(generation, 0)
         maps = [self._some_maps(generation, config.starts, rng) for _ in range(config.groups)]
         fresh = self._new_starts(np.concatenate(maps), rng)
+        self._limit(fresh.rows, self.target)
         if not len(self.crashes) or not config.crash_starts:
             return fresh
         chosen = self._choose_crashes(generation)
-        crashes = with_limits(self.crashes[chosen], self._limits(min(config.crash_target, self.target)))
+        crashes = self.crashes[chosen]
+        self._limit(crashes, min(config.crash_target, self.target))
         seeds = [self.map_seeds[m] for m in crashes["map"]]
         used = sorted({*fresh.maps, *seeds})
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
@@ -164,13 +151,14 @@ class Curriculum:
         return np.concatenate(np.concatenate(parts, axis=1))
 
     def starts(self, batch: int, count: int, purpose: int = 3) -> Episodes:
-        """`count` new episodes on the training maps, by default for the DQN's batches."""
+        """`count` new full episodes on the training maps, by default for the DQN's batches."""
         rng = self._rng(batch, purpose)
         return self._new_starts(self._some_maps(batch, count, rng), rng)
 
     def leader_episodes(self, generation: int) -> Episodes:
         """The leader's episodes alongside a generation, with `rewind` set for crash starts."""
-        episodes = self.starts(generation, self.config.leader_episodes, purpose=2).with_limits(self.leader_limits())
+        episodes = self.starts(generation, self.config.leader_episodes, purpose=2)
+        self._limit(episodes.rows, min(self.config.leader_stretch * self.target, self.goal))
         episodes.rows["rewind"] = self.config.rewind
         return episodes
 
@@ -204,8 +192,7 @@ class Curriculum:
             maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic)
             absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
-            episodes = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
-            self._validation[seeds] = episodes.with_limits(self.goal_limits())
+            self._validation[seeds] = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
         return self._validation[seeds]
 
     def validation_score(self, results: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ epsilon and key.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -34,22 +33,14 @@ _F, _U = np.float32, np.uint64
 _IDLE = int(End.IDLE)
 
 #: An episode: index of its map in the task; x, y (m), heading (rad), speed (m/s), steering (rad) at its start; its
-#: target (m) and time limit (control steps), or 0 for those of `Limits`; rewind: if above 0, return the state that many
-#: control steps before the end.
+#: target (m of new ground) and time limit (control steps); rewind: if above 0, return the state that many control steps
+#: before the end.
 EPISODE = np.dtype([("map", "<i4"), ("start", "<f4", 5), ("target", "<f4"), ("steps", "<i4"), ("rewind", "<i4")])
 
 #: The result of an episode: new ground (m), new ground at a speed within the interval (m), control steps, End.
 RESULT = np.dtype([("distance", "<f4"), ("paced", "<f4"), ("steps", "<u2"), ("end", "u1"), ("pad", "u1")])
 
 MAX_STEPS = 65_535
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Target (m of new ground) and time limit (control steps) of episodes."""
-
-    target: float
-    steps: int
 
 
 class GridBuffers(NamedTuple):
@@ -289,23 +280,11 @@ def _collect(
         run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, results[k])
 
 
-def targets(episodes: np.ndarray, limits: Limits) -> np.ndarray:
-    """Target (m) of each episode: float64 [e]."""
-    return np.where(episodes["target"] > 0, episodes["target"], limits.target).astype(np.float64)
-
-
-def with_limits(episodes: np.ndarray, limits: Limits) -> np.ndarray:
-    """A copy of EPISODE [e] with `limits` filled in where they have no target or time limit of their own."""
-    episodes = episodes.copy()
-    episodes["target"] = targets(episodes, limits)
-    episodes["steps"] = np.where(episodes["steps"] > 0, episodes["steps"], limits.steps)
-    return episodes
-
-
-def _check(episodes: np.ndarray, limits: Limits, worlds: np.ndarray) -> None:
-    """Raises: ValueError if the traffic's shape does not fit or the time limit is out of range."""
-    if not 0 < limits.steps <= MAX_STEPS:
-        raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {limits.steps}")
+def _check(episodes: np.ndarray, worlds: np.ndarray) -> None:
+    """Raises: ValueError if the traffic's shape does not fit or a time limit is out of range."""
+    wrong = episodes["steps"][(episodes["steps"] < 1) | (episodes["steps"] > MAX_STEPS)]
+    if len(wrong):
+        raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {wrong[0]}")
     if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
         raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
 
@@ -315,7 +294,6 @@ def evaluate(
     genomes: np.ndarray,
     road_maps: Sequence[Map],
     episodes: np.ndarray,
-    limits: Limits,
     config: SimConfig,
     worlds: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -330,7 +308,7 @@ def evaluate(
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
         raise ValueError(f"genomes of {spec} are [n, {spec.size}], not {genomes.shape}")
-    _check(episodes, limits, worlds)
+    _check(episodes, worlds)
     buffers = policy_buffers(spec, config)
     genomes = freeze(genomes.astype(np.float32, copy=False))
     # Transposed, because the kernel fills one episode at a time.
@@ -340,7 +318,7 @@ def evaluate(
     rewound = np.zeros((max(k, 1), len(genomes), 5), dtype=np.float32)
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
     simulations = simulations_on(road_maps, config)
-    for column, episode in enumerate(with_limits(episodes, limits)):
+    for column, episode in enumerate(episodes):
         _rollout(
             simulations[episode["map"]],
             genomes,
@@ -363,7 +341,6 @@ def collect(
     episodes: np.ndarray,
     epsilons: np.ndarray,
     keys: np.ndarray,
-    limits: Limits,
     config: SimConfig,
     worlds: np.ndarray,
 ) -> tuple[Experience, np.ndarray]:
@@ -377,8 +354,7 @@ def collect(
     """
     if weights.shape != (spec.size,):
         raise ValueError(f"the weights of {spec} are [{spec.size}], not {weights.shape}")
-    _check(episodes, limits, worlds)
-    episodes = with_limits(episodes, limits)
+    _check(episodes, worlds)
     buffers, simulations = policy_buffers(spec, config), simulations_on(road_maps, config)
     weights = freeze(weights.astype(np.float32, copy=False))
     setups = freeze(episodes["start"]), freeze(episodes["target"]), freeze(episodes["steps"].astype(np.int64))
@@ -401,18 +377,19 @@ def trajectory(
     genome: np.ndarray,
     road_map: Map,
     start: np.ndarray,
-    limits: Limits,
+    target: float,
+    steps: int,
     config: SimConfig,
     world: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive one genome through one episode and record all states.
 
-    Args: as `evaluate`'s; start float32 [5], world float32 [cars, world.FIELDS].
+    Args: as `evaluate`'s; start float32 [5], target m and steps as in EPISODE, world float32 [cars, world.FIELDS].
     Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
     `gridsim.car.ego`, and the traffic at these times, float32 [steps + 1, cars, world.FIELDS]).
     """
     simulation, cars = simulations_on([road_map], config)[0], 0 if world is None else len(world)
-    workspace = make_workspace(simulation, spec.layers, limits.steps + 1, cars)
+    workspace = make_workspace(simulation, spec.layers, steps + 1, cars)
     closing, grid_buffers = policy_buffers(spec, config)
     world = world.copy() if world is not None and cars else None
     result = np.zeros(1, dtype=RESULT)
@@ -420,7 +397,7 @@ def trajectory(
         simulation,
         packed_genome(freeze(genome), spec.layers, grid_buffers),
         spec.layers,
-        EpisodeSetup(freeze(start), _F(limits.target), limits.steps),
+        EpisodeSetup(freeze(start), _F(target), steps),
         workspace,
         world,
         closing,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evolution.episodes.rollout import EPISODE, Limits, with_limits
+from evolution.episodes.rollout import EPISODE
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
 from gridsim.traffic.world import FIELDS, spawn
@@ -19,10 +19,6 @@ class Episodes(NamedTuple):
     maps: list[int]  # seeds of the maps
     rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
     worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
-
-    def with_limits(self, limits: Limits) -> Episodes:
-        """`rollout.with_limits` of these episodes."""
-        return self._replace(rows=with_limits(self.rows, limits))
 
     def and_then(self, others: Episodes) -> Episodes:
         """Concatenate these and other episodes with the same number of cars."""
@@ -44,15 +40,17 @@ def lane_starts(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
 
+    They have the configuration's target and time limit.
     Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
     """
+    config = config or SimConfig()
     episodes, worlds = np.zeros(len(maps), dtype=EPISODE), np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
-    episodes["map"] = maps
+    episodes["map"], episodes["target"], episodes["steps"] = maps, config.episode.target, config.episode.steps
     on_each = [(road_maps[m], np.flatnonzero(maps == m)) for m in np.unique(maps)]
     for road_map, of in on_each:
         episodes["start"][of] = sample_starts(road_map, len(of), rng)
     if traffic:
         keys = rng.integers(1 << 63, size=len(maps), dtype=np.uint64)
         for road_map, of in on_each:
-            worlds[of] = spawn(road_map.network, episodes["start"][of], traffic, keys[of], config or SimConfig())
+            worlds[of] = spawn(road_map.network, episodes["start"][of], traffic, keys[of], config)
     return episodes, worlds

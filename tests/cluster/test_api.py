@@ -12,7 +12,7 @@ from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champio
 from cluster.runs.checkpoint import CheckpointError, save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import DqnSettings
-from evolution.episodes.rollout import Limits, trajectory
+from evolution.episodes.rollout import trajectory
 from evolution.networks import convnet
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import STEERING
@@ -65,7 +65,7 @@ def test_environment_and_rollout_drive_alike(champion):
         blind = genome.copy()
         blind[(spec.inputs - 1) * 8 : spec.inputs * 8] = 0.0
         (result, states, _), (other, *_) = (
-            trajectory(spec, genes, scenario, start, Limits(2000.0, 400), champion.sim) for genes in (genome, blind)
+            trajectory(spec, genes, scenario, start, 2000.0, 400, champion.sim) for genes in (genome, blind)
         )
         steps, without = int(result["steps"]), int(other["steps"])
     driver = Champion(genome, policy, "curved", champion.sim)

@@ -28,7 +28,7 @@ from cluster.workers.pool import (
 )
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.dqn.experience import Experience
-from evolution.episodes.rollout import EPISODE, RESULT, Limits, _rollout
+from evolution.episodes.rollout import EPISODE, RESULT, _rollout
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import RECIPE, Kind, Mutation, _breed
@@ -74,8 +74,9 @@ def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | Non
     if episodes is None:
         episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
         episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
+        episodes["target"], episodes["steps"] = 150.0, 300
     worlds = np.zeros((len(episodes), 0, FIELDS), dtype=np.float32)
-    return Task("mlp:6,7", episodes, worlds, maps, Limits(150.0, 300), SimConfig(), parents, 12345, Mutation())
+    return Task("mlp:6,7", episodes, worlds, maps, SimConfig(), parents, 12345, Mutation())
 
 
 def make_collect_task(n: int) -> CollectTask:
@@ -83,18 +84,19 @@ def make_collect_task(n: int) -> CollectTask:
     policy, keys = "mlp:6,7", np.arange(n, dtype=np.uint64)
     weights, epsilons = np.zeros(PolicySpec.parse(policy).size, dtype=np.float32), np.zeros(n, dtype=np.float32)
     episodes = np.zeros(n, dtype=EPISODE)
+    episodes["target"], episodes["steps"] = 150.0, 300
     worlds = np.zeros((n, 0, FIELDS), dtype=np.float32)
-    return CollectTask(policy, episodes, worlds, (), Limits(150.0, 300), SimConfig(), weights, epsilons, keys)
+    return CollectTask(policy, episodes, worlds, (), SimConfig(), weights, epsilons, keys)
 
 
 def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:
     """A small real task on two maps, and the maps."""
     maps, rng = [build(*name) for name in MAPS], np.random.default_rng(1)
     episodes, worlds = lane_starts(maps, np.arange(n) % 2, rng, 2)
+    episodes["target"], episodes["steps"] = 150.0, 300
     weights = (rng.standard_normal(311) * 0.4).astype(np.float32)
     keys, epsilons = rng.integers(1 << 63, size=n, dtype=np.uint64), np.full(n, 0.2, dtype=np.float32)
-    limits = Limits(150.0, 300)
-    return CollectTask("mlp:6,7", episodes, worlds, MAPS, limits, SimConfig(), weights, epsilons, keys), maps
+    return CollectTask("mlp:6,7", episodes, worlds, MAPS, SimConfig(), weights, epsilons, keys), maps
 
 
 def make_recipes(n: int) -> np.ndarray:
@@ -116,6 +118,7 @@ def drive_task() -> tuple[Task, list[Map]]:
     """A small real task on two maps, and the maps."""
     maps = [build(*name) for name in MAPS]
     episodes, _ = lane_starts(maps, np.array([0, 1, 1]), np.random.default_rng(1))
+    episodes["target"], episodes["steps"] = 150.0, 300
     return make_task(MAPS, episodes), maps
 
 

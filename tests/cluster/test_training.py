@@ -16,7 +16,6 @@ from cluster.training.evolution import Evolution
 from cluster.training.trainer import Champion, Maps
 from cluster.workers.pool import Outcome, PoolError, SerialPool
 from evolution.episodes.curriculum import FINAL_SEEDS, HELD_OUT_SEEDS
-from evolution.episodes.rollout import targets
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.breeding import Kind, breed
@@ -126,7 +125,6 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     driven: list[Outcome] = []
     evolution.search.tell, evolution._report = told.append, lambda stage, outcome: driven.append(outcome)
     curriculum, config, leader = evolution.curriculum, evolution.curriculum.config, evolution.search.leader()
-    limits, long = curriculum.limits(), curriculum.leader_limits()
     episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
     row = evolution.step()
     outcome, groups = driven[0], evolution.search.asked.groups
@@ -139,9 +137,9 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     score = np.zeros(50)
     for g, group in enumerate(groups):
         own = Episodes(episodes.maps, episodes.rows[g * e : g * e + e], episodes.worlds[g * e : g * e + e])
-        alone = evolution.drive("alone", genomes[group], own.with_limits(limits))
+        alone = evolution.drive("alone", genomes[group], own)
         assert alone.results.tobytes() == outcome.results[group, g * e : g * e + e].tobytes()
-        score[group] = evolution._score(alone.results, targets(own.rows, limits))
+        score[group] = evolution._score(alone.results, own.rows["target"].astype(np.float64))
     assert told[0].tobytes() == score.tobytes()
     assert not outcome.results[groups[0], e : len(episodes.rows)]["steps"].any()  # nor anybody else's
     if leader is None:
@@ -158,7 +156,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
         assert alone.worlds.tobytes() == outcome.worlds[first : first + len(led)].tobytes()
         assert evolution.elites[after].tobytes() == leader.tobytes()
         assert row["distance_m/best"] == led["distance"].mean()
-        assert row["fitness/best"] == evolution._score(alone.results, long.target)[0]
+        assert row["fitness/best"] == evolution._score(alone.results, float(followed.rows["target"][0]))[0]
         assert row["fitness/mean"] == score.mean()
         assert len(outcome.recipes) == 52
         validation = evolution.drive("alone", candidate[None], curriculum.validation())

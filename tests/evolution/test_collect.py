@@ -10,7 +10,7 @@ from scipy import stats
 
 from cluster.runs.champion import load_champion
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
-from evolution.episodes.rollout import Limits, collect, evaluate
+from evolution.episodes.rollout import collect, evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode
 from gridsim.car.ego import SPEED, STEERING, End
@@ -22,10 +22,10 @@ from gridsim.sensing.grid import grid_table, grids
 F = np.float32
 CONFIG = SimConfig()
 CARS = 8
-LIMITS = Limits(120.0, 150)
+TARGET, STEPS = 120.0, 150
 
 # The arguments of `collect`, in its order.
-Asked = namedtuple("Asked", "spec weights scenarios episodes epsilons keys limits config worlds")
+Asked = namedtuple("Asked", "spec weights scenarios episodes epsilons keys config worlds")
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +39,9 @@ def ask(root):
         spec = PolicySpec.parse(policy)
         weights = driver if policy == "mlp:6,7" else (rng.normal(size=spec.size) * 0.3).astype(F)
         episodes, worlds = lane_starts(scenarios, np.arange(n) % len(scenarios), rng, cars)
+        episodes["target"], episodes["steps"] = TARGET, STEPS
         keys = rng.integers(1 << 63, size=n, dtype=np.uint64)
-        return Asked(spec, weights, scenarios, episodes, np.full(n, epsilon, F), keys, LIMITS, CONFIG, worlds)
+        return Asked(spec, weights, scenarios, episodes, np.full(n, epsilon, F), keys, CONFIG, worlds)
 
     return make
 
@@ -67,7 +68,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
     row, table, seen = 0, grid_table(CONFIG), np.zeros(64, dtype=F)
     for episode, world, result in zip(of.episodes, of.worlds, results, strict=True):
         road = of.scenarios[episode["map"]]
-        simulator = Simulator(1, CONFIG, LIMITS.target, LIMITS.steps, traffic=cars)
+        simulator = Simulator(1, CONFIG, TARGET, STEPS, traffic=cars)
         simulator.reset(road, episode["start"][None], worlds=world[None] if cars else None)
         car, ranges, ends = simulator.cars[0], simulator.ranges, simulator.ends
         for step in range(int(result["steps"]) + 1):
@@ -90,7 +91,7 @@ def test_every_row_is_what_the_simulator_shows_for_these_actions(ask, policy, ca
 def test_without_exploring_it_is_evaluate(ask, policy, cars):
     of = ask(policy, 12, 0.0, cars)
     _, results = collect(*of)
-    wanted, _, _ = evaluate(of.spec, of.weights[None], of.scenarios, of.episodes, LIMITS, CONFIG, of.worlds)
+    wanted, _, _ = evaluate(of.spec, of.weights[None], of.scenarios, of.episodes, CONFIG, of.worlds)
     assert results.tobytes() == wanted[0].tobytes()
     assert results["steps"].sum() > 100
 
@@ -102,13 +103,13 @@ def test_all_ends_are_flagged_once_each_and_an_episodes_own_limits_count(ask):
     of.episodes["target"][::5] = 25.0
     experience, results = collect(*of)
     for episode, row, result in zip(cut_up(experience), of.episodes, results, strict=True):
-        steps, most = len(episode.actions) - 1, row["steps"] or LIMITS.steps
+        steps, most = len(episode.actions) - 1, row["steps"]
         assert steps == result["steps"] <= most
         assert episode.ends.tolist() == [0] * (steps - 1) + [int(result["end"]), 0]
         assert (episode.actions[:-1] < 8).all()
         assert (episode.rewards[:-1] == -1.0).tolist() == [False] * (steps - 1) + [result["end"] == End.COLLISION]
         assert (result["end"] == End.TIME) <= (steps == most)
-        assert (result["end"] == End.SUCCESS) == (result["distance"] >= (row["target"] or LIMITS.target))
+        assert (result["end"] == End.SUCCESS) == (result["distance"] >= row["target"])
     assert set(results["end"]) == {End.COLLISION, End.IDLE, End.SUCCESS, End.TIME}
 
 
@@ -152,10 +153,12 @@ def test_an_episode_depends_on_itself_alone(ask):
 
 def test_what_does_not_fit_is_refused(ask):
     of = ask("mlp:6,7", 4, 0.5, 0)
+    endless = of.episodes.copy()
+    endless["steps"][1] = 65_536
     for change, text in (
         ({"weights": of.weights[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
         ({"worlds": of.worlds[:3]}, "traffic of 4 episodes is"),
-        ({"limits": Limits(100.0, 0)}, "1 to 65535 steps, not 0"),
+        ({"episodes": endless}, "1 to 65535 steps, not 65536"),
     ):
         with pytest.raises(ValueError, match=text):
             collect(*of._replace(**change))

@@ -7,7 +7,7 @@ import pytest
 
 from cluster.runs.champion import load_champion
 from cluster.workers.worker import Task, Worker
-from evolution.episodes.rollout import RESULT, Limits, evaluate, trajectory
+from evolution.episodes.rollout import RESULT, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, outputs_of
 from evolution.search.breeding import RECIPE, Mutation
@@ -21,7 +21,7 @@ from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 F = np.float32
 CONFIG = SimConfig()
 CARS = 8
-AMONG = Limits(1000.0, 1700)
+TARGET, STEPS = 1000.0, 1700
 
 
 def actions_of(spec, genome, simulator):
@@ -37,8 +37,9 @@ def among(root):
     spec = PolicySpec.parse(champion.policy)
     maps = [build("seamless", 3), build("highway", 4), build("city", 5)]
     episodes, worlds = lane_starts(maps, np.arange(9) % 3, np.random.default_rng(18), CARS)
+    episodes["target"], episodes["steps"] = TARGET, STEPS
     paths = [
-        trajectory(spec, champion.genome, maps[e["map"]], e["start"].copy(), AMONG, CONFIG, w)
+        trajectory(spec, champion.genome, maps[e["map"]], e["start"].copy(), TARGET, STEPS, CONFIG, w)
         for e, w in zip(episodes, worlds, strict=True)
     ]
     # Worth comparing: crashes, successes, a lane change.
@@ -50,16 +51,16 @@ def among(root):
 def test_the_same_world_alone_in_a_batch_and_in_a_worker(among):
     """Bit for bit: the fused rollout, a worker, and `Simulator.step` with one car or nine on three maps."""
     spec, genome, maps, episodes, worlds, paths = among
-    results, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, worlds=worlds)
+    results, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, worlds)
     assert results.tobytes() == np.array([[row for row, _, _ in paths]], dtype=RESULT).tobytes()
     recipes = np.zeros(3, dtype=RECIPE)
     names = tuple((scenario.name, scenario.seed) for scenario in maps)
-    task = Task("mlp:6,7", episodes.copy(), worlds.copy(), names, AMONG, CONFIG, genome[None].copy(), 0, Mutation())
+    task = Task("mlp:6,7", episodes.copy(), worlds.copy(), names, CONFIG, genome[None].copy(), 0, Mutation())
     shared, _, _ = Worker().evaluate(task, maps, recipes)
     assert all(row.tobytes() == results[0].tobytes() for row in shared)
 
     for cars in (np.arange(9), np.array([4])):
-        simulator = Simulator(len(cars), CONFIG, AMONG.target, AMONG.steps, traffic=CARS)
+        simulator = Simulator(len(cars), CONFIG, TARGET, STEPS, traffic=CARS)
         own = [maps[m] for m in episodes["map"][cars]]
         simulator.reset(own, episodes["start"][cars], worlds=worlds[cars])
         for step in range(1 + max(int(paths[k][0]["steps"]) for k in cars)):
@@ -79,12 +80,12 @@ def test_what_is_rewound_goes_on_as_it_did(among):
     """
     spec, genome, maps, episodes, worlds, paths = among
     both = np.stack([genome, np.zeros_like(genome)])
-    plain, starts, then = evaluate(spec, both, maps, episodes, AMONG, CONFIG, worlds)
+    plain, starts, then = evaluate(spec, both, maps, episodes, CONFIG, worlds)
     assert (starts.shape, then.shape) == ((2, 0, 5), (2, 0, *worlds.shape[1:]))
     crashed = [int(row["end"]) == End.COLLISION for row, _, _ in paths]
     wanted = episodes.copy()
     wanted["rewind"] = np.where(crashed, 64, [0, 1, 5000, 1, 5000, 0, 5000, 0, 1])
-    results, starts, then = evaluate(spec, both, maps, wanted, AMONG, CONFIG, worlds)
+    results, starts, then = evaluate(spec, both, maps, wanted, CONFIG, worlds)
     assert results.tobytes() == plain.tobytes()
     kept = np.flatnonzero(wanted["rewind"])
     assert (starts.shape, then.shape) == ((2, len(kept), 5), (2, len(kept), *worlds.shape[1:]))
@@ -97,7 +98,7 @@ def test_what_is_rewound_goes_on_as_it_did(among):
         assert start == pytest.approx([*car[[X, Y]], math.atan2(car[SIN], car[COS]), *car[[SPEED, STEERING]]])
         if not crashed[k]:
             continue
-        original, again = (Simulator(1, CONFIG, AMONG.target, AMONG.steps, traffic=CARS) for _ in range(2))
+        original, again = (Simulator(1, CONFIG, TARGET, STEPS, traffic=CARS) for _ in range(2))
         road_map = maps[episodes["map"][k]]
         original.reset(road_map, episodes["start"][k : k + 1], worlds=worlds[k : k + 1])
         again.reset(road_map, start[None], worlds=world[None])
@@ -118,6 +119,6 @@ def test_without_room_for_anybody_there_is_no_traffic(among):
     spec, genome, maps, episodes, _, _ = among
     absent = np.zeros((9, CARS, TRAFFIC_FIELDS), dtype=F)
     absent[..., LANE] = -1.0
-    alone, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, absent[:, :0])
-    results, _, _ = evaluate(spec, genome[None], maps, episodes, AMONG, CONFIG, worlds=absent)
+    alone, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, absent[:, :0])
+    results, _, _ = evaluate(spec, genome[None], maps, episodes, CONFIG, absent)
     assert results.tobytes() == alone.tobytes()
