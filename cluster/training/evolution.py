@@ -66,6 +66,7 @@ class Evolution(Learning):
         curriculum, period = self.curriculum, self.sim.episode.control_period
         leader = self.search.leader()
         candidate = leader if self._promising() else None
+        self.search.champion = self.champion.genome if self.champion else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.steps)
         n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
         goals = episodes.rows["target"][:e].astype(np.float64)  # the same in each group
@@ -97,8 +98,6 @@ class Evolution(Learning):
         self.search.tell(score)
         if candidate is not None and not driven.lost[trial.rows][0]:
             self._judge(candidate, driven.results[trial], self.steps - 1)
-        if self.champion is not None:
-            self.search.champion = self.champion.genome
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
         row = {
             "fitness/best": led_score if np.isfinite(led_score) else -1.0,
@@ -165,12 +164,9 @@ class Evolution(Learning):
         super().restore(arrays, meta)
         self.search.restore(named(arrays, "search_"))
         self.search.generation = meta["generation"]
-        if self.champion is not None:
-            self.search.champion = self.champion.genome
-        curriculum = self.curriculum
         for name in CRASHES:
-            setattr(curriculum, name, arrays[name])
-        curriculum.target = meta["target"]
+            setattr(self.curriculum, name, arrays[name])
+        self.curriculum.target = meta["target"]
 
 
 @dataclass
