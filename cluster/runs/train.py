@@ -33,7 +33,7 @@ from cluster.tracking.address import TrackingError, check_uri, shown, with_passw
 from cluster.tracking.mlflow_run import Identity, Status, quiet
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
-from cluster.training.trainer import Learning, Maps, State, held_out_episodes
+from cluster.training.trainer import Learning, Maps, State
 from cluster.workers import kernels
 from cluster.workers.pool import SerialPool, WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
@@ -303,11 +303,10 @@ class Session:
         champion.save(path / CHAMPION)
         elites = steps.read_elites(path, settings.policy)
         checkpoint.save(path / ELITES, {"genomes": elites}, {"policy": settings.policy})
-        episodes = held_out_episodes(self.maps, settings.traffic)
+        episodes, figures = learning.held_out()
+        self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # meanwhile, in its thread
         seed = episodes.maps[int(episodes.rows[0]["map"])]
         road_map, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
-        figures = learning.held_out()
-        self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # meanwhile, in its thread
         pictures.curves(learning.history, path / "curves.png", settings.step_name)
         drive = film.record(champion, road_map, start, learning.sim.episode.time_limit, world)
         where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"

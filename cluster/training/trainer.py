@@ -220,15 +220,15 @@ class Learning(ABC):
         steps, seconds = row["car_steps"] - before["car_steps"], wall_s - before["wall_s"]
         row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
 
-    def held_out(self) -> dict[str, float]:
+    def held_out(self) -> tuple[Episodes, dict[str, float]]:
         """The champion on roads never used in training or selection: the same 64 episodes in all runs of a scenario."""
         assert self.champion is not None
         before = self.car_steps
-        episodes = held_out_episodes(self.maps, self.settings.traffic)
+        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, self.settings.traffic)
         driven = self.drive("held out", self.champion.genome[None], episodes)
         check_any_left(driven.lost, "held out")
         self.car_steps = before  # not part of learning
-        return summarise(driven.results[0], self.sim.episode.control_period)
+        return episodes, summarise(driven.results[0], self.sim.episode.control_period)
 
     # ------------------------------------------------------------------------------------------------------- state
 
@@ -279,11 +279,6 @@ def check_any_left(lost: np.ndarray, stage: str) -> None:
     """Raises: PoolError if all of lost, bool [n], are true: then there is nothing to continue with."""
     if lost.all():
         raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")
-
-
-def held_out_episodes(maps: Maps, traffic: int) -> Episodes:
-    """The 64 episodes that are reported, and never used for selection."""
-    return spread_starts(maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, traffic)
 
 
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
