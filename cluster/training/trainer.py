@@ -6,7 +6,6 @@ returned what.
 
 from __future__ import annotations
 
-import threading
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -47,17 +46,15 @@ class Maps:
     def __init__(self, scenario: str, config: SimConfig):
         self._scenario, self._config = scenario, config
         self._built: dict[int, Future[Map]] = {}
-        self._lock = threading.Lock()
         # Two threads for later ones: while the workers wait for validation's maps, both cores build them.
         self._soon, self._later = (ThreadPoolExecutor(n, thread_name_prefix=f"maps-{n}") for n in (1, 2))
 
     def ahead(self, seeds: Sequence[int], later: bool = False) -> None:
         """Begin to build maps that will be needed, in this order; `later` ones do not delay the others."""
         thread = self._later if later else self._soon
-        with self._lock:
-            for seed in seeds:
-                if seed not in self._built:
-                    self._built[seed] = thread.submit(build, self._scenario, seed, self._config)
+        for seed in seeds:
+            if seed not in self._built:
+                self._built[seed] = thread.submit(build, self._scenario, seed, self._config)
 
     def get(self, seed: int) -> Map:
         """The map of a seed."""
