@@ -59,26 +59,19 @@ class Champion:
         """Other cars on a scenario by default: on its own as many as it learned among, elsewhere the usual number."""
         return self.traffic if scenario == self.scenario else default_traffic(scenario)
 
-    def act(
-        self, observation: np.ndarray | dict[str, np.ndarray], speed: float | np.ndarray | None = None
-    ) -> int | np.ndarray:
-        """The action for an observation, or actions [n] for n of them.
+    def act(self, observation: np.ndarray | dict[str, np.ndarray]) -> int | np.ndarray:
+        """The action for an observation as `make_env`'s environment gives it, or actions [n] for n of them.
 
-        Args: with rays, the environment's float32 [32] or [n, 32], which contains the speed, or more numbers if the
-        policy sees more (as from `make_env`). With the grid, the environment's dictionary of grid and speed, or what
-        `convnet.act_on` takes, uint8 [80, 80] or [frames, 80, 80], and the speed in m/s, which the grid does not show.
+        Args: with rays, float32 [32] or [n, 32], or more numbers if the policy sees more; with the grid, a dictionary:
+        grid, uint8 [frames, 80, 80] or [n, frames, 80, 80], and speed.
         Raises: ValueError, with a one-line message, for an observation that does not fit this champion.
         """
         spec = PolicySpec.parse(self.policy)
         if isinstance(spec, CnnSpec):
-            if isinstance(observation, dict):
-                if speed is None:
-                    speed = observation["speed"][..., 0] * np.float32(self.sim.vehicle.speed_limit)
-                grids = observation["grid"]
-                observation = grids[..., 0, :, :] if spec.frames == 1 else grids
-            if speed is None:
-                raise ValueError(f'{spec} needs the speed (m/s) besides the grid: act(grid, info["speed_mps"])')
-            return convnet.act_on(spec, self.genome, observation, speed)
+            if not isinstance(observation, dict):
+                raise ValueError(f"{spec} sees a dictionary of grid and speed, not {type(observation).__name__}")
+            speeds = observation["speed"][..., 0] * np.float32(self.sim.vehicle.speed_limit)
+            return convnet.act_on(spec, self.genome, observation["grid"], speeds)
         return act_on(spec, self.genome, np.asarray(observation), self.sim)
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:

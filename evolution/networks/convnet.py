@@ -145,17 +145,14 @@ def _act_on(genome, layers, frames, speeds, scratch, actions):
 def act_on(spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: float | np.ndarray) -> int | np.ndarray:
     """Actions of a genome for grids.
 
-    Args: observation uint8 [80, 80] for a network of one frame, [frames, 80, 80] for one of several, newest last, or
-    either with a leading axis [n, ...]; speed m/s, a number or [n].
+    Args: observation uint8 [frames, 80, 80], newest last, or [n, frames, 80, 80]; speed m/s, a number or [n].
     Returns: an action, or int64 [n]; -1 if an output is NaN.
     Raises: ValueError with one line if the observation's shape or type is wrong.
     """
     grids = np.asarray(observation)
-    frame = (CELLS, CELLS) if spec.frames == 1 else (spec.frames, CELLS, CELLS)
-    many = grids.ndim == len(frame) + 1
-    if grids.shape[many:] != frame or grids.dtype != np.uint8:
-        shape = ", ".join(map(str, frame))
-        raise ValueError(f"{spec} sees grids uint8 [{shape}] or [n, {shape}], not {grids.dtype} {grids.shape}")
+    many, frames = grids.ndim == 4, f"{spec.frames}, {CELLS}, {CELLS}"
+    if grids.shape[many:] != (spec.frames, CELLS, CELLS) or grids.dtype != np.uint8:
+        raise ValueError(f"{spec} sees grids uint8 [{frames}] or [n, {frames}], not {grids.dtype} {grids.shape}")
     grids = np.ascontiguousarray(grids).reshape(-1, spec.frames, CELLS * CELLS)
     speeds = np.ascontiguousarray(np.broadcast_to(np.asarray(speed, dtype=np.float32), len(grids)))
     actions = np.empty(len(grids), dtype=np.int64)

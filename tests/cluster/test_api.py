@@ -141,18 +141,17 @@ def test_an_unfinished_run_says_how_to_go_on(settings, tmp_path):
 def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer, monkeypatch):
     stack = np.random.default_rng(1).choice([0, 127, 255], (3, 2, 80, 80)).astype(np.uint8)
     speeds = np.array([0.0, 5.0, 9.0])
-    actions = seer.act(stack, speeds)
-    assert [seer.act(grid, speed) for grid, speed in zip(stack, speeds, strict=True)] == list(actions)
-    assert list(seer.act({"grid": stack}, speeds)) == list(actions)
+    shares = speeds[:, None] / seer.sim.vehicle.speed_limit  # as an environment shows them
+    actions = seer.act({"grid": stack, "speed": shares})
+    assert [seer.act({"grid": stack[k], "speed": shares[k]}) for k in range(3)] == list(actions)
     with monkeypatch.context() as patch:
         patch.setattr(convnet, "act_on", lambda spec, genome, grids, speed: speed)
-        shares = speeds[:, None] / seer.sim.vehicle.speed_limit  # as an environment shows them
         np.testing.assert_allclose(seer.act({"grid": stack, "speed": shares}), speeds, rtol=1e-6)
-    with pytest.raises(ValueError, match="needs the speed"):
+    with pytest.raises(ValueError, match="sees a dictionary of grid and speed, not ndarray"):
         seer.act(stack)
     for other in (np.zeros(32, dtype=np.float32), stack.astype(np.float32), stack[0, 0], stack[..., None]):
         with pytest.raises(ValueError, match=r"^cnn:8,8,8@2 sees grids uint8"):
-            seer.act(other, 5.0)
+            seer.act({"grid": other, "speed": shares})
 
 
 def test_evolution_on_the_grid_is_the_same_for_any_number_of_workers(seer):

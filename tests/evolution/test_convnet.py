@@ -32,8 +32,7 @@ def test_forward_is_pytorchs(spec):
         expected = to_torch(spec, genome, SimConfig()).double()(seen).numpy()[0]
         assert np.abs(expected).max() > 1e-3
         assert room.outputs == pytest.approx(expected, abs=2e-5 * max(1.0, np.abs(expected).max()))
-        shown = frames[0] if spec.frames == 1 else frames
-        assert convnet.act_on(spec, genome, shown, float(speed)) == int(room.outputs.argmax())
+        assert convnet.act_on(spec, genome, frames, float(speed)) == int(room.outputs.argmax())
 
 
 def test_a_gene_that_is_not_a_number_is_no_action():
