@@ -190,12 +190,6 @@ class Dqn(Learning):
             "converged": self.converged,
         }
 
-    def progress(self) -> tuple[float, float, str]:
-        s = self.settings
-        if s.episodes and not s.car_steps:
-            return self.episodes, s.episodes, "episodes"
-        return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
-
     def describe(self, row: dict[str, float]) -> str:
         return (
             f"distance {row['distance_m/best']:,.0f} m, {row['network/success_rate']:.0%} succeed  "

@@ -140,12 +140,6 @@ class Evolution(Learning):
     def counts(self) -> dict[str, int]:
         return {"generation": self.steps, "car_steps": self.car_steps}
 
-    def progress(self) -> tuple[float, float, str]:
-        s = self.settings
-        if s.car_steps and not s.generations:
-            return self.car_steps / 1e6, s.car_steps / 1e6, "M car-steps"
-        return self.steps, s.generations, "generations"
-
     def describe(self, row: dict[str, float]) -> str:
         plural = "" if self.steps == 1 else "s"
         done = f"{self.steps} generation{plural}  " if self.progress()[2] != "generations" else ""

@@ -128,10 +128,6 @@ class Learning(ABC):
         """How far it has come: the number of its steps by their name, and what the settings' `ended` asks for."""
 
     @abstractmethod
-    def progress(self) -> tuple[float, float, str]:
-        """How far the run is, how far it goes at most (0: unknown), and in what unit."""
-
-    @abstractmethod
     def describe(self, row: dict[str, float]) -> str:
         """A row of the history in words."""
 
@@ -139,6 +135,13 @@ class Learning(ABC):
     def steps(self) -> int:
         """Steps that are done."""
         return len(self.history)
+
+    def progress(self) -> tuple[float, float, str]:
+        """How far the run is, how far it goes at most (0: unknown), and in what unit: that of its first limit."""
+        settings, limits = self.settings, self.settings.unbound
+        name = next((name for name in limits if getattr(settings, name)), limits[0])
+        done, most = self.steps if name == "generations" else self.counts()[name], getattr(settings, name)
+        return (done / 1e6, most / 1e6, "M car-steps") if name == "car_steps" else (done, most, name)
 
     def done(self) -> bool:
         """Whether there is nothing left to learn."""
