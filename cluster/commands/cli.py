@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -122,16 +123,6 @@ class EvaluateFlags(RoadFlags):
     removed: ClassVar[dict[str, str]] = {"--reference": "errors are those against the reference driver; use --errors"}
 
 
-def evolve_main() -> None:
-    """Entry point of `gridsim-evolve`."""
-    main(EvolveFlags.command, lambda: _learn(EvolveFlags, sys.argv[1:]))
-
-
-def dqn_main() -> None:
-    """Entry point of `gridsim-dqn`."""
-    main(DqnFlags.command, lambda: _learn(DqnFlags, sys.argv[1:]))
-
-
 def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     """Flags and the run's folder, checked; nothing is written yet. Raises GridSimError."""
     prog = kind.command
@@ -185,10 +176,10 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
     return flags, new_run(Path(flags.output), flags.name, settings, flags.init, digest)
 
 
-def _learn(kind: type[Flags], arguments: Sequence[str]) -> int:
+def _learn(kind: type[Flags]) -> int:
     prog, step = kind.command, kind.step_name
     console = Console()
-    flags, run = _prepare(kind, arguments)
+    flags, run = _prepare(kind, sys.argv[1:])
     if run.saved and is_finished(run):
         sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
         sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
@@ -269,11 +260,6 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     )
 
 
-def evaluate_main() -> None:
-    """Entry point of `gridsim-evaluate`."""
-    main("gridsim-evaluate", _evaluate, {CheckpointError: "give a run's folder or a champion.npz"})
-
-
 def _evaluate() -> int:
     flags = parse(EvaluateFlags, "gridsim-evaluate", sys.argv[1:])
     champion = load_champion(flags.champion)
@@ -291,3 +277,8 @@ def _evaluate() -> int:
     if missed is not None:
         Console().print(errors_table("Errors against the reference driver", missed))
     return 0
+
+
+evolve_main = partial(main, EvolveFlags.command, partial(_learn, EvolveFlags))
+dqn_main = partial(main, DqnFlags.command, partial(_learn, DqnFlags))
+evaluate_main = partial(main, "gridsim-evaluate", _evaluate, {CheckpointError: "give a run's folder or a champion.npz"})

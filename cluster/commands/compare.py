@@ -84,12 +84,8 @@ MAX_JOBS = 256  # each takes some 500 MB here
 WITH_RUNS = ("runs", "output", "name")  # flags for a comparison of finished runs
 
 
-def compare_main() -> None:
-    """Entry point of `gridsim-compare`."""
-    main(PROG, lambda: _compare(sys.argv[1:]))
-
-
-def _compare(arguments: Sequence[str]) -> int:
+def _compare() -> int:
+    arguments = sys.argv[1:]
     flags = parse(CompareFlags, PROG, arguments)
     if flags.quick and not flags.resume:
         flags = parse(CompareFlags, PROG, arguments, QUICK)
@@ -310,3 +306,6 @@ class Progress(Line):
         now = time.perf_counter()
         seconds = (self._run_s * self.left - sum(now - begun for begun in self._begun.values())) / self._jobs
         return clock(max(seconds, 0.0)) if math.isfinite(seconds) else "-:--"
+
+
+compare_main = partial(main, PROG, _compare)

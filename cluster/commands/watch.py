@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -36,10 +37,15 @@ from gridsim.traffic.world import spawn
 from gridsim.view.drive import Recorder, drive, read_drive, replay
 from gridsim.view.render import NoDisplayError, Renderer, Window
 
+WATCH, DRIVE = "gridsim-watch", "gridsim-drive"
+HINTS: dict[type[GridSimError], str] = {
+    NoDisplayError: "to write a page or a film in place of a window: --output drive.html, or film.mp4",
+    UnfinishedError: "to watch it as it stands: --follow, or --generation N",
+    CheckpointError: "give a run's folder, a champion.npz or a recorded drive.csv",
+}
 FILM_S = 60.0  # s of a film by default
 FOLLOW_S = 10.0  # s that an elite is watched before a newer one may take its place
 LINGER_S = 1.5  # s that the last picture of a drive stays
-WATCH, DRIVE = "gridsim-watch", "gridsim-drive"
 
 
 @dataclass(frozen=True)
@@ -109,16 +115,6 @@ def _map(name: str, seed: int, config: SimConfig) -> tuple[Map, np.ndarray]:
     """A map and a start float32 [5] on it, both of this seed. Raises GridSimError."""
     scenario = build(name, seed, config)
     return scenario, sample_starts(scenario, 1, np.random.default_rng(np.random.SeedSequence([seed, 7])))[0]
-
-
-def watch_main() -> None:
-    """Entry point of `gridsim-watch`."""
-    hints: dict = {
-        NoDisplayError: "to write a page or a film in place of a window: --output drive.html, or film.mp4",
-        UnfinishedError: "to watch it as it stands: --follow, or --generation N",
-        CheckpointError: "give a run's folder, a champion.npz or a recorded drive.csv",
-    }
-    main(WATCH, _watch, hints)
 
 
 def _watch() -> int:
@@ -303,11 +299,6 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
                     break
 
 
-def drive_main() -> None:
-    """Entry point of `gridsim-drive`."""
-    main(DRIVE, _drive)
-
-
 def _drive() -> int:
     flags = parse(DriveFlags, DRIVE, sys.argv[1:])
     size, seconds = _size_and_seconds(flags.size, flags.seconds, flags.traffic)
@@ -323,3 +314,7 @@ def _drive() -> int:
                 recorder.close()
                 print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {recorder.path}")
     return 0
+
+
+watch_main = partial(main, WATCH, _watch, HINTS)
+drive_main = partial(main, DRIVE, _drive)

@@ -47,7 +47,7 @@ def finish(*arguments, cwd, timeout=240, code=0, **env):
 
 def call(main, monkeypatch, capsys, *arguments):
     """A command's function (`evolve_main`) in this process: (exit code, what it prints, its errors)."""
-    monkeypatch.setattr(sys, "argv", [f"gridsim-{main.__name__.removesuffix('_main')}", *map(str, arguments)])
+    monkeypatch.setattr(sys, "argv", [main.args[0], *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
         main()
     return ended.value.code, *capsys.readouterr()
@@ -57,7 +57,7 @@ def refused(main, monkeypatch, capsys, *arguments):
     """The one line or two that a command says where it refuses to begin."""
     code, out, err = call(main, monkeypatch, capsys, *arguments)
     assert (code, out) == (2, "")
-    assert err.startswith(f"gridsim-{main.__name__.removesuffix('_main')}: error: ")
+    assert err.startswith(f"{main.args[0]}: error: ")
     lines = err.splitlines()
     assert len(lines) <= 2
     return lines
