@@ -14,7 +14,7 @@ import shutil
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -118,12 +118,14 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     printed = io.StringIO()
     # Unless it writes to a terminal, tyro draws no box and uses no colours: its error is parsed below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
-    with _reader_may_leave(), contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
+    with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(out):
         try:
             found: Any = tyro.cli(
                 asked, prog=prog, description=_about(kind), args=arguments, config=config, registry=registry, **given
             )
             return kind(**{k: v for name in groups for k, v in vars(getattr(found, name)).items()}) if groups else found
+        except BrokenPipeError:  # the reader has left, as in `--help | head`
+            raise SystemExit(0) from None
         except SystemExit as stop:
             if not stop.code:
                 raise
@@ -133,19 +135,6 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     for words, plain in PLAIN.items():
         reason = re.sub(words, plain, reason)
     fail(prog, reason, f"see {command_path(prog)} --help")
-
-
-@contextlib.contextmanager
-def _reader_may_leave() -> Iterator[None]:
-    """Exit quietly if the output's reader leaves first, as in `--help | head`."""
-    try:
-        try:
-            yield
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more on exit
-        raise SystemExit(0) from None
 
 
 def _check_flags(kind: type, prog: str, arguments: Sequence[str]) -> None:
