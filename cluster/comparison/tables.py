@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,13 +27,6 @@ COLUMNS = (
 NOTHING = "–"
 
 
-def spread(values: Iterable[float]) -> tuple[int, float, float, float]:
-    """The number of finite values (the others were not measured), and their quartiles; nan if there are none."""
-    found = [value for value in values if math.isfinite(value)]
-    lower, median, upper = np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist()
-    return len(found), lower, median, upper
-
-
 @dataclass(frozen=True)
 class Group:
     """The runs of one learner on one road with all seeds."""
@@ -49,12 +42,14 @@ class Group:
     seeds: tuple[int, ...]  # all of the plan's
 
     def values(self, figure: str) -> list[float]:
-        """One number for each run."""
-        return [run.figures.get(figure, math.nan) for run in self.runs]
+        """One number for each run that has it: an error may not have been measured."""
+        return [value for run in self.runs if math.isfinite(value := run.figures.get(figure, math.nan))]
 
     def spread(self, figure: str) -> tuple[int, float, float, float]:
-        """The number of seeds that have it, and its quartiles over them."""
-        return spread(self.values(figure))
+        """The number of runs that have it, and its quartiles over them; nan if there are none."""
+        found = self.values(figure)
+        lower, median, upper = np.quantile(found or [math.nan], [0.25, 0.5, 0.75]).tolist()
+        return len(found), lower, median, upper
 
 
 Kind = tuple[str, int, str, str]  # a group's scenario, traffic, observation and learner

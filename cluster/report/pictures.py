@@ -138,7 +138,7 @@ def comparison(groups: Sequence[Group], path: Path) -> None:
                 place, median, 0.92 * width, color=color, alpha=0.75, yerr=whiskers, capsize=3,
                 hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2, label=group.name,
             )  # fmt: skip
-            seeds = [scale * value for value in group.values(name) if np.isfinite(value)]
+            seeds = [scale * value for value in group.values(name)]
             beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
             axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
                       markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
