@@ -111,10 +111,9 @@ def parse(kind: type[T], prog: str, arguments: Sequence[str], default: T | None 
     asked: type = kind
     if groups := getattr(kind, "groups", None):  # tyro shows each field of this type as a group
         # A new run's groups get no default: settings made before the flags are known would already fix the policy.
-        shown: list[Any] = list(groups.items())
+        asked = dataclasses.make_dataclass(kind.__name__, groups.items())
         if default is not None:
-            shown = [(name, part, field(default=select(part, default))) for name, part in shown]
-        asked, given = dataclasses.make_dataclass(kind.__name__, shown), {}
+            given = {"default": asked(*(select(part, default) for part in groups.values()))}
     printed = io.StringIO()
     # Unless it writes to a terminal, tyro draws no box and uses no colours: its error is parsed below.
     out = sys.stdout if {"-h", "--help"} & set(arguments) else printed
