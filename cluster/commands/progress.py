@@ -20,23 +20,14 @@ WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time
 BAR = 10  # characters
 
 
-class Line:
+class Line(Live):
     """On a terminal: `head`, `facts`, a bar and the elapsed time if `share` is known, and `rest` on a second line."""
 
     def __init__(self, console: Console):
-        self.console = console
         self.head = self.facts = self.rest = ""
         self.share: float | None = None
-        self._started = time.perf_counter()
-        self._live = Live(get_renderable=self.text, console=console, transient=True)
-
-    def __enter__(self) -> Self:
-        if self.console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
+        self._since = time.perf_counter()
+        super().__init__(console=console, auto_refresh=console.is_terminal, transient=True, get_renderable=self.text)
 
     def text(self) -> Text:
         """Both lines as they are now."""
@@ -44,7 +35,7 @@ class Line:
         if self.share is not None:
             done = round(BAR * min(self.share, 1.0))
             line.append("━" * done, "bar.complete").append("━" * (BAR - done), "bar.back")
-            line.append(f"  {clock(time.perf_counter() - self._started)}", "progress.elapsed")
+            line.append(f"  {clock(time.perf_counter() - self._since)}", "progress.elapsed")
         return line.append(f"\n{self.rest}")
 
 
