@@ -104,7 +104,7 @@ class RayPool(WorkerPool):
     ):  # fmt: skip
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
-        ray_session.prepare(own=address is None)
+        self._variables = ray_session.prepare(own=address is None)
         self.address = None if address is None else ray_session.check_address(address)
         self._asked = workers
         self._build_map = build_map
@@ -311,7 +311,7 @@ class RayPool(WorkerPool):
                 ray.kill(slot.actor)
             ray_session.leave()
             self._connected = False
-        ray_session.restore()
+        ray_session.restore(self._variables)
         self._slots = []
         self._closed.set()
         self._thread.join(1.0)

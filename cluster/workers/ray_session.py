@@ -69,30 +69,27 @@ def check_address(address: str) -> str:
     return address
 
 
-def prepare(own: bool) -> None:
+def prepare(own: bool) -> list[str]:
     """Set Ray's variables for a Ray of our `own` or a cluster; to be called before there are threads.
 
     A new variable may move the environment, and a thread that reads it at this moment, in C, crashes the process.
+    Returns: those to remove when Ray is left: with our token, a cluster that is joined next could not call us.
     """
-    new = ENVIRONMENT
-    if own:
-        new = new | OWN_ENVIRONMENT | ({} if any(name in os.environ for name in AUTH_ENVIRONMENT) else OWN_TOKEN)
-    for name, value in new.items():
+    for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    ours = OWN_ENVIRONMENT | ({} if any(name in os.environ for name in AUTH_ENVIRONMENT) else OWN_TOKEN)
+    new = {name: value for name, value in ours.items() if own and name not in os.environ}
+    os.environ.update(new)
+    return list(new)
 
 
-def restore() -> None:
-    """Remove our Ray's variables: with our token, a cluster that is joined next could not call us."""
-    ours = [name for name, value in (OWN_ENVIRONMENT | OWN_TOKEN).items() if os.environ.get(name) == value]
-    if "RAY_AUTH_TOKEN" not in ours:
-        ours = [name for name in ours if name not in OWN_TOKEN]  # the mode is the user's
-    for name in ours:
-        del os.environ[name]
-    if "RAY_AUTH_TOKEN" in ours and "ray" in sys.modules:
-        with contextlib.suppress(ImportError, AttributeError):
-            raylet = importlib.import_module("ray._raylet")
-            raylet.Config.initialize("")
-            raylet.AuthenticationTokenLoader.instance().reset_cache()
+def restore(variables: list[str]) -> None:
+    """Remove what `prepare` returned, once."""
+    for name in variables:
+        os.environ.pop(name, None)
+    if "ray" in sys.modules and not OWN_TOKEN.keys().isdisjoint(variables):
+        _read_token()
+    variables.clear()
 
 
 def start_own(workers: int, begun: Callable[[str], int]) -> None:
@@ -103,6 +100,7 @@ def start_own(workers: int, begun: Callable[[str], int]) -> None:
     import ray
 
     _be_quiet()
+    _read_token()
     with _lean_head(begun):
         ray.init(
             address="local",  # whatever RAY_ADDRESS says
@@ -179,6 +177,14 @@ def reason(error: BaseException) -> str:
         if "connection error" in text:
             text = "its process was killed, crashed, or ran out of memory"
     return text[:300]
+
+
+def _read_token() -> None:
+    """Have Ray, which may have been used before in this process, read again what the environment says of a token."""
+    with contextlib.suppress(ImportError, AttributeError):
+        raylet = importlib.import_module("ray._raylet")
+        raylet.Config.initialize("")
+        raylet.AuthenticationTokenLoader.instance().reset_cache()
 
 
 def _private(name: str) -> Any:
