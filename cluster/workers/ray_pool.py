@@ -138,11 +138,9 @@ class RayPool(WorkerPool):
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         started = time.perf_counter()
         self._wait_for_ray()
-        import ray
-
         try:
             self._share_out(call, on_progress, meanwhile)
-        except ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
+        except self._ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
         self._measure(call)
         call.wall_s = time.perf_counter() - started
@@ -216,14 +214,12 @@ class RayPool(WorkerPool):
 
     def _ready(self, refs: list[Any], timeout_s: float) -> list[Any]:
         """All answers that have come; if there are none, wait for the next one, at most `timeout_s`."""
-        import ray
-
         if not refs:
             time.sleep(timeout_s)
             return []
-        ready, _ = ray.wait(refs, num_returns=len(refs), timeout=0.0)  # one look: with many workers it is slow
+        ready, _ = self._ray.wait(refs, num_returns=len(refs), timeout=0.0)  # one look: with many workers it is slow
         if not ready and timeout_s > 0.0:
-            ready, _ = ray.wait(refs, num_returns=1, timeout=timeout_s)
+            ready, _ = self._ray.wait(refs, num_returns=1, timeout=timeout_s)
         return ready
 
     def _send(self, slot: _Slot, index: int) -> None:
@@ -252,14 +248,12 @@ class RayPool(WorkerPool):
 
     def _receive(self, slot: _Slot) -> bool:
         """Take in a worker's oldest answer, or its death. Returns whether there is progress."""
-        import ray
-
         serial, ref = slot.sent[0]
         try:
-            answer = ray.get(ref)
-        except ray.exceptions.RayTaskError as error:
+            answer = self._ray.get(ref)
+        except self._ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, BaseException) else error
-            if cause is not error and isinstance(cause, ray.exceptions.RayError):  # it could not get what it needs
+            if cause is not error and isinstance(cause, self._ray.exceptions.RayError):  # it lacks what it needs
                 return self._bury(slot, ray_session.reason(cause), ray_session.is_to_blame(cause))
             if serial == self._serial:
                 at = self._dispatch.at(slot.number)
@@ -268,7 +262,7 @@ class RayPool(WorkerPool):
             slot.serial = 0  # it may not have the task
             slot.maps.clear()
             answer = pickle.dumps({})
-        except ray.exceptions.RayError as error:
+        except self._ray.exceptions.RayError as error:
             return self._bury(slot, ray_session.reason(error), ray_session.is_to_blame(error))
         slot.sent.popleft()
         slot.heard = time.monotonic()
@@ -305,10 +299,8 @@ class RayPool(WorkerPool):
         self._leaving = True
         self._booted.wait(CONNECT_S)  # Ray cannot be stopped while it starts
         if self._connected:
-            import ray
-
             for slot in self._slots:
-                ray.kill(slot.actor)
+                self._ray.kill(slot.actor)
             ray_session.leave()
             self._connected = False
         ray_session.restore(self._variables)
@@ -328,8 +320,9 @@ class RayPool(WorkerPool):
     def _boot(self) -> None:
         """Bring up Ray and ask it for the workers; then wait, since Ray's processes die with this thread."""
         try:
-            import ray
+            import ray  # which takes a second, and so is not done by the caller
 
+            self._ray: Any = ray
             if ray.is_initialized():
                 raise PoolError("Ray is in use in this process already; close the other pool first")
             if self._leaving:
@@ -371,19 +364,15 @@ class RayPool(WorkerPool):
         return _Slot(number, actor, actor.hello.remote())
 
     def _replace(self, slot: _Slot) -> None:
-        import ray
-
-        ray.kill(slot.actor)  # it may be alive and merely out of reach
+        self._ray.kill(slot.actor)  # it may be alive and merely out of reach
         self._slots[slot.number] = self._start(slot.number)
 
     def _greet(self, slot: _Slot) -> None:
         """Take in a `hello`: a worker is up and is to be prepared, or it is prepared, or it could not start."""
-        import ray
-
         preparing = slot.serial > 0
         try:
-            slot.pid = ray.get(slot.hello)
-        except ray.exceptions.RayError as error:
+            slot.pid = self._ray.get(slot.hello)
+        except self._ray.exceptions.RayError as error:
             reason, blamed = ray_session.reason(error), ray_session.is_to_blame(error)
             if preparing:  # it has no parcel yet, and so no member is blamed
                 self._bury(slot, reason, blamed)
