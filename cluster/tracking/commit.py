@@ -26,7 +26,6 @@ def git_commit() -> str:
     try:
         # If installed into a .venv inside another repository, this file is not tracked there.
         git("ls-files", "--error-unmatch", here.name)
-        changed = git("--no-optional-locks", "status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + (DIRTY if changed else "")
+        return git("--no-optional-locks", "describe", "--always", "--abbrev=40", "--exclude=*", f"--dirty={DIRTY}")
     except (OSError, subprocess.SubprocessError):
         return "unknown"

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from cluster.runs.settings import RunSettings
-from cluster.tracking.commit import git_commit
 from cluster.tracking.mlflow_run import MODEL, RUN_ID, Model
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.scenarios import label
@@ -49,7 +48,6 @@ def tags(settings: RunSettings) -> dict[str, str]:
         "algorithm": "dqn" if settings.algorithm == "dqn" else "evolution",
         "scenario": settings.scenario,
         "group": group(settings),
-        "git_commit": git_commit(),
     }
 
 
