@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from cluster.tracking.address import one_line
 from gridsim.errors import GridSimError
 
 CONFIG, CHECKPOINT, STEPS, CHAMPION = "config.json", "checkpoint.npz", "steps.part", "champion.npz"
@@ -84,7 +85,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
             raise ValueError("it holds no GridSim data")
         version, meta = header["version"], header["meta"]
     except Exception as error:
-        raise CheckpointError(f"{path}: not a GridSim file ({one_line(error)})") from error
+        raise CheckpointError(f"{path}: not a GridSim file ({one_line(error):.120})") from error
     if version != VERSION:
         raise CheckpointError(f"{path}: written in format {repr(version)[:20]}; this GridSim reads format {VERSION}")
     return arrays, meta
@@ -111,9 +112,3 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
-
-
-def one_line(error: BaseException) -> str:
-    """The error in a few words."""
-    text = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return text.splitlines()[0][:120]

@@ -16,8 +16,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError, one_line
+from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError
 from cluster.runs.run import ELITES
+from cluster.tracking.address import one_line
 from evolution.networks.policy import PolicySpec
 
 

@@ -117,9 +117,9 @@ def shown(uri: str) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """The error in one line, without a password; for a failed connection only what went wrong."""
+    """The error in one line, without a password; of what the system refused only why."""
     text = str(error) or type(error).__name__
-    reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>]+)", text)
+    reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>:]+)", text)
     if reasons:
         return reasons[-1].strip()
     if "timed out" in text.lower():
