@@ -24,7 +24,7 @@ from evolution.networks.policy import CnnSpec, PolicySpec, act_on
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig, TrafficConfig, VehicleConfig, constants
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
-from gridsim.maps.scenarios import HELD_OUT_SEED, build, check_name, default_traffic
+from gridsim.maps.scenarios import HELD_OUT_SEED, build, default_traffic
 
 GONE = ("apart", "kerb")  # former parameters of traffic, which older champions hold
 
@@ -171,7 +171,6 @@ def held_out(
 ) -> tuple[Episodes, list[Map]]:
     """The episodes that `evaluate` drives, and their maps. Raises: GridSimError as it does."""
     name = scenario or champion.scenario
-    check_name(name)
     if episodes < 1:
         raise GridSimError(f"episodes must be 1 or more, not {episodes}")
     traffic = champion.traffic_on(name) if traffic is None else traffic
