@@ -73,10 +73,9 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
     # A checksum is not a signature: another program may have written these bytes. zipfile, numpy and json raise a dozen
     # kinds of errors for such content, which all mean the same.
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > len(content):
-                raise ValueError("its arrays are larger than the file")
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            if sum(member.file_size for member in file.zip.infolist()) > len(content):
+                raise ValueError("its arrays are larger than the file")
             arrays = {name: file[name] for name in file.files}
         if not all(isinstance(array, np.ndarray) for array in arrays.values()):
             raise ValueError("it holds more than arrays")
