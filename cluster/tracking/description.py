@@ -30,8 +30,7 @@ def group(settings: RunSettings) -> str:
     words = [label(settings.scenario), settings.algorithm, settings.policy]
     words += [f"{settings.traffic} cars"] if settings.traffic else []
     given = asdict(settings)
-    shared = {name: given[name] for name in ("scenario", "observation", "traffic", "recombination") if name in given}
-    usual = asdict(type(settings)(**shared)) | {"recombination": "all"}
+    usual = asdict(type(settings)(settings.scenario, settings.traffic, observation=settings.observation))
     left_out = {"seed", "policy", "search", *settings.unbound}  # varied, named above, or only limits
     more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
     return ", ".join([" ".join(words), *more])
