@@ -217,14 +217,13 @@ def _lean_head(begun: Callable[[str], int]) -> Iterator[None]:
                 init_temp(self, *arguments)
                 inherited.append(begun(self._session_dir))
 
+            group = 0 if sys.platform == "linux" else None  # elsewhere Ray ends its processes by our group
             replaced: list[tuple[Any, str, Any]] = [
                 (node, "_init_temp", make_folder),
                 (node, "start_api_server", _no_api_server),
                 (parameter, "RayParams", lean),
+                (services, "ConsolePopen", partial(popen, pass_fds=inherited, process_group=group)),
             ]
-            # Elsewhere Ray ends its processes by our group.
-            group: dict[str, Any] = {"process_group": 0} if sys.platform == "linux" else {}
-            replaced.append((services, "ConsolePopen", partial(popen, pass_fds=inherited, **group)))
             for owner, name, value in replaced:
                 undo.callback(setattr, owner, name, getattr(owner, name))
                 setattr(owner, name, value)
