@@ -124,6 +124,8 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
             TrafficConfig(**{k: v for k, v in sim.get("traffic", {}).items() if k not in GONE}),
         )
         constants(config)  # which checks it
+        if not 1 <= config.episode.steps <= rollout.MAX_STEPS:
+            raise ValueError(f"an episode has 1 to {rollout.MAX_STEPS} steps, not {config.episode.steps}")
         return Champion(genome, str(spec), str(meta["scenario"]), config, int(meta.get("traffic", 0)))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path}: not a champion: {error}") from error

@@ -115,6 +115,12 @@ def test_bad_champions_are_refused(champion, tmp_path):
     save(tmp_path / "short.npz", {"genome": champion.genome[:10]}, {"policy": "mlp:6,7", "scenario": "curved"})
     with pytest.raises(CheckpointError):
         load_champion(tmp_path / "short.npz")
+    for limit in (0.01, 1e9, np.inf):
+        episode = dataclasses.replace(champion.sim.episode, time_limit=limit)
+        sim = dataclasses.replace(champion.sim, episode=episode)
+        dataclasses.replace(champion, sim=sim).save(tmp_path / "long.npz")
+        with pytest.raises(CheckpointError, match=r"long.npz: not a champion: [^\n]*$"):
+            load_champion(tmp_path / "long.npz")
     with pytest.raises(ValueError, match="unknown scenario"):
         evaluate(champion, "moon")
     with pytest.raises(ValueError, match="1 or more"):
