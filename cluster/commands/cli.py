@@ -196,7 +196,7 @@ def _learn(kind: type[Flags]) -> int:
     uri = check_uri(flags.tracking_uri, saved)
     address = flags.address or os.environ.get("RAY_ADDRESS") or None
     if address and flags.workers:
-        from cluster.workers.ray_session import check_address  # imports Ray
+        from cluster.workers.ray_session import check_address
 
         address = check_address(address)
     warn_of_many_workers(prog, flags.workers, flags.address)

@@ -127,6 +127,9 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
 
 def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags) -> int:
     """Train the unfinished runs; write tables and a picture of all runs."""
+    workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
+    if not all(cell.finished() for cell in cells):
+        workers.prepare()
     folder.write()
     uri = folder.tracking_uri
     params = {key: " ".join(v) if isinstance(v, tuple) else str(v) for key, v in vars(folder.plan).items()}
@@ -146,7 +149,6 @@ def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[C
                     parent = tracker.wait_ready()
                 except TrackingError as error:
                     print(f"{PROG}: warning: its runs are not nested in MLflow: {error}", file=sys.stderr)
-            workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
             train_cell = partial(
                 train, workers=workers, uri=uri, experiment=flags.experiment, parent_id=parent,
                 wall_limit_s=limits(folder.plan.budget)[1] or math.inf,

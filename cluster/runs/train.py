@@ -87,6 +87,15 @@ class Workers:
     _pool: WorkerPool | None = None
     _maps: Maps | None = None
 
+    def prepare(self) -> None:
+        """Set what libraries read from the environment; to be called before there are threads."""
+        quiet()
+        if self.number:
+            from cluster.workers import ray_session
+
+            self.address = ray_session.check_address(self.address) if self.address else None
+            ray_session.prepare(self.address)
+
     def open(self, maps: Maps) -> WorkerPool:
         """The pool, which gets its maps from `maps`."""
         self._maps = maps

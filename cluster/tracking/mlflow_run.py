@@ -73,7 +73,8 @@ def quiet() -> None:
     """
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{tempfile.gettempdir()}/torchinductor_{os.getuid()}")  # as torch
+    # Else PyTorch sets it, later.
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{tempfile.gettempdir()}/torchinductor_{os.getuid()}")
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         if not logger.handlers:

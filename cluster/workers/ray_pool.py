@@ -104,8 +104,8 @@ class RayPool(WorkerPool):
     ):  # fmt: skip
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
-        self._variables = ray_session.prepare(own=address is None)
         self.address = None if address is None else ray_session.check_address(address)
+        self._variables = ray_session.prepare(self.address)
         self._asked = workers
         self._build_map = build_map
         self._factory = worker_factory

@@ -43,7 +43,8 @@ OWN_ENVIRONMENT = {
 }
 # Ray listens on all interfaces and lets in whoever has its token. Ours must not outlive the run in ~/.ray, where it
 # would change what `ray start` does from then on.
-OWN_TOKEN = {"RAY_AUTH_TOKEN": secrets.token_hex(32), "RAY_AUTH_MODE": "token"}
+TOKEN = {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
+MODE = {"RAY_AUTH_MODE": "token"}
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses /tmp
 PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
 ELSEWHERE = ("ActorUnavailableError", "NodeDiedError", "ObjectLostError", "OwnerDiedError", "ObjectFetchTimedOutError")
@@ -58,6 +59,7 @@ def check_address(address: str) -> str:
     if address == "auto":
         address = os.environ.get("RAY_ADDRESS") or "auto"
     if address == "auto":
+        os.environ.update(ENVIRONMENT | os.environ)  # read when Ray is imported
         logging.getLogger("ray").setLevel(logging.CRITICAL)
         try:
             address = _private("services").canonicalize_bootstrap_address("auto")
@@ -69,16 +71,23 @@ def check_address(address: str) -> str:
     return address
 
 
-def prepare(own: bool) -> list[str]:
-    """Set Ray's variables for a Ray of our `own` or a cluster; to be called before there are threads.
+def prepare(address: str | None) -> list[str]:
+    """Set Ray's variables for the cluster at `host:port`, or a Ray of our own; to be called before there are threads.
 
     A new variable may move the environment, and a thread that reads it at this moment, in C, crashes the process.
     Returns: those to remove when Ray is left: with our token, a cluster that is joined next could not call us.
     """
+    ray = sys.modules.get("ray")
+    if ray and ray.is_initialized():  # it is a user's own, or another pool's, which is then refused
+        return []
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    ours = OWN_ENVIRONMENT | ({} if any(name in os.environ for name in AUTH_ENVIRONMENT) else OWN_TOKEN)
-    new = {name: value for name, value in ours.items() if own and name not in os.environ}
+    ours = {}
+    if address is None:
+        ours = OWN_ENVIRONMENT | MODE | ({} if any(name in os.environ for name in AUTH_ENVIRONMENT) else TOKEN)
+    elif has_token(address.rpartition(":")[0]):  # as Ray does when it finds the cluster itself
+        ours = MODE
+    new = {name: value for name, value in ours.items() if name not in os.environ}
     os.environ.update(new)
     return list(new)
 
@@ -87,7 +96,7 @@ def restore(variables: list[str]) -> None:
     """Remove what `prepare` returned, once."""
     for name in variables:
         os.environ.pop(name, None)
-    if "ray" in sys.modules and not OWN_TOKEN.keys().isdisjoint(variables):
+    if "ray" in sys.modules and not MODE.keys().isdisjoint(variables):
         _read_token()
     variables.clear()
 
@@ -121,11 +130,8 @@ def join(address: str) -> None:
     """
     import ray
 
-    if has_token(address.rpartition(":")[0]):
-        with contextlib.suppress(ImportError, AttributeError):  # as Ray does when it finds the cluster itself
-            setup = importlib.import_module("ray._private.authentication.authentication_token_setup")
-            setup.maybe_enable_token_auth_if_token_available(warn_if_disabled=False)
     _be_quiet()
+    _read_token()
     ray.init(address=address, runtime_env=runtime_env(), log_to_driver=False, logging_level=logging.CRITICAL)
 
 

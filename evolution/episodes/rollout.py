@@ -285,6 +285,8 @@ def _check(episodes: np.ndarray, worlds: np.ndarray) -> None:
     wrong = episodes["steps"][(episodes["steps"] < 1) | (episodes["steps"] > MAX_STEPS)]
     if len(wrong):
         raise ValueError(f"an episode has 1 to {MAX_STEPS} steps, not {wrong[0]}")
+    if not (episodes["target"] > 0.0).all():
+        raise ValueError("an episode needs a target above 0 m")
     if worlds.shape[:1] + worlds.shape[2:] != (len(episodes), TRAFFIC_FIELDS):
         raise ValueError(f"the traffic of {len(episodes)} episodes is [e, cars, {TRAFFIC_FIELDS}], not {worlds.shape}")
 

@@ -150,7 +150,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             self.single_action_space = Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._started = False
+        self._seeded = self._started = False
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy has its own renderers and its own window."""
@@ -182,9 +182,10 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         which = np.flatnonzero(mask)
         self._started &= len(which) < self.num_envs
         self._seed(seed, which)
-        if map_seed is not None:
-            self._views.clear()  # of maps that may not be seen again
         self._begin(which, map_seed, start)
+        if map_seed is not None:  # for maps that may not be seen again
+            driven = set(self.simulator.maps.values())
+            self._views = {road_map: view for road_map, view in self._views.items() if road_map in driven}
         self._started = True
         self._note(which, mask)
         return self._observer.look(), {name: part * mask for name, part in self._info().items()}
@@ -230,7 +231,11 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             seeds = seed
             if len(seeds) != n or not all(s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in seeds):
                 raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
-        episodes.numbers[which] += _U(1)
+        if self._seeded:
+            episodes.numbers[which] += _U(1)
+        else:
+            episodes.keys[:] = _U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
+            self._seeded = True
         for i in which:
             given = seeds[i]
             if given is not None:
@@ -239,6 +244,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> None:
         """Begin the current episodes of cars `which`."""
         maps, starts, worlds = self._episodes.draw(which, map_seed, start)
+        if map_seed is not None and len(which) == self.num_envs:
+            self.simulator.forget_maps()
         self.simulator.reset(maps, starts, which, worlds)
 
     def _begin_anew(self, observations: Any, info: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
@@ -287,7 +294,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         from gridsim.view.render import Renderer  # here, because only pictures need it
 
         car, world = self.simulator.cars[i], self.simulator.worlds[i]
-        road_map = self.simulator.map_of(i)
+        road_map = self.simulator.maps[i]
         view = self._views.get(road_map)
         if view is None:
             view = self._views[road_map] = Renderer(road_map, RENDER_SIZE, config=self.config)

@@ -37,7 +37,7 @@ class Episodes:
     """The episodes of a batch of cars.
 
     Attributes:
-        keys: uint64 [n], each car's seed; at first random ones.
+        keys: uint64 [n], each car's seed.
         numbers: uint64 [n], each car's current episode, counted from its seeding.
     """
 
@@ -56,7 +56,9 @@ class Episodes:
             raise ValueError("an environment needs 1 map or more")
         # The maps of `_seeds` that were built so far.
         self._own: dict[int, Map] = {} if isinstance(maps, int) else {each.seed: each for each in maps}
-        self.keys = np.random.default_rng().integers(1 << 63, size=cars, dtype=np.uint64)
+        if len(set(self._seeds)) < len(self._seeds):
+            raise ValueError("maps that are given need different seeds, by which episodes name them")
+        self.keys = np.zeros(cars, dtype=np.uint64)
         self.numbers = np.zeros(cars, dtype=np.uint64)
 
     def draw(
@@ -72,7 +74,8 @@ class Episodes:
             if given.dtype.kind not in "iu" or given.shape not in ((), every) or given.min() < 0:
                 raise ValueError(f"map_seed must be a whole number from 0, or {every[0]} of them, not {map_seed!r}")
             seeds = np.broadcast_to(given, every)[which].tolist()
-        maps = [self._map(seed) for seed in seeds]
+        found = {seed: self._map(seed) for seed in dict.fromkeys(seeds)}
+        maps = [found[seed] for seed in seeds]
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is not None:
             starts[:] = self._checked_start(start, which, maps)

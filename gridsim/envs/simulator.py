@@ -18,6 +18,8 @@ from gridsim.sensing.rays import fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
+MOST_MAPS = 256  # in the atlas, beyond which those without cars go; some 2 MB each, at most 8
+
 
 class Physics(NamedTuple):
     """What all cars share, as kernels read it; arrays are read-only."""
@@ -123,8 +125,9 @@ class Simulator:
         self.ranges = np.zeros((cars, self.config.sensors.rays), dtype=np.float32)
         self.closing = np.zeros_like(self.ranges)
         self._physics: Physics | None = None  # made when a kernel first needs it
-        self._charted: list[Map] = []  # the maps in the atlas
-        self._rows = np.full(cars, -1)  # of each car's map in the atlas; -1 before its first reset
+        self.maps: dict[int, Map] = {}  # of each car that was reset
+        self._row_of: dict[Map, int] = {}  # the maps in the atlas
+        self._rows = np.full(cars, -1)  # of each car's map in the atlas
         self._groups = _by_map(self._rows)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -156,24 +159,24 @@ class Simulator:
         starts, traffic = starts.astype(np.float32), (len(cars), *self.worlds.shape[1:])
         if len(maps) != len(cars) or starts.shape != (len(cars), 5):
             raise ValueError(f"there are {len(cars)} cars, not {len(maps)} maps and starts of shape {starts.shape}")
+        if not np.isfinite(starts).all():
+            raise ValueError("starts must be finite numbers")
         if worlds is not None and worlds.shape != traffic:
             raise ValueError(f"traffic must be {traffic[0]} worlds of {traffic[1]} cars, not {worlds.shape}")
+        self.ends[cars] = End.RUNNING
         self.worlds[cars] = -1.0 if worlds is None else worlds
-        rows = self._chart(maps)
+        self._put_on(cars, maps)
         cells = max(visit_cells(each.road) for each in set(maps))
         if cells > self.visits.shape[1]:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
         physics, around = self._kernel_physics(), self._kernel_worlds()
-        _place_all(physics, *_by_map(rows), cars, starts, self.cars, self.visits, around, self.ranges, self.closing)
-        self.ends[cars] = End.RUNNING
-        if (self._rows[cars] != rows).any():
-            self._rows[cars] = rows
-            self._groups = _by_map(self._rows)
+        groups = _by_map(self._rows[cars])
+        _place_all(physics, *groups, cars, starts, self.cars, self.visits, around, self.ranges, self.closing)
 
-    def map_of(self, car: int) -> Map:
-        """The map on which a car drives."""
-        return self._charted[self._rows[car]]
+    def forget_maps(self) -> None:
+        """Keep no map that is without cars after the next reset."""
+        self._row_of = {}
 
     def _kernel_worlds(self) -> np.ndarray | None:
         return self.worlds if self.worlds.shape[1] else None
@@ -181,17 +184,23 @@ class Simulator:
     def _kernel_physics(self) -> Physics:
         if self._physics is None:
             k, rays = constants(self.config), self.config.sensors.rays
-            atlas = make_atlas([each.road for each in self._charted], [each.network for each in self._charted])
+            atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
             self._physics = Physics(atlas, k, drivers(self.config), fan(rays, k.ray_first, k.ray_step))
         return self._physics
 
-    def _chart(self, maps: Sequence[Map]) -> np.ndarray:
-        """Rows of maps [k] in the atlas. It gets those that it lacks; where all cars are reset, it keeps no others."""
-        if not set(maps) <= set(self._charted):
-            kept = self._charted if len(maps) < len(self) else []
-            self._charted, self._physics = list(dict.fromkeys([*kept, *maps])), None
-        row_of = {each: row for row, each in enumerate(self._charted)}
-        return np.array([row_of[each] for each in maps])
+    def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
+        """Put cars [k] on maps [k]. The atlas gets those that it lacks; if it has many, it loses those without cars."""
+        self.maps.update(zip(cars.tolist(), maps, strict=True))
+        before = self._rows.copy()
+        if set(maps) <= self._row_of.keys():
+            self._rows[cars] = [self._row_of[each] for each in maps]
+        else:
+            kept = self._row_of if len(self) > 1 and len(self._row_of) < MOST_MAPS else ()
+            wanted = dict.fromkeys([*kept, *self.maps.values()])
+            self._row_of, self._physics = {each: row for row, each in enumerate(wanted)}, None
+            self._rows[list(self.maps)] = [self._row_of[each] for each in self.maps.values()]
+        if (self._rows != before).any():
+            self._groups = _by_map(self._rows)
 
     def step(self, actions: np.ndarray) -> np.ndarray:
         """One control period of every car. A car whose episode has ended stands still until it is reset.

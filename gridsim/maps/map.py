@@ -50,6 +50,10 @@ class Map:
         """Bytes of its arrays."""
         return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what follows from the rest."""
+        return {name: part for name, part in vars(self).items() if name != "mileage"}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Unpickle with read-only arrays: for writable ones, Numba would compile the kernels again."""
         vars(self).update({name: _frozen(part) for name, part in state.items()})

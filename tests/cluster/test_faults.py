@@ -126,11 +126,17 @@ sys.addaudithook(hook)
 """
 
 
-@pytest.mark.parametrize("program", ["gridsim-evolve", "gridsim-dqn"])
-def test_no_variable_is_added_while_threads_may_read_the_environment(tmp_path: Path, program: str) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [
+        "gridsim-evolve --scenario curved --generations 2",
+        "gridsim-dqn --scenario curved --car-steps 2000",
+        "gridsim-compare --scenarios curved --learners evolution --seeds 2 --budget 20k --name c",
+        "gridsim-compare --scenarios curved --learners evolution --seeds 2 --budget 20k --name c --jobs 2",
+    ],
+)
+def test_no_variable_is_added_while_threads_may_read_the_environment(tmp_path: Path, command: str) -> None:
     """One of 613 faults met the C library's `getenv` in the environment that had just moved, and the process ended."""
     (tmp_path / "sitecustomize.py").write_text(AUDIT)
-    short = ["--scenario", "curved", "--workers", "2"]
-    short += ["--generations", "2"] if program == "gridsim-evolve" else ["--car-steps", "2000"]
-    done = finish(program, *short, cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    done = finish(*command.split(), "--workers", "2", cwd=tmp_path, PYTHONPATH=str(tmp_path))
     assert [line for line in done.stderr.splitlines() if "LATE" in line] == []

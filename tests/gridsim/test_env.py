@@ -167,7 +167,7 @@ def test_the_reward_among_traffic_is_the_papers(maps: Maps) -> None:
         _, rewards, terminations, truncations, info = env.step(np.full(8, Action.ACCELERATE))
         state = env.simulator
         for i in range(8):
-            cars, road = state.cars[i : i + 1], env.simulator.map_of(i)
+            cars, road = state.cars[i : i + 1], env.simulator.maps[i]
             ranges = views(road, cars, state.worlds[i : i + 1], env.config)[0][0]
             nearer += ranges.min() < views(road, cars, state.worlds[i : i + 1, :0], env.config)[0][0].min()
             expected = (

@@ -121,4 +121,4 @@ def test_a_copied_environment_goes_on_alike_with_the_same_kernels(
     assert [len(kernel.signatures) for kernel in KERNELS] == compiled
     maps = [each.unwrapped.cars if single else each.unwrapped for each in (env, other)]
     if clone is copy.deepcopy:
-        assert maps[0].simulator.map_of(0) is maps[1].simulator.map_of(0)
+        assert maps[0].simulator.maps[0] is maps[1].simulator.maps[0]

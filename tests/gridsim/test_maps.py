@@ -248,7 +248,7 @@ def test_environments_and_champions_drive_on_it(track):
     for _ in range(10):
         observation, *_ = env.step(0)
     assert np.isfinite(observation).all()
-    assert env.cars.simulator.map_of(0).name == track.name
+    assert env.cars.simulator.maps[0].name == track.name
     champion = Champion(np.zeros(PolicySpec.parse("mlp:2").size, np.float32), "mlp:2", track.name, SimConfig())
     assert evaluate(champion, episodes=8)["episodes"] == 8
 

@@ -240,6 +240,8 @@ def test_arrays_of_other_shapes_are_refused_and_cars_that_begin_without_traffic_
     for maps, few in ((scenario, starts[:3]), ([scenario] * 3, starts), (scenario, starts[:, :4])):
         with pytest.raises(ValueError, match="there are 4 cars, not"):
             simulator.reset(maps, few)
+    with pytest.raises(ValueError, match="finite"):
+        simulator.reset(scenario, starts * np.nan)
     simulator.reset(scenario, starts, worlds=worlds)
     for shape in ((1,), (5,), (4, 1), (1, 2), ()):
         with pytest.raises(ValueError, match="there are 4 cars, not actions of shape"):
