@@ -257,11 +257,7 @@ def sleeping_efficiency(workers: int, members: int, generations: int = 3) -> flo
     try:
         while len(pool.pids()) < workers:  # until all are up, and the time for a metre is known
             pool.evaluate(task, recipes)
-        walls = []
-        for _ in range(generations):
-            begun = time.perf_counter()
-            pool.evaluate(task, recipes)
-            walls.append(time.perf_counter() - begun)
+        walls = [pool.evaluate(task, recipes).wall_s for _ in range(generations)]
     finally:
         pool.close()
         maps.close()

@@ -23,6 +23,7 @@ class Dispatch:
 
     def __init__(self, parcels: Sequence[Parcel]):
         self.parcels = list(parcels)  # where one is split, its pieces are added at the end
+        self.retries = 0  # parcels that were sent again because their worker died; one that is split then counts once
         self.deaths = 0  # workers that died in a row, without an answer in between
         self._open = set(range(len(self.parcels)))  # neither answered nor lost
         self._todo = deque(range(len(self.parcels)))  # of these, the ones that no worker holds
@@ -81,7 +82,9 @@ class Dispatch:
             alone = len(self._units(parcel)) == 1
             if alone and self._kills[parcel] >= MAX_KILLS:
                 lost = self._lose(parcel)
-            elif not alone and self._kills[parcel] >= MAX_KILLS - 1:
+                continue
+            self.retries += 1
+            if not alone and self._kills[parcel] >= MAX_KILLS - 1:
                 self._split(parcel)
             else:
                 self._todo.appendleft(parcel)

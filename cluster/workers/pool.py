@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -60,8 +61,10 @@ class Call(ABC):
         self.task, self.recipes, self.asked = task, recipes, asked
         self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for and where it was lost
         self.lost = np.zeros(rows, bool)  # those that killed every worker that tried them
+        self.wall_s = 0.0  # from call to return
         self.busy_s: dict[int, float] = {}  # seconds of work, by the worker's number, which a replacement keeps
         self.episode_s = np.zeros(columns)  # seconds of these that each column took, for all rows together
+        self.retries = 0  # parcels that were sent again because their worker died or failed
         self.bytes_down = self.bytes_up = 0  # payload sent to workers, recipes mostly, and back
         self.broadcast_bytes = 0  # put into the object store: the task and the maps that were new to it
         self.warnings: list[str] = []  # a line for each row that was lost, and for each silent worker that was replaced
@@ -209,6 +212,7 @@ class SerialPool(WorkerPool):
         self._worker = worker_factory()
 
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
+        started = time.perf_counter()
         maps = [self._build_map(*name) for name in call.task.maps]
         finish(meanwhile)
         for index, parcel in enumerate(cut(call.task, call.asked, SERIAL_PARTS)):
@@ -219,6 +223,7 @@ class SerialPool(WorkerPool):
                 raise call.failure(index, parcel, error) from error
             if on_progress:
                 on_progress(*call.progress())
+        call.wall_s = time.perf_counter() - started
 
 
 def finish(meanwhile: Meanwhile | None) -> None:

@@ -136,12 +136,14 @@ class RayPool(WorkerPool):
         self._shared.put_maps(maps)
 
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
+        started = time.perf_counter()
         self._wait_for_ray()
         try:
             self._share_out(call, on_progress, meanwhile)
         except self._ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
         self._measure(call)
+        call.wall_s = time.perf_counter() - started
 
     def _share_out(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         """Have the workers do all that is asked for."""
@@ -158,6 +160,7 @@ class RayPool(WorkerPool):
             self._tickets.put(self._serial, len(self._parcels))
             meanwhile = self._work_off([FROM_QUEUE] * readers, on_progress, meanwhile)
             parcels = list(self._parcels.values())  # those of workers that died or failed
+            call.retries = len(parcels)
         else:
             shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
             parcels = cut(task, call.asked, shares, metre_s)
@@ -168,7 +171,7 @@ class RayPool(WorkerPool):
     ) -> Meanwhile | None:
         """Have parcels done. Returns what is still to be done meanwhile."""
         self._dispatch = dispatch = Dispatch(parcels)
-        call = self._call
+        call, retries = self._call, self._call.retries
         alone_since = time.monotonic()
         while not dispatch.finished():
             now = time.monotonic()
@@ -189,6 +192,7 @@ class RayPool(WorkerPool):
                     self._greet(waiting[ref])
                 elif self._receive(waiting[ref]) and on_progress:
                     on_progress(*call.progress())
+            call.retries = retries + dispatch.retries
             if self.pids():
                 alone_since = time.monotonic()
             elif time.monotonic() - alone_since > self._patience_s:

@@ -59,6 +59,7 @@ def test_what_a_stopped_worker_holds_is_done_by_others(tmp_path: Path, workers: 
         (tmp_path / "stop").touch()
         outcome = pool.evaluate(make_task(), make_recipes(512))
         assert outcome.results.tobytes() == wanted
+        assert prepared <= outcome.retries <= 2 * prepared
         (said,) = outcome.warnings
         assert re.fullmatch(r"a worker did not answer for \d+ s \(--patience\) and is replaced", said)
         pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])

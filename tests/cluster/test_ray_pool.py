@@ -154,6 +154,7 @@ def test_results_progress_and_what_is_sent(pool: RayPool, way: str) -> None:
     assert outcome.results.tobytes() == expected(512)
     assert progress == sorted(progress)
     assert progress[-1] == (512, 512)
+    assert outcome.retries == 0
     assert outcome.bytes_down == 512 * RECIPE.itemsize * (2 if way == "queued" else 1), "to each worker, or once"
     assert outcome.results.nbytes < outcome.bytes_up < outcome.results.nbytes + 10_000
     assert len(progress) <= 2 or way == "sent", "one answer of each worker that did anything"
@@ -166,10 +167,10 @@ def test_results_progress_and_what_is_sent(pool: RayPool, way: str) -> None:
 def test_what_a_killed_worker_was_at_runs_elsewhere_at_once_and_it_is_replaced(pool: RayPool, folder: Path) -> None:
     before = set(pool.pids())
     (folder / "kill-300").write_text("1")
-    started = time.perf_counter()
     outcome = pool.evaluate(make_task(), make_recipes(512))
     assert outcome.results.tobytes() == expected(512)
-    assert time.perf_counter() - started < 5.0
+    assert 1 <= outcome.retries <= 2
+    assert outcome.wall_s < 5.0
     wait_until(lambda: pool.evaluate(make_task(), make_recipes(8)) and len(pool.pids()) == 2)
     assert len(before.intersection(pool.pids())) == 1
 
@@ -222,7 +223,7 @@ def test_experience_keeps_its_order_where_workers_die(pool: RayPool, folder: Pat
     assert collected.results.tobytes() == wanted.results.tobytes()
     assert progress == sorted(progress)
     assert progress[-1] == (400, 400)
-    assert int((folder / "kill-150").read_text()) <= 0, "it was met as often as it was to kill"
+    assert times <= collected.retries <= 2 * times
     sent = wanted.results.nbytes + len(to_bytes(wanted.experience))
     assert sent < collected.bytes_up < sent + 20_000 + 1000 * len(progress)
 
