@@ -488,10 +488,8 @@ def main() -> int:
     else:
         for name, number in figures.items():
             print(f"{name:24} {number:6,}")
-    if wrong:
-        print(wrong, file=sys.stderr)
     if wrong or any(left.values()):
-        print(f"its files: {folder}", file=sys.stderr)
+        print(f"{wrong or 'something is left'}\nits files: {folder}", file=sys.stderr)
         return 1
     shutil.rmtree(folder, ignore_errors=True)
     return 0

@@ -24,7 +24,7 @@ import gridsim
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_address import AUTH_ENVIRONMENT, has_token, probe
 
-# Read when Ray is imported and when it connects; it sets the last two itself.
+# Read when Ray is imported and when it connects. Ray sets the last two itself, but only after threads have started.
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",  # under `uv run` Ray would copy the working folder to every worker
@@ -77,8 +77,8 @@ def prepare(address: str | None) -> list[str]:
     A new variable may move the environment, and a thread that reads it at this moment, in C, crashes the process.
     Returns: those to remove when Ray is left: with our token, a cluster that is joined next could not call us.
     """
-    ray = sys.modules.get("ray")
-    if ray and ray.is_initialized():  # it is a user's own, or another pool's, which is then refused
+    in_use = getattr(sys.modules.get("ray"), "is_initialized", None)  # None also while Ray is being imported
+    if in_use and in_use():  # by the caller or another pool, so that the new pool will be refused
         return []
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)

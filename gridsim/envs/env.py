@@ -183,7 +183,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         self._started &= len(which) < self.num_envs
         self._seed(seed, which)
         self._begin(which, map_seed, start)
-        if map_seed is not None:  # for maps that may not be seen again
+        if map_seed is not None:  # keep no renderers of maps that may not be used again
             driven = set(self.simulator.maps.values())
             self._views = {road_map: view for road_map, view in self._views.items() if road_map in driven}
         self._started = True

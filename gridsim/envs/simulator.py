@@ -18,7 +18,7 @@ from gridsim.sensing.rays import fan
 from gridsim.traffic.behaviour import Drivers, drivers, flow
 from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
-MOST_MAPS = 256  # in the atlas, beyond which those without cars go; some 2 MB each, at most 8
+MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
 
 
 class Physics(NamedTuple):
@@ -152,7 +152,7 @@ class Simulator:
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
 
-        Raises: ValueError with one line for a wrong shape.
+        Raises: ValueError with one line for a wrong shape or a start that is not finite.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
@@ -175,7 +175,7 @@ class Simulator:
         _place_all(physics, *groups, cars, starts, self.cars, self.visits, around, self.ranges, self.closing)
 
     def forget_maps(self) -> None:
-        """Keep no map that is without cars after the next reset."""
+        """Have the next reset keep only maps on which there are cars."""
         self._row_of = {}
 
     def _kernel_worlds(self) -> np.ndarray | None:
@@ -189,7 +189,7 @@ class Simulator:
         return self._physics
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
-        """Put cars [k] on maps [k]. The atlas gets those that it lacks; if it has many, it loses those without cars."""
+        """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
         self.maps.update(zip(cars.tolist(), maps, strict=True))
         before = self._rows.copy()
         if set(maps) <= self._row_of.keys():

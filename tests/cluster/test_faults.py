@@ -84,7 +84,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
         _, second = cluster(1, address)
 
         def joined() -> bool:
-            """Whether the second host has a worker. If its start failed, as other tests' Rays take ports, it is new."""
+            """Whether the second host has a worker. A host that failed to start is started again."""
             nonlocal second
             assert process.poll() is None
             if second.poll() is not None:
@@ -137,7 +137,7 @@ sys.addaudithook(hook)
     ],
 )
 def test_no_variable_is_added_while_threads_may_read_the_environment(tmp_path: Path, command: str) -> None:
-    """One of 613 faults met the C library's `getenv` in the environment that had just moved, and the process ended."""
+    """A new variable may move the environment while another thread is in `getenv`, which crashes the process."""
     (tmp_path / "sitecustomize.py").write_text(AUDIT)
     done = finish(*command.split(), "--workers", "2", cwd=tmp_path, PYTHONPATH=str(tmp_path))
     assert [line for line in done.stderr.splitlines() if "LATE" in line] == []
