@@ -32,9 +32,10 @@ settings.load_profile("gridsim")
 
 
 @pytest.fixture(autouse=True)
-def _ctrl_c_as_before() -> Iterator[None]:
-    """Commands inherit whether Ctrl-C is ignored: a test that leaves it so spoils later ones."""
+def _nothing_is_left_for_later_tests() -> Iterator[None]:
+    """Commands inherit whether Ctrl-C is ignored, and `ray start` reads a token at home."""
     yield
+    assert not Path(_home.name, ".ray/auth_token").exists()
     assert signal.getsignal(signal.SIGINT) != signal.SIG_IGN
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

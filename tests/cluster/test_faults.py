@@ -82,16 +82,7 @@ def test_hosts_come_and_go_and_in_the_end_patience_does(
         wait_until(lambda: rows(run) or process.poll() is not None, LONG_S)
         process.send_signal(signal.SIGSTOP)  # or it may be done before the second host is up
         _, second = cluster(1, address)
-
-        def joined() -> bool:
-            """Whether the second host has a worker. A host that failed to start is started again."""
-            nonlocal second
-            assert process.poll() is None
-            if second.poll() is not None:
-                _, second = cluster(1, address)
-            return bool(ray_workers(second.pid))
-
-        wait_until(joined, LONG_S)
+        wait_until(lambda: ray_workers(second.pid) or process.poll() is not None, LONG_S)
         done = len(rows(run))
         end(first)
         process.send_signal(signal.SIGCONT)

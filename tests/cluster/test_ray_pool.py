@@ -318,6 +318,7 @@ LITTER = """
 import gc, threading, ray
 from cluster.workers import ray_session
 
+ray_session.prepare(None)
 ray_session.start_own(1, lambda session: 2)
 one, shutdown = ray.put(0), ray.shutdown
 cycle = [ray.ObjectRef(one.binary()) for _ in range(100_000)]
