@@ -9,16 +9,16 @@ always. Medians over them:
     bytes_per_child                 sent per member and generation, both ways, leader and validation included
     broadcast_bytes_per_generation  put into the object store per generation: a few genomes, episodes
 
-The coordinator's ceilings, with workers that answer at once (`ceilings.py`):
+The coordinator's ceilings, with workers that answer at once (`coordinator.py`):
 
     children_per_s                  recipes, dispatch, collection and recombination, mlp:6,7
     coordinator_mib_100k            peak memory of its process at population 100,000, everything included
     broadcast_bytes_100k            as above, at that population
     chunk_us, look_us, ...          input of the simulation: the coordinator's own time
 
-On more machines: a simulation (`simulation.py`) of a generation of 10,000 members on 1 to 10,000 workers, as a table
-and, with --picture, a picture; and its figures for 1 to 8 workers beside those of real Ray actors. These share this
-machine's cores, so they sleep instead of evaluating: this checks the dispatch, not the cores.
+On more machines: a simulation (`simulated_workers.py`) of a generation of 10,000 members on 1 to 10,000 workers, as a
+table and, with --picture, a picture; and its figures for 1 to 8 workers beside those of real Ray actors. These share
+this machine's cores, so they sleep instead of evaluating: this checks the dispatch, not the cores.
 
     efficiency_1000_workers         1 s of evaluation a member, mlp:6,7; evaluation over what the workers had
     real_efficiency_<n>, simulated_efficiency_<n>
@@ -40,7 +40,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ceilings import (  # beside this file
+from coordinator import (  # beside this file
     CHILDREN,
     CHUNKS,
     EPISODES,
@@ -57,8 +57,8 @@ from ceilings import (  # beside this file
     sleeping_efficiency,
     step_s,
 )
-from ceilings import POLICY as MLP
-from simulation import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, table
+from coordinator import POLICY as MLP
+from simulated_workers import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, table
 
 from cluster.runs.settings import MAX_STEPS, EvolveSettings
 from cluster.training.trainer import Maps

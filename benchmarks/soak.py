@@ -23,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ceilings import learn, session  # beside this file
+from coordinator import learn, session  # beside this file
 
 from cluster.runs.champion import load_champion
 from cluster.runs.settings import EvolveSettings

@@ -38,7 +38,7 @@ RUNS = {
     "traffic.py": (["--hours", "0.01", "--seeds", "1", "--scenario", "curved", "--json"], set()),
     "traffic.py --ego": (["3", "--seeds", "1", "--scenario", "curved", "--json"], {"curved_off_road"}),
 }  # fmt: skip
-PARTS = {"ceilings.py", "simulation.py", "two_hosts.py"}  # of scaling.py and faults.py
+PARTS = {"coordinator.py", "simulated_workers.py", "two_hosts.py"}  # of scaling.py and faults.py
 
 
 def test_every_script_is_run_here() -> None:

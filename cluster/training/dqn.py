@@ -17,7 +17,7 @@ import numpy as np
 from cluster.runs.settings import DqnSettings
 from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
 from cluster.workers.worker import CollectTask
-from evolution.dqn.learner import DqnConfig, DqnLearner, finite
+from evolution.dqn.learner import DqnConfig, DqnLearner, exploration, finite
 from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
 
@@ -26,8 +26,6 @@ BATCH_STEPS = 32_768  # car-steps of a batch, about
 EPISODES = (64, 2048)  # of a batch, at least and at most
 WARM_UP = 20_000  # rows of replay before the first update
 SLICE = 8  # updates between two looks at the workers
-RANDOM_SHARE = 0.02  # share of --anneal over which exploration falls from random driving
-SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
 PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
 CALM = 3  # evaluations in a row with little change of these, after which the run has converged
 
@@ -86,7 +84,7 @@ class Dqn(Learning):
             "loss": sum(n * loss for n, loss, _ in self._losses) / max(updates, 1),
             "q/mean": sum(n * q for n, _, q in self._losses) / max(updates, 1),
             "q/change": self._change_of_values(updates),
-            "exploration": float(self._epsilons(EPISODES[0]).mean()),
+            "exploration": float(self._exploration(EPISODES[0]).mean()),
             "learning_rate": self.learner.config.learning_rate_at(self.learner.updates),
             "episodes": float(self.episodes),
             "updates": float(self.learner.updates),
@@ -108,7 +106,7 @@ class Dqn(Learning):
         self.maps.ahead(self.curriculum.map_seeds[: k + 8])
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         weights = finite(self.learner.weights, self.learner.updates)
-        task = CollectTask(*self._base(episodes), weights, self._epsilons(n), keys)
+        task = CollectTask(*self._base(episodes), weights, self._exploration(n), keys)
         brought = self.pool.collect(task, partial(self.on_progress, "collect"), self._train)
         self._report("collect", brought)
         check_any_left(brought.lost, "collect")
@@ -122,12 +120,8 @@ class Dqn(Learning):
         self.batches += 1
         return results, float(brought.experience.rewards.sum())
 
-    def _epsilons(self, n: int) -> np.ndarray:
-        """Shares of random actions of a batch's episodes: float32 [n]."""
-        s = self.settings
-        usual = s.epsilon ** (1.0 + SPREAD * np.arange(n) / max(n - 1, 1))
-        random = max(1.0 - min(self.car_steps / s.anneal, 1.0) / RANDOM_SHARE, 0.0)
-        return (usual + (1.0 - usual) * random).astype(np.float32)
+    def _exploration(self, n: int) -> np.ndarray:
+        return exploration(self.settings.epsilon, self.car_steps / self.settings.anneal, n)
 
     def _train(self) -> bool:
         """Make some of the updates that the batches so far require. Returns whether any are left."""

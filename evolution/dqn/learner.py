@@ -32,6 +32,8 @@ from evolution.networks.policy import PolicySpec, squash
 from gridsim.jit import njit
 
 T = TypeVar("T", np.ndarray, float)
+RANDOM_SHARE = 0.02  # of exploration's decline, over which it falls from random driving
+SPREAD = 7.0  # of exploration among a batch's episodes (alpha of Horgan et al. 2018)
 _WEIGHTS, _SAMPLES = 0, 1  # purposes of random numbers
 # PyTorch's Adam as a function, because the overhead of its class exceeds the time of the step.
 _adam = partial(adam, fused=True, amsgrad=False, beta1=0.9, beta2=0.999, weight_decay=0.0, maximize=False)
@@ -57,6 +59,16 @@ class DqnConfig:
         """Adam's learning rate in an update, counted from 0."""
         share = min(update / self.learning_rate_updates, 1.0)
         return self.learning_rate * (1.0 + (self.final_learning_rate - 1.0) * share)
+
+
+def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
+    """Shares of random actions in a batch's episodes, declining from 1: float32 [episodes].
+
+    Args: epsilon: the first episode's final share, the others' are smaller; progress: car-steps relative to --anneal.
+    """
+    usual = epsilon ** (1.0 + SPREAD * np.arange(episodes) / max(episodes - 1, 1))
+    random = max(1.0 - min(progress, 1.0) / RANDOM_SHARE, 0.0)
+    return (usual + (1.0 - usual) * random).astype(np.float32)
 
 
 def finite(numbers: T, update: int) -> T:

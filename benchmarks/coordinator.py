@@ -1,6 +1,6 @@
 """What the coordinator can do at most, measured with workers that answer at once or sleep; `scaling.py` calls it.
 
-    python benchmarks/ceilings.py POPULATION
+    python benchmarks/coordinator.py POPULATION
 
 prints as JSON the peak memory of a process that coordinates a complete run of so many members, and what it broadcasts.
 It is a process of its own, so that nothing else is counted.
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from simulation import ROWS  # beside this file
+from simulated_workers import ROWS  # beside this file
 
 from cluster.runs.run import new_run
 from cluster.runs.settings import EvolveSettings
@@ -265,7 +265,7 @@ def sleeping_efficiency(workers: int, members: int, generations: int = 3) -> flo
 
 
 def memory(population: int) -> dict[str, float]:
-    """Figures of a process that coordinates so many members, by `python benchmarks/ceilings.py POPULATION`."""
+    """Figures of a process that coordinates so many members, by `python benchmarks/coordinator.py POPULATION`."""
     done = subprocess.run(
         [sys.executable, __file__, str(population)], stdout=subprocess.PIPE, text=True, check=True, timeout=600
     )

@@ -1,4 +1,4 @@
-"""A generation on 1 to 10,000 workers, as a discrete-event simulation fed by what `ceilings.py` measured.
+"""A generation on 1 to 10,000 workers, as a discrete-event simulation fed by what `coordinator.py` measured.
 
 The coordinator is one thread, as in `cluster.workers.ray_pool`: it sends chunks to free workers, looks at all busy
 ones, and takes in their answers. The chunks are those of `cluster.workers.pool.cut`. Simulated are its time, the
