@@ -22,6 +22,7 @@ from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
+from gridsim.envs.episodes import Episodes
 from gridsim.envs.simulator import Simulator, views
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.scenarios import REGISTRY
@@ -136,6 +137,16 @@ def test_an_episode_follows_from_seed_and_number_alone(maps: Maps, name: str, op
     for ours, theirs in zip(first, others, strict=True):
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_array_equal(a[car], b[1])
+
+
+def test_a_cars_map_says_nothing_of_its_start(maps: Maps) -> None:
+    episodes = Episodes(1000, "curved", maps["curved"], 0, 0, SimConfig())
+    episodes.keys[:] = np.arange(1000)
+    drawn, starts, _ = episodes.draw(np.arange(1000))
+    for road_map in maps["curved"]:
+        there = starts[[each is road_map for each in drawn]]
+        x, y, heading = (starts_at(road_map, np.linspace(0.05, 0.95, 16))[:, np.newaxis, :3] - there[:, :3]).T
+        assert np.where(np.cos(heading) > 0.0, np.hypot(x, y), np.inf).min(axis=0).max() < 15.0, "lanes are left out"
 
 
 def test_a_reset_without_a_seed_goes_on_and_another_seed_differs(maps: Maps) -> None:
