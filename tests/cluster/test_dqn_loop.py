@@ -1,5 +1,6 @@
 """The DQN's loop in this process: when it learns, converges, diverges and ends."""
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,22 @@ def test_values_that_stand_still_while_they_are_trained_have_converged(loop):
         trained += learning.steps > 1 and learning.learner.updates > before
     assert learning.converged
     assert learning.done()
+
+
+def test_a_run_goes_on_exactly(loop, monkeypatch):
+    monkeypatch.setattr(dqn_loop, "EPISODES", (1, 2048))  # so that the size of a batch follows from those before
+
+    def go_on(learning):
+        learning.step()
+        learning.add_wall_clock(1.0)
+
+    straight, resumed = loop(), loop()
+    go_on(straight)
+    go_on(straight)
+    resumed.restore(*copy.deepcopy(straight.state()))
+    for learning in (straight, resumed):
+        go_on(learning)
+    np.testing.assert_equal(resumed.state(), straight.state())
 
 
 def test_large_values_can_be_saved_and_taken_up_again(loop):

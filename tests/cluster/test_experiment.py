@@ -132,6 +132,12 @@ def test_edited_comparison_is_refused(tmp_path, change):
         open_comparison(tmp_path)
 
 
+def test_comparison_keeps_no_password(tmp_path):
+    ComparisonFolder(tmp_path, PLAN, "http://me:secret@host").write()
+    assert "secret" not in (tmp_path / "comparison.json").read_text()
+    assert open_comparison(tmp_path).tracking_uri == "http://host"
+
+
 def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
     first, second, third = PLAN.cells(tmp_path)[:3]
     make_run(first.path, settings=first.settings)

@@ -69,6 +69,7 @@ def shown_drives():
     champion = load_champion(CHAMPION)
     road_map = build("seamless", 2_000_000)
     start = sample_starts(road_map, 1, np.random.default_rng(1))
+    start[0, 3] = -1.0  # m/s; the page shows the speed forwards
     world = spawn(road_map.network, start, 3, np.array([1]), champion.sim)[0]
     drive = record(champion, road_map, start[0], 60.0, world)
     return champion, drive, Shown("elite", "1", drive, stride=2), Shown("champion", "champion", drive)

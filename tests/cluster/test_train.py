@@ -1,6 +1,7 @@
 """A run's lifecycle: how it ends in MLflow, and what its caller is shown."""
 
 import dataclasses
+import re
 from contextlib import nullcontext
 from unittest.mock import Mock, PropertyMock
 
@@ -64,6 +65,23 @@ def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raise
     assert took_s == pytest.approx(float(rows(run.path)[-1]["wall_s"]), abs=0.01)
     assert steps(uri, found.info.run_id, ["leader/success_rate"]) == [0, 1]
     assert open_run(run.path).tracking_key == found.data.tags["gridsim.key"]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError("no space"), r"no space\ncontinue with: \S+ --resume r"),
+        (FloatingPointError("diverged"), r"diverged\nrepeat it with: \S+ --config r/config.json --learning-rate ..."),
+    ],
+)
+def test_a_run_that_fails_exits_with_1_and_says_how_to_go_on(uri, tmp_path, monkeypatch, capsys, error, said):
+    monkeypatch.setattr(train.Session, "finish", end(error))
+    monkeypatch.chdir(tmp_path)
+    small = ["--scenario", "curved", "--policy", "mlp:4", "--population", 8, "--generations", 1, "--workers", 0]
+    flags = [*small, "--output", ".", "--name", "r", "--tracking-uri", uri]
+    code, _, err = call(evolve_main, monkeypatch, capsys, *flags)
+    assert code == 1
+    assert re.search(f"^gridsim-evolve: error: {said}\n$", err, re.MULTILINE)
 
 
 @pytest.mark.usefixtures("impatient")

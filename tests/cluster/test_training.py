@@ -30,7 +30,8 @@ SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
 RANDOM = dataclasses.replace(SETTINGS, search="random")
 GENES = PolicySpec.parse(SETTINGS.policy).size
-EAGER = {"promising": 0.0, "latest": 0, "validation_share": 1.0}  # a candidate is validated in every generation
+# A candidate is validated in every generation, and whenever there was a leader the target doubles.
+EAGER = {"promising": 0.0, "latest": 0, "validation_share": 1.0, "growth": 0.0}
 
 
 @pytest.fixture(scope="module")

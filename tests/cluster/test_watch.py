@@ -193,6 +193,7 @@ def test_newest_elite_is_read_anew(going):
     assert name == "elite of generation 3"
     assert (first.genome == elites[3]).all()
     assert first.sim == SimConfig()
+    assert (elite(going, 0)[0].genome == elites[0]).all()
     before = checkpoint_time(going)
     save_steps(going, 4, elites[:1])
     assert checkpoint_time(going) != before
