@@ -42,6 +42,8 @@ from pathlib import Path
 import psutil  # type: ignore[import-untyped]
 from two_hosts import Cluster  # beside this file
 
+from cluster.workers.tickets import abandoned
+
 BIN = Path(sys.executable).parent
 SMALL = (
     "--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "10", "--until", "2",
@@ -152,6 +154,7 @@ class Campaign:
             port = free.getsockname()[1]
         self._server = self._start_server(port)
         self.gate = Gate(port)
+        self.uri = f"http://127.0.0.1:{self.gate.port}"  # the server's, by way of the gate
         self.cluster = Cluster(folder / "nodes", dict(os.environ)) if clustered else None
 
     def _start_server(self, port: int) -> subprocess.Popen:
@@ -197,11 +200,6 @@ class Campaign:
     def happened(self) -> int:
         """Faults so far."""
         return sum(self.counts.values())
-
-    @property
-    def uri(self) -> str:
-        """The server's, by way of the gate."""
-        return f"http://127.0.0.1:{self.gate.port}"
 
     def disturb(self, faults: int, tell: Callable[[], None]) -> None:
         """One run after another, until there were so many faults in all."""
@@ -267,15 +265,18 @@ class Campaign:
         self._wait_for_processes()
         said = "".join(path.read_text() for path in self.folder.glob("said-*"))
         return {
-            "processes_left": len(self.processes()),
+            "processes_left": len(self.processes()) + len(self.queues_in_use()),
             "shared_memory_left": len(set(os.listdir(SHARED_MEMORY)) - self._shared_memory),
             "ray_sessions_left": sum(str(path) not in said for path in (self.folder / "ray").glob("**/session_2*")),
         }
 
+    def queues_in_use(self) -> list[Path]:
+        """Queues of Rays that have not ended. A killed coordinator's agents, whose titles hide MARK, take a minute."""
+        return [path for path in (self.folder / "ray").glob("**/tickets") if not abandoned(path)]
+
     def _wait_for_processes(self) -> None:
-        """Until they have ended. Ray's helpers look for a killed coordinator for a minute."""
         ends = time.monotonic() + 90.0
-        while self.processes() and time.monotonic() < ends:
+        while (self.processes() or self.queues_in_use()) and time.monotonic() < ends:
             time.sleep(1.0)
 
 
