@@ -9,6 +9,7 @@ import pytest
 import gridsim
 from cluster import api
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
+from cluster.runs.champion import held_out
 from cluster.runs.checkpoint import CheckpointError, save
 from cluster.runs.run import RunFolder
 from cluster.runs.settings import DqnSettings
@@ -52,6 +53,20 @@ def test_load_drive_evaluate(which, shown, request, tmp_path):
     assert figures == evaluate(made, "curved", episodes=8)
     assert figures["episodes"] == 8
     assert figures["distance_m"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("scenario", "traffic", "cars"),
+    [(None, None, 2), ("highway", None, 8), (None, 0, 0), ("highway", 0, 0), (None, 3, 3)],
+)
+def test_traffic_is_the_champions_the_roads_or_what_is_asked_for(champion, scenario, traffic, cars):
+    used_to_two = dataclasses.replace(champion, traffic=2)
+    episodes, _ = held_out(used_to_two, scenario, 1, 0, traffic)
+    assert episodes.worlds.shape[1] == cars
+    asked = {} if traffic is None else {"traffic": traffic}
+    env = used_to_two.make_env(scenario, **asked)
+    env.reset(seed=0)
+    assert env.cars.simulator.worlds.shape[1] == cars
 
 
 def test_environment_and_rollout_drive_alike(champion):
