@@ -271,7 +271,7 @@ class Campaign:
         }
 
     def queues_in_use(self) -> list[Path]:
-        """Queues of Rays that have not ended. A killed coordinator's agents, whose titles hide MARK, take a minute."""
+        """Queues that a process has open. Ray's agents, whose titles overwrite MARK, outlive a kill by a minute."""
         return [path for path in (self.folder / "ray").glob("**/tickets") if not abandoned(path)]
 
     def _wait_for_processes(self) -> None:

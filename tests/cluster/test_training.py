@@ -30,7 +30,7 @@ SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)
 RANDOM = dataclasses.replace(SETTINGS, search="random")
 GENES = PolicySpec.parse(SETTINGS.policy).size
-# A candidate is validated in every generation, and whenever there was a leader the target doubles.
+# A candidate is validated in every generation, and the target doubles in each that has a leader.
 EAGER = {"promising": 0.0, "latest": 0, "validation_share": 1.0, "growth": 0.0}
 
 

@@ -139,7 +139,7 @@ def test_an_episode_follows_from_seed_and_number_alone(maps: Maps, name: str, op
             np.testing.assert_array_equal(a[car], b[1])
 
 
-def test_a_cars_map_says_nothing_of_its_start(maps: Maps) -> None:
+def test_where_an_episode_starts_does_not_depend_on_its_map(maps: Maps) -> None:
     episodes = Episodes(1000, "curved", maps["curved"], 0, 0, SimConfig())
     episodes.keys[:] = np.arange(1000)
     drawn, starts, _ = episodes.draw(np.arange(1000))
