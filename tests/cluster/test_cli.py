@@ -233,6 +233,12 @@ def test_a_champion_that_does_not_fit_is_refused(monkeypatch, capsys, tmp_path):
         assert said in line
 
 
+def test_config_of_a_run_that_began_with_a_champion_begins_with_it_again(monkeypatch, capsys, tmp_path):
+    RunFolder(tmp_path, EvolveSettings("curved"), init=str(tmp_path / "gone.npz")).write_config()
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--workers", "0", "--config", str(tmp_path / "config.json"))
+    assert "gone.npz" in line
+
+
 @pytest.mark.parametrize("main", [evolve_main, compare_main])
 def test_a_folder_that_another_process_works_on_is_refused_in_one_line(main, monkeypatch, capsys, tmp_path):
     RunFolder(tmp_path, EvolveSettings("curved")).write_config()

@@ -62,6 +62,10 @@ def test_values_that_stand_still_while_they_are_trained_have_converged(loop):
         trained += learning.steps > 1 and learning.learner.updates > before
     assert learning.converged
     assert learning.done()
+    learning.probe_q += 1.0  # they change once more
+    learning.step()
+    assert learning.calm == 0
+    assert not learning.converged
 
 
 def test_a_run_goes_on_exactly(loop, monkeypatch):

@@ -67,6 +67,19 @@ def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raise
     assert open_run(run.path).tracking_key == found.data.tags["gridsim.key"]
 
 
+def test_the_last_candidates_validation_is_a_step_after_the_last(uri, tmp_path):
+    run, names = new_run(tmp_path, "r", SETTINGS), ["validation/success_rate"]
+    run.path.mkdir()
+    tracker = train.make_tracker(run, uri, "driving")
+    train.log_rows(tracker, [{names[0]: 0.25, "wall_s": 1.0}])
+    end = {"held_out": {"success_rate": 0.75}, "wall_s": 3.0, "validation_success_rate": 0.5}
+    train.log_end(tracker, run, 0, end, "a note")
+    assert tracker.close("FINISHED") is None
+    history = client(uri).get_metric_history(tracker.run_id, names[0])
+    assert [(each.step, each.value) for each in history] == [(0, 0.25), (1, 0.5)]
+    assert steps(uri, tracker.run_id, ["held_out/success_rate"]) == [0]
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [

@@ -432,6 +432,7 @@ def test_steps_and_pictures_need_a_reset(maps: Maps) -> None:
         ({"start": [1, 2, np.nan, 0, 0]}, "finite"),
         ({"start": [1, 2, 0, 31, 0]}, "speed"),
         ({"start": [1, 2, 0, 0, 1.0]}, "steering"),
+        ({"start": [1, 2, 0, 0, -1.0]}, "steering"),
         ({"map_seed": 0, "start": [0, 0, 0, 0, 0]}, "on the road"),
     ],
 )

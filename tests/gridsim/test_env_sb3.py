@@ -62,6 +62,7 @@ def test_options_are_the_next_resets():
         np.testing.assert_array_equal(cars.reset(), own.reset(seed=3, options=theirs)[0])
         cars.seed(3)
         np.testing.assert_array_equal(cars.reset(), own.reset(seed=3)[0])  # they are used once
+        np.testing.assert_array_equal(cars.reset(), own.reset()[0])  # and so are seeds
     for wrong in ([{"map_seed": 1}, {}], {"map": 1}):
         cars.set_options(wrong)
         with pytest.raises(ValueError, match=r"^[^\n]*option[^\n]*$"):
