@@ -198,10 +198,16 @@ def test_formats(tmp_path, suffix, mode):
     np.testing.assert_array_equal(read_free(MapFile(tmp_path / f"picture.{suffix}")), pixels[::-1] > 128)
 
 
-def test_transparent_is_wall(tmp_path):
-    pixels = np.full((4, 6, 4), 255, dtype=np.uint8)
-    pixels[:2, :, 3] = 0
-    save(tmp_path / "a.png", pixels)
+@pytest.mark.parametrize("mode", ["LA", "RGBA", "P"])
+def test_transparent_is_wall(tmp_path, mode):
+    alpha = np.repeat([0, 255], [12, 12]).astype(np.uint8).reshape(4, 6)
+    image = Image.fromarray(alpha)
+    if mode == "P":  # both of its colours are white
+        image.putpalette([255] * 768)
+        image.save(tmp_path / "a.png", transparency=0)
+    else:
+        white = Image.new("L", image.size, 255)
+        Image.merge(mode, [white] * (len(mode) - 1) + [image]).save(tmp_path / "a.png")
     assert read_free(MapFile(tmp_path / "a.png")).sum(axis=1).tolist() == [6, 6, 0, 0]
 
 
