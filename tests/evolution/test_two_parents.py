@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from searching import first_gene, leader, told
+from searching import first_gene, leader, new_genomes, told
 
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import SearchConfig, ranks
@@ -54,6 +54,15 @@ def test_both_parents_come_from_the_pool_and_mutation_is_as_asked_for():
         assert set(children[side].tolist()) == set(range(3, PARENTS + 3))
     assert (children["a"] != children["b"]).mean() == pytest.approx(1.0 - 1.0 / PARENTS, abs=0.01)
     assert len(set(children["seed"].tolist())) == len(children)
+
+
+@pytest.mark.parametrize("elites", [0, 4])
+def test_a_search_that_starts_from_a_genome_breeds_from_it(elites):
+    search = TwoParents(SPEC, SearchConfig(population=40, elites=elites, mutation_rate=0.0), seed=1)
+    genome = new_genomes(SPEC)[0]
+    search.start_from(genome)
+    search.ask()
+    assert (search.genomes(EVERYONE) == genome).all()
 
 
 def test_who_has_no_score_is_neither_elite_nor_parent():

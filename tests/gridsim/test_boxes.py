@@ -200,9 +200,9 @@ def test_nothing_tunnels_through_crosswise(cross, offset):
 # --- Standing behind a standing car ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("gap", "ends"), [(3.0, False), (9.5, False), (11.0, True), (None, True)])
+@pytest.mark.parametrize(("gap", "ends"), [(3.0, False), (9.5, False), (11.0, True), (-11.0, True), (None, True)])
 def test_waiting_behind_a_standing_car_is_not_idle(cross, gap, ends):
-    """Standing 5 s, bumper to bumper so many m behind a car that stands, and alone."""
+    """Standing 5 s, bumper to bumper so many m behind a car that stands, 3 m in front of it, and alone."""
     simulator = Simulator(1, BLIND, traffic=1)
     world = cars_on(cross.network, (0, 100.0, 0.0, 1.0))
     if gap is None:
