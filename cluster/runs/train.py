@@ -102,7 +102,8 @@ class Workers:
         if self._pool is None and self.number:
             from cluster.workers.ray_pool import RayPool
 
-            self._pool = RayPool(self.number, self._build, self.address, patience_s=self.patience_s)
+            here = self.address is None  # a cluster's hosts may be of another type, and then give other bits
+            self._pool = RayPool(self.number, self._build, self.address, patience_s=self.patience_s, begin_here=here)
         return self._pool or SerialPool(self._build)
 
     def close(self) -> None:
@@ -133,13 +134,13 @@ def train(
     maps = Maps(settings.scenario, SimConfig())
     warming = kernels.Warming(settings)
     try:
+        if warming.processes:
+            with reporter.compiling():
+                warming.wait()
         session = Session(
             run, workers.open(maps), maps, uri, experiment, reporter, perf_counter() if started is None else started,
             initial, parent_id, wall_limit_s,
         )  # fmt: skip
-        if warming.processes:
-            with reporter.compiling():
-                warming.wait()
         maps.ahead(session.learning.curriculum.map_seeds[:3])
         maps.ahead(VALIDATION_SEEDS, later=True)  # while Ray starts, cores are idle
         kernels.compile_kernels(settings.policy, settings.traffic, settings.command)

@@ -23,8 +23,7 @@ Progress = Callable[[int, int], None]  # (members done, members in all), or epis
 Meanwhile = Callable[[], bool | None]  # called while workers are busy, again and again until it returns a false value
 
 SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
-METRE_S = 1e-6  # seconds that a metre of an episode takes a small network
-UNMEASURED_METRE_S = 3e-5  # the same, assumed for Ray's workers until it is measured: large networks are slower
+METRE_S = 3e-5  # seconds that a metre of an episode takes a large network; a small one is thirty times as fast
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
 PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
 LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
@@ -213,9 +212,19 @@ class SerialPool(WorkerPool):
 
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         started = time.perf_counter()
+        self.work_until(lambda: False, call, on_progress, meanwhile)
+        call.wall_s = time.perf_counter() - started
+
+    def work_until(
+        self, stop: Callable[[], bool], call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None
+    ) -> list[Chunk]:
+        """Do what a call asks for until `stop` returns true. Returns what is left of it."""
         maps = [self._build_map(*name) for name in call.task.maps]
         finish(meanwhile)
-        for index, parcel in enumerate(cut(call.task, call.asked, SERIAL_PARTS)):
+        parcels = cut(call.task, call.asked, SERIAL_PARTS)
+        for index, parcel in enumerate(parcels):
+            if stop():
+                return [chunk for parcel in parcels[index:] for chunk in parcel]
             try:
                 for chunk in parcel:
                     call.add(0, chunk, *self._worker.answer(call.task, maps, *call.work(chunk)))
@@ -223,7 +232,7 @@ class SerialPool(WorkerPool):
                 raise call.failure(index, parcel, error) from error
             if on_progress:
                 on_progress(*call.progress())
-        call.wall_s = time.perf_counter() - started
+        return []
 
 
 def finish(meanwhile: Meanwhile | None) -> None:
@@ -255,7 +264,7 @@ def cut(
     result depends on it.
 
     Args:
-        metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
+        metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S, until it is measured.
         worth_s: the least seconds of evaluation in a parcel; None for what pays when the coordinator sends each.
     """
     rates = [METRE_S] * len(asked) if metre_s is None else metre_s

@@ -2,8 +2,9 @@
 
 What differs from Ray's defaults, and why:
 
-* Ray is started by a thread, so that the caller can load kernels meanwhile. The thread lives until `close`: the system
-  kills Ray's processes when their parent *thread* dies, and so they die with us, whatever kills us.
+* Ray is started by a thread. Until a first worker is up, which takes seconds, this process does the work itself
+  (`begin_here`). The thread lives until `close`: the system kills Ray's processes when their parent *thread* dies, and
+  so they die with us, whatever kills us.
 * Actors are replaced by this pool and not by Ray's `max_restarts`: what was sent has to be sent again either way, and
   `dispatch` has to know which chunk killed which worker.
 * Where a call takes little time, the workers of this machine take its parcels from a queue (`tickets`), with one call
@@ -24,6 +25,7 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ from cluster.workers import ray_session
 from cluster.workers.actor import Actor, Name, Shared, Work
 from cluster.workers.dispatch import MAX_KILLS, Dispatch
 from cluster.workers.pool import (
-    UNMEASURED_METRE_S,
+    METRE_S,
     BuildMap,
     Call,
     Chunk,
@@ -39,6 +41,7 @@ from cluster.workers.pool import (
     Parcel,
     PoolError,
     Progress,
+    SerialPool,
     WorkerPool,
     cut,
     finish,
@@ -94,13 +97,14 @@ class RayPool(WorkerPool):
         address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
         worker_factory: makes what evaluates; must be importable in the workers.
         patience_s: how long to go on without any worker, or wait for a silent one; default 60 s, on a cluster 300 s.
+        begin_here: whether this process does the work until the first worker is up.
 
     Raises PoolError at once if nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
 
     def __init__(
         self, workers: int, build_map: BuildMap, address: str | None = None,
-        worker_factory: Callable[[], Worker] = Worker, patience_s: float | None = None,
+        worker_factory: Callable[[], Worker] = Worker, patience_s: float | None = None, begin_here: bool = False,
     ):  # fmt: skip
         if workers < 1:
             raise ValueError(f"a RayPool needs 1 worker or more, not {workers}")
@@ -110,6 +114,8 @@ class RayPool(WorkerPool):
         self._build_map = build_map
         self._factory = worker_factory
         self._patience_s = patience_s or (PATIENCE_S if address is None else CLUSTER_PATIENCE_S)
+        self._here = SerialPool(build_map, worker_factory) if begin_here else None  # until the first worker is up
+        self._here_until = time.monotonic() + self._patience_s
         self._slots: list[_Slot] = []
         self._serial = 0
         self._last_failure = ""  # of a worker's start
@@ -133,29 +139,52 @@ class RayPool(WorkerPool):
         return f" (logs: {self._session}/logs)" if self._named else ""
 
     def expect(self, maps: Sequence[Name]) -> None:
-        self._shared.put_maps(maps)
+        if self._connected:
+            self._shared.put_maps(maps)
 
     def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
         started = time.perf_counter()
-        self._wait_for_ray()
+        self._call, asked = call, call.asked
+        self._serial += 1
         try:
-            self._share_out(call, on_progress, meanwhile)
+            if self._here:
+                asked, meanwhile = self._here.work_until(partial(self._is_up, call), call, on_progress, meanwhile), None
+            if asked:
+                self._wait_for_ray()
+                self._share_out(call, asked, on_progress, meanwhile)
         except self._ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
         self._measure(call)
         call.wall_s = time.perf_counter() - started
 
-    def _share_out(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
-        """Have the workers do all that is asked for."""
+    def _is_up(self, call: Call) -> bool:
+        """Whether the workers can take over: one of them is prepared, or the wait for it is to end in an error."""
+        late = time.monotonic() > self._here_until
+        if self._booted.is_set():
+            self._wait_for_ray()  # which raises what went wrong
+            self._put(call)
+            self._dispatch = Dispatch([])
+            for ref in self._ready([slot.hello for slot in self._slots], 0.0):
+                self._greet(next(slot for slot in self._slots if slot.hello is ref))
+        if late or any(slot.pid and not slot.hello for slot in self._slots):
+            self._here = None
+        return self._here is None
+
+    def _put(self, call: Call) -> None:
+        """Put a call's task where the workers find it, unless it is there."""
+        call.broadcast_bytes = call.broadcast_bytes or self._shared.put(call.task)
+
+    def _share_out(
+        self, call: Call, asked: Sequence[Chunk], on_progress: Progress | None, meanwhile: Meanwhile | None
+    ) -> None:
+        """Have the workers do what is asked for."""
         task = call.task
-        metre_s = [self._metre_s.get(_kind(task, part), UNMEASURED_METRE_S) for part in call.asked]
-        seconds = sum(rate * metres(task, part) for rate, part in zip(metre_s, call.asked, strict=True))
-        self._call = call
-        self._serial += 1
-        call.broadcast_bytes = self._shared.put(task)
+        metre_s = [self._metre_s.get(_kind(task, part), METRE_S) for part in asked]
+        seconds = sum(rate * metres(task, part) for rate, part in zip(metre_s, asked, strict=True))
+        self._put(call)
         if self._tickets and seconds < QUEUED_S * len(self.pids()):
             readers = min(len(self.pids()), CORES)  # each costs a call, and more would only share the cores
-            self._parcels = dict(enumerate(cut(task, call.asked, readers, metre_s, WORTH_QUEUING_S)))
+            self._parcels = dict(enumerate(cut(task, asked, readers, metre_s, WORTH_QUEUING_S)))
             self._packed = pickle.dumps([self._pack(parcel) for parcel in self._parcels.values()], protocol=5)
             self._tickets.put(self._serial, len(self._parcels))
             meanwhile = self._work_off([FROM_QUEUE] * readers, on_progress, meanwhile)
@@ -163,7 +192,7 @@ class RayPool(WorkerPool):
             call.retries = len(parcels)
         else:
             shares = self._asked * (FINER if isinstance(task, CollectTask) else 1)
-            parcels = cut(task, call.asked, shares, metre_s)
+            parcels = cut(task, asked, shares, metre_s)
         finish(self._work_off(parcels, on_progress, meanwhile))
 
     def _work_off(
@@ -331,8 +360,8 @@ class RayPool(WorkerPool):
                 ray_session.start_own(self._asked, self._begin)
             else:
                 ray_session.join(self.address)
-            self._connected = True
             self._shared = Shared(ray.put, self._build_map)
+            self._connected = True
             self._actor_class = ray.remote(num_cpus=1)(Actor)
             self._slots = [self._start(number) for number in range(self._asked)]
         except BaseException as error:

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from cluster.workers.actor import Actor, Shared
 from cluster.workers.pool import (
+    METRE_S,
     PARCEL_S,
-    UNMEASURED_METRE_S,
     WORTH_SENDING_S,
     Chunk,
     Collected,
@@ -174,7 +174,7 @@ def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers(
 def test_a_parcel_holds_members_of_several_groups() -> None:
     """So that the number of parcels does not grow with the number of groups."""
     task = make_task(episodes=goals(*[400.0] * 16))
-    assert len(cut(task, GROUPS, 2)) == len(cut(task, rectangle(512, 2), 2)) < 16
+    assert len(cut(task, GROUPS, 2, [1e-6] * 8)) == len(cut(task, rectangle(512, 2), 2, [1e-6])) < 16
 
 
 def test_what_is_asked_for_is_driven_and_nothing_else_and_progress_is_reported() -> None:
@@ -198,8 +198,8 @@ def test_what_is_asked_for_is_driven_and_nothing_else_and_progress_is_reported()
 def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
     """Of a large network, 1 ms a metre, before any of it is measured."""
     task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [UNMEASURED_METRE_S])) * 1e-3 < 20
-    assert len(cut(task, rectangle(512, 2), 2, [UNMEASURED_METRE_S])) < 40, "as few as a small network needs"
+    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [METRE_S])) * 1e-3 < 20
+    assert len(cut(task, rectangle(512, 2), 2, [METRE_S])) < 40, "as few as a small network needs"
 
 
 def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
@@ -209,6 +209,20 @@ def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
     assert left == [0, 1, 2, 3]
     pool.collect(make_collect_task(40), meanwhile=lambda: bool(left.pop()))
     assert left == []
+
+
+@pytest.mark.parametrize("parcels", [0, 1, 5, 1000])
+def test_what_is_left_of_a_call_that_is_stopped_is_all_that_was_not_done(parcels: int) -> None:
+    pool = SerialPool(never_built, Answering)
+    task, recipes = make_task(episodes=goals(*[400.0] * 16)), make_recipes(512)
+    whole, begun, stops = pool.evaluate(task, recipes, asked=GROUPS), Outcome(task, recipes, GROUPS), [False] * parcels
+    left = pool.work_until(lambda: not stops or stops.pop(), begun, None, None)
+    rest = pool.evaluate(task, recipes, asked=left)
+    assert begun.done + rest.done == whole.done
+    assert (begun.done > 0) == (parcels > 0)
+    assert (rest.done > 0) == (parcels < 1000)
+    for name in ("distance", "paced"):
+        assert (begun.results[name] + rest.results[name] == whole.results[name]).all()
 
 
 def test_a_lost_member_has_no_results_and_experience_is_in_order() -> None:

@@ -80,6 +80,18 @@ class Inspecting(Worker):
         return super().evaluate(task, maps, recipes)
 
 
+class Signing(Answering):
+    """Takes its time, and leaves a file named after its process."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+
+    def answer(self, task, maps, recipes, first, stop):
+        (self._folder / str(os.getpid())).touch()
+        time.sleep(0.1)
+        return super().answer(task, maps, recipes, first, stop)
+
+
 @dataclass(frozen=True)
 class Reluctant(Task):
     """Cannot be unpickled the first time in each process."""
@@ -397,6 +409,41 @@ def test_workers_that_cannot_start_are_given_up() -> None:
         pytest.raises(PoolError, match=r"^no worker can be started: .*TypeError: .*missing 1 required .*'folder'"),
     ):
         pool.evaluate(make_task(), make_recipes(20))
+
+
+@pytest.mark.usefixtures("no_pool")
+def test_this_process_works_until_a_worker_is_up_also_within_one_call(tmp_path: Path) -> None:
+    signing, progress = functools.partial(Signing, tmp_path), list[tuple[int, int]]()
+    with contextlib.closing(RayPool(2, never_built, worker_factory=signing, begin_here=True)) as pool:
+        assert pool.evaluate(make_task(), make_recipes(8)).results.tobytes() == expected(8)
+        assert [int(path.name) for path in tmp_path.iterdir()] == [os.getpid()]
+        outcome = pool.evaluate(make_task(), make_recipes(20_000), lambda *done: progress.append(done))
+        assert outcome.results.tobytes() == expected(20_000)
+        assert {int(path.name) for path in tmp_path.iterdir()} >= {os.getpid(), *pool.pids()}
+        assert pool.pids()
+        assert progress == sorted(progress)
+        assert progress[-1] == (20_000, 20_000)
+        (tmp_path / str(os.getpid())).unlink()
+        assert pool.evaluate(make_task(), make_recipes(512)).results.tobytes() == expected(512)
+        assert not (tmp_path / str(os.getpid())).exists(), "no longer here"
+
+
+@pytest.mark.usefixtures("no_pool")
+@pytest.mark.parametrize(
+    ("takes_s", "said"), [(0.2, "^Ray could not be started: no room$"), (3.0, "^Ray did not come up within 0.5 s$")]
+)
+def test_a_ray_that_does_not_start_ends_a_run_that_has_begun_without_it(
+    monkeypatch: pytest.MonkeyPatch, takes_s: float, said: str
+) -> None:
+    def fail(*_: object) -> None:
+        time.sleep(takes_s)
+        raise OSError("no room")
+
+    monkeypatch.setattr(ray_pool, "CONNECT_S", 0.5)
+    monkeypatch.setattr(ray_pool.ray_session, "start_own", fail)
+    pool = RayPool(2, never_built, worker_factory=Answering, patience_s=1.0, begin_here=True)
+    with contextlib.closing(pool), pytest.raises(PoolError, match=said):
+        wait_until(lambda: not pool.evaluate(make_task(), make_recipes(8)))
 
 
 def test_a_pool_needs_workers() -> None:
