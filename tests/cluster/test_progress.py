@@ -87,7 +87,7 @@ def test_there_is_no_eta_before_it_means_something(monkeypatch):
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-def test_a_comparison_shows_the_same(width):
+def test_a_comparison_shows_the_same(width, monkeypatch):
     plan = Plan(("roundabout",), ("two-parents",), 3, budget="3700s")
     cells = plan.cells(Path("runs/c"))
     console = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
@@ -102,6 +102,9 @@ def test_a_comparison_shows_the_same(width):
     assert line.startswith("run 0/3  ETA 1:3")
     assert "\nroundabout-two-parents-s0  12 generations  success 37%" in line
     assert "\nroundabout-two-parents-s1  12 generations  success 37%" in line
+    after(monkeypatch, 600.0)
+    shown.show(cells[0], "note", note)
+    assert drawn(shown, width).startswith("run 0/3  ETA 1:22:")
 
 
 def test_a_terminal_shows_it_live():

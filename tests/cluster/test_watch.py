@@ -141,6 +141,7 @@ def test_watch_shows_a_recorded_drive(tmp_path, monkeypatch, capsys):
     scenario = build("seamless", 3)
     start = sample_starts(scenario, 1, np.random.default_rng(1))[0]
     record_drive(tmp_path / "drive.csv", scenario, start, [[0] * 16, [0] * 11])
+    monkeypatch.setattr(watch, "FILM_S", 1.0)  # is not for recordings
     for arguments, pictures in (([], 25), (["--seconds", 2], 20)):
         film = ["drive.csv", "--output", "d.mp4", "--fps", 10, "--size", "64x64", *arguments]
         assert f"{pictures / 10:.1f} s, {pictures} pictures" in call(watch_main, monkeypatch, capsys, *film)[1]

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from evolution.dqn.experience import NO_ACTION, Experience
-from evolution.dqn.learner import DqnConfig, DqnLearner, QNetwork, new_weights, tanh
+from evolution.dqn.learner import RANDOM_SHARE, DqnConfig, DqnLearner, QNetwork, exploration, new_weights, tanh
 from evolution.dqn.replay import Batch, Replay
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
@@ -134,6 +134,15 @@ def test_training_may_be_cut_and_resumed_anywhere():
     assert resumed.updates == whole.updates == 100
     np.testing.assert_equal(resumed.state(), whole.state())
     assert not np.array_equal(whole.weights, whole.state()["target"])
+
+
+def test_learning_rate_and_exploration_decline_and_then_stay():
+    config = DqnConfig(learning_rate=0.01, final_learning_rate=0.1, learning_rate_updates=100)
+    assert [config.learning_rate_at(k) for k in (0, 50, 100, 1000)] == pytest.approx([0.01, 0.0055, 0.001, 0.001])
+    for progress, first in ((0.0, 1.0), (RANDOM_SHARE / 2, 0.65), (RANDOM_SHARE, 0.3), (0.5, 0.3), (2.0, 0.3)):
+        shares = exploration(0.3, progress, 8)
+        assert shares[0] == pytest.approx(first)
+        assert (np.diff(shares) <= 0.0).all()
 
 
 def test_seeds_differ_and_repeat():
