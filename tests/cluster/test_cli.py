@@ -117,7 +117,8 @@ def test_init_begins_with_a_champion(reference, tmp_path):
 )
 def test_stopped_while_ray_starts_it_ends_soon_and_leaves_nothing(tmp_path, send, sign, after_s):
     with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
-        process = start("gridsim-evolve", "--workers", "2", *SMALL, cwd=tmp_path, RAY_TMPDIR=short)
+        many = [*ROAD, "--population", "30000"]  # of which a generation takes longer
+        process = start("gridsim-evolve", "--workers", "2", *many, cwd=tmp_path, RAY_TMPDIR=short)
         wait_until(lambda: list(Path(short).glob("ray/session_2*")))
         time.sleep(after_s)
         children = descendants(process.pid)

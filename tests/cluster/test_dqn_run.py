@@ -28,7 +28,7 @@ pytestmark = pytest.mark.e2e
 def test_a_killed_worker_ctrl_c_and_a_killed_process_change_nothing(reference, tmp_path):
     run = tmp_path / "runs/k"
     with running("gridsim-dqn", "--workers", "2", "--name", "k", *SMALL, cwd=tmp_path) as process:
-        wait_until(lambda: rows(run))
+        wait_until(lambda: rows(run) and ray_workers(process.pid))
         os.kill(ray_workers(process.pid)[0], signal.SIGKILL)
         wait_until(lambda: len(rows(run)) >= 2)
         time.sleep(0.3)  # in the midst of an evaluation's updates
