@@ -335,6 +335,8 @@ class Run:
                     raise Wrong(f"{self.name} hangs; it last said: {self.last_words()}")
                 if process.poll() is None and campaign.happened < faults:
                     fault = self.rng.choice(campaign.faults)
+                    if fault.startswith("worker") and not _workers(self, process):
+                        continue
                     campaign.counts[fault] += 1
                     FAULTS[fault](self, process)
             if process.returncode == 0:
@@ -344,8 +346,7 @@ class Run:
             if outside:  # Python itself was interrupted, before the command began or after its end
                 self._heard = self._said.stat().st_size
                 continue
-            # SIGBUS ends a process that writes to a full shared memory.
-            known = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, 130, 1)
+            known = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, 130, 1)  # SIGBUS: shared memory was full
             if "Traceback" in self.said() or not (refused or known):
                 raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
         with campaign.shared:
@@ -375,9 +376,8 @@ def _workers(run: Run, process: subprocess.Popen) -> list[psutil.Process]:
 
 
 def _signal_a_worker(run: Run, process: subprocess.Popen, number: int) -> None:
-    if workers := _workers(run, process):
-        with contextlib.suppress(psutil.Error):
-            run.rng.choice(workers).send_signal(number)
+    with contextlib.suppress(psutil.Error, IndexError):  # all have ended by now
+        run.rng.choice(_workers(run, process)).send_signal(number)
 
 
 def _signal_group(process: subprocess.Popen, number: int) -> None:

@@ -81,9 +81,7 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     before = CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES
     CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = str(CACHE_FOLDER), f"{__name__}.{CacheLocator.__name__}"
     try:
-        return numba.njit(**{"cache": True, "nogil": True, "error_model": "numpy", "fastmath": FAST_MATH, **options})(
-            function
-        )
+        return numba.njit(**{"cache": True, "error_model": "numpy", "fastmath": FAST_MATH, **options})(function)
     finally:
         CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = before
 

@@ -134,6 +134,8 @@ def train(
     maps = Maps(settings.scenario, SimConfig())
     warming = kernels.Warming(settings)
     try:
+        if workers.address:
+            workers.open(maps)  # its hosts start, and compile for themselves
         if warming.processes:
             with reporter.compiling():
                 warming.wait()
@@ -142,7 +144,7 @@ def train(
             initial, parent_id, wall_limit_s,
         )  # fmt: skip
         maps.ahead(session.learning.curriculum.map_seeds[:3])
-        maps.ahead(VALIDATION_SEEDS, later=True)  # while Ray starts, cores are idle
+        maps.ahead(VALIDATION_SEEDS, later=True)
         kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
         lock(run.path)
         run.write_config()

@@ -1,7 +1,7 @@
 """Compiling the kernels before they are needed: once for all processes, and on more than one core.
 
-Numba compiles one function at a time in a process. So separate processes compile what a run needs while this one starts
-Ray, and all others then load it from the cache on disk (`gridsim.jit`).
+Numba compiles one function at a time in a process. So separate processes compile what a run needs, and all others then
+load it from the cache on disk (`gridsim.jit`).
 
 Run as `python -m cluster.workers.kernels kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it
 prints a line when what a run needs first is compiled, and goes on with what is needed at the run's end. `python -m

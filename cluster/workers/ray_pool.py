@@ -115,8 +115,9 @@ class RayPool(WorkerPool):
         self._factory = worker_factory
         self._patience_s = patience_s or (PATIENCE_S if address is None else CLUSTER_PATIENCE_S)
         self._here = SerialPool(build_map, worker_factory) if begin_here else None  # until the first worker is up
-        self._here_until = time.monotonic() + self._patience_s
+        self._ray: Any = None  # once it is imported
         self._slots: list[_Slot] = []
+        self._dispatch = Dispatch([])
         self._serial = 0
         self._last_failure = ""  # of a worker's start
         self._metre_s: dict[_Kind, float] = {}  # what a metre of such a part took the last time
@@ -125,6 +126,7 @@ class RayPool(WorkerPool):
         self._failure: BaseException | None = None
         self._leaving = self._connected = self._named = False
         self._booted, self._closed = threading.Event(), threading.Event()
+        self._connect_by = time.monotonic() + CONNECT_S
         self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
         self._thread.start()
 
@@ -152,21 +154,25 @@ class RayPool(WorkerPool):
             if asked:
                 self._wait_for_ray()
                 self._share_out(call, asked, on_progress, meanwhile)
-        except self._ray.exceptions.RayError as error:  # Ray itself failed; `_receive` handles deaths of workers
+        except Exception as error:
+            if self._ray is None or not isinstance(error, self._ray.exceptions.RayError):
+                raise
+            # Ray itself failed; `_receive` handles deaths of workers.
             raise PoolError(f"Ray failed: {ray_session.reason(error)}{self._logs}") from error
         self._measure(call)
         call.wall_s = time.perf_counter() - started
 
     def _is_up(self, call: Call) -> bool:
-        """Whether the workers can take over: one of them is prepared, or the wait for it is to end in an error."""
-        late = time.monotonic() > self._here_until
-        if self._booted.is_set():
-            self._wait_for_ray()  # which raises what went wrong
-            self._put(call)
-            self._dispatch = Dispatch([])
-            for ref in self._ready([slot.hello for slot in self._slots], 0.0):
-                self._greet(next(slot for slot in self._slots if slot.hello is ref))
-        if late or any(slot.pid and not slot.hello for slot in self._slots):
+        """Whether a worker is prepared, so that the workers can take over."""
+        if not self._booted.is_set() and time.monotonic() < self._connect_by:
+            return False
+        self._wait_for_ray()  # raises what went wrong
+        self._put(call)
+        starting = {slot.hello: slot for slot in self._slots if slot.hello}
+        for ref in self._ready(list(starting), 0.0):
+            self._greet(starting[ref])
+        self._check_patience()
+        if any(slot.pid and not slot.hello for slot in self._slots):
             self._here = None
         return self._here is None
 
@@ -201,7 +207,7 @@ class RayPool(WorkerPool):
         """Have parcels done. Returns what is still to be done meanwhile."""
         self._dispatch = dispatch = Dispatch(parcels)
         call, retries = self._call, self._call.retries
-        alone_since = time.monotonic()
+        self._alone_since = time.monotonic()
         while not dispatch.finished():
             now = time.monotonic()
             for slot in self._slots:
@@ -222,14 +228,18 @@ class RayPool(WorkerPool):
                 elif self._receive(waiting[ref]) and on_progress:
                     on_progress(*call.progress())
             call.retries = retries + dispatch.retries
-            if self.pids():
-                alone_since = time.monotonic()
-            elif time.monotonic() - alone_since > self._patience_s:
-                why = ray_session.capacity()
-                if self._last_failure:
-                    why += f"; the last one: {self._last_failure}{self._logs}"
-                raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
+            self._check_patience()
         return meanwhile
+
+    def _check_patience(self) -> None:
+        """Raise if there has been no worker for too long."""
+        if self.pids():
+            self._alone_since = time.monotonic()
+        elif time.monotonic() - self._alone_since > self._patience_s:
+            why = ray_session.capacity()
+            if self._last_failure:
+                why += f"; the last one: {self._last_failure}{self._logs}"
+            raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
 
     def _measure(self, call: Call) -> None:
         """Remember how long a metre took."""
@@ -333,7 +343,7 @@ class RayPool(WorkerPool):
             ray_session.leave()
             self._connected = False
         ray_session.restore(self._variables)
-        self._slots = []
+        self._slots, self._here = [], None
         self._closed.set()
         self._thread.join(1.0)
         if self._tickets:
@@ -351,7 +361,7 @@ class RayPool(WorkerPool):
         try:
             import ray  # which takes a second, and so is not done by the caller
 
-            self._ray: Any = ray
+            self._ray = ray
             if ray.is_initialized():
                 raise PoolError("Ray is in use in this process already; close the other pool first")
             if self._leaving:
@@ -367,6 +377,7 @@ class RayPool(WorkerPool):
         except BaseException as error:
             self._failure = error
         finally:
+            self._alone_since = time.monotonic()
             self._booted.set()
         self._closed.wait()
 
@@ -380,7 +391,7 @@ class RayPool(WorkerPool):
     def _wait_for_ray(self) -> None:
         if self._closed.is_set():
             raise PoolError("the pool of workers is closed")
-        if not self._booted.wait(CONNECT_S):
+        if not self._booted.wait(max(self._connect_by - time.monotonic(), 0.0)):
             raise PoolError(f"Ray did not come up within {CONNECT_S:g} s")
         if isinstance(self._failure, PoolError):
             raise self._failure

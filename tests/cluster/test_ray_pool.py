@@ -419,8 +419,7 @@ def test_this_process_works_until_a_worker_is_up_also_within_one_call(tmp_path: 
         assert [int(path.name) for path in tmp_path.iterdir()] == [os.getpid()]
         outcome = pool.evaluate(make_task(), make_recipes(20_000), lambda *done: progress.append(done))
         assert outcome.results.tobytes() == expected(20_000)
-        assert {int(path.name) for path in tmp_path.iterdir()} >= {os.getpid(), *pool.pids()}
-        assert pool.pids()
+        assert {int(path.name) for path in tmp_path.iterdir()} & set(pool.pids())
         assert progress == sorted(progress)
         assert progress[-1] == (20_000, 20_000)
         (tmp_path / str(os.getpid())).unlink()
