@@ -69,6 +69,10 @@ def test_traffic_is_the_champions_the_roads_or_what_is_asked_for(champion, scena
     assert env.cars.simulator.worlds.shape[1] == cars
 
 
+def test_a_champions_traffic_is_its_runs():
+    assert evolve(dataclasses.replace(SMALL, traffic=5, generations=1))[0].traffic == 5
+
+
 def test_environment_and_rollout_drive_alike(champion):
     """What a person sees in the environment is what evolution saw, the wheels (the last input) included."""
     policy = "mlp:8+motion+steering"

@@ -17,8 +17,10 @@ from finished_runs import make_run
 
 from cluster.commands import compare
 from cluster.commands.compare import compare_main
+from cluster.commands.jobs import train_all
 from cluster.comparison import results
 from cluster.comparison.plan import ComparisonFolder, Plan
+from cluster.runs.train import Workers
 from cluster.workers.pool import PoolError
 from gridsim import evolve
 
@@ -91,6 +93,16 @@ def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(
     rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))
     assert len(rows) == 8
     assert {row["velocity_error_percent"] for row in rows} == {"2.5"}
+
+
+def fail(run, reporter):
+    raise PoolError(f"no workers for {run.name}")
+
+
+def test_each_job_goes_on_after_a_run_that_failed(tmp_path):
+    cells, events = Plan(("curved",), ("evolution",), 5, budget="1k").cells(tmp_path), []
+    train_all(cells, Workers(0, None, 0.0), fail, 2, lambda *event: events.append(event[1:]))
+    assert sorted(said for kind, said in events if kind == "failed") == [f"no workers for {c.name}" for c in cells]
 
 
 def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, monkeypatch, capsys):

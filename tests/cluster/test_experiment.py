@@ -8,7 +8,7 @@ import shutil
 import pytest
 from finished_runs import make_run
 
-from cluster.comparison.plan import ComparisonFolder, Plan, limits, open_comparison, read_runs
+from cluster.comparison.plan import UNBOUND, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import LEARNERS
 from cluster.comparison.tables import group
 from evolution.networks.policy import PolicySpec
@@ -96,6 +96,11 @@ def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, tra
     assert specs["evolution"] == specs["two-parents"] == specs["random"]
     if observation == "rays":
         assert {spec.inputs for spec in specs["evolution"]} == {64 if traffic else 33}, plan
+
+
+def test_generations_are_those_asked_for_or_without_bound():
+    for plan, generations in ((Plan(generations=5), 5), (Plan(), UNBOUND)):
+        assert vars(plan.settings("curved", "two-parents", 0))["generations"] == generations
 
 
 @pytest.mark.parametrize(("budget", "every"), [("200k", 20_000), ("1G", 1_000_000)])

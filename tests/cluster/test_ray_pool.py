@@ -23,7 +23,16 @@ import pytest
 import ray
 from commands import wait_until
 from driving import to_bytes
-from test_pool import Answering, collect_drive_task, drive_task, make_collect_task, make_recipes, make_task, never_built
+from test_pool import (
+    Answering,
+    Failing,
+    collect_drive_task,
+    drive_task,
+    make_collect_task,
+    make_recipes,
+    make_task,
+    never_built,
+)
 
 from cluster.workers import ray_pool
 from cluster.workers.pool import PoolError, SerialPool
@@ -443,6 +452,20 @@ def test_a_ray_that_does_not_start_ends_a_run_that_has_begun_without_it(
     pool = RayPool(2, never_built, worker_factory=Answering, patience_s=1.0, begin_here=True)
     with contextlib.closing(pool), pytest.raises(PoolError, match=said):
         wait_until(lambda: not pool.evaluate(make_task(), make_recipes(8)))
+
+
+@pytest.mark.usefixtures("no_pool")
+def test_what_goes_wrong_while_ray_is_being_imported_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_pool, "CONNECT_S", 0.5)
+    monkeypatch.setattr(RayPool, "_boot", lambda pool: pool._closed.wait())
+    with contextlib.closing(RayPool(1, never_built, worker_factory=Failing, begin_here=True)) as pool:
+        with pytest.raises(PoolError, match=r"^a worker failed on parcel \d+ .*: ValueError: not to be had$"):
+            pool.evaluate(make_task(), make_recipes(512))
+        time.sleep(0.5)
+        with pytest.raises(PoolError, match=r"^Ray did not come up within 0.5 s$"):
+            pool.evaluate(make_task(), make_recipes(8))
+    with pytest.raises(PoolError, match=r"^the pool of workers is closed$"):
+        pool.evaluate(make_task(), make_recipes(8))
 
 
 def test_a_pool_needs_workers() -> None:
