@@ -23,7 +23,7 @@ Progress = Callable[[int, int], None]  # (members done, members in all), or epis
 Meanwhile = Callable[[], bool | None]  # called while workers are busy, again and again until it returns a false value
 
 SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
-METRE_S = 3e-5  # seconds that a metre of an episode takes a large network; a small one is thirty times as fast
+METRE_S = 3e-5  # seconds that a metre of an episode may take, until it is measured: a small network takes a thirtieth
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
 PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
 LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
