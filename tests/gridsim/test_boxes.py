@@ -16,7 +16,7 @@ from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.sensing.boxes import cast_boxes, hits_box
+from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
 from gridsim.sensing.rays import fan
 from gridsim.traffic.world import COS, FIELDS, LANE, SIN, SPEED, X, Y
 
@@ -121,6 +121,20 @@ def test_all_contacts_are_found(vehicle):
     assert hits[smaller].all()
     assert larger[hits].all()
     assert (hits & (away > vehicle.length - 1.0)).sum() > 1000
+
+
+@njit
+def _met(k, world, width, height, x, y, cosine, sine):
+    speed = top_speed_near(world, F(10.0), width, height, x, y)
+    hit = hits_box(k, world, F(0.0), F(0.1), width, height, x, y, cosine, sine)
+    return speed, hit, stands_ahead(k, world, width, height, x, y, cosine, sine)
+
+
+@pytest.mark.parametrize(("pose", "other"), [((1023, 60, 0.0), (2, 60)), ((500, 127, math.pi / 2), (500, 2))])
+def test_a_car_is_met_across_both_seams_of_a_map_that_is_not_square(pose, other):
+    world = parked((*other, pose[2]))
+    world[0, SPEED] = 0.25
+    assert _met(K, world, F(1024.0), F(128.0), *directed(np.array([pose], dtype=float))[0]) == (0.25, True, True)
 
 
 # --- Collisions in the simulator -------------------------------------------------------------------------------------

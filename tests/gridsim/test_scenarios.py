@@ -302,6 +302,12 @@ def test_parked_cars_stand_beside_the_lanes():
         u, v = np.abs(away[..., 0] * c + away[..., 1] * s), np.abs(away[..., 1] * c - away[..., 0] * s)
         gap = np.hypot(np.maximum(u - 2.0, 0), np.maximum(v - 0.9, 0)).min(axis=0)
         assert 1.5 <= gap.min() <= gap.max() < 3.0
+        # Their middles are a metre or more inside a bay.
+        lines = m.strips.lines
+        along, away = lines[:, 2:4] - lines[:, :2], wrapped(blocks[:, None, :2] - lines[:, :2], m.sides)
+        share = np.clip((away * along).sum(axis=2) / (along * along).sum(axis=1), 0.0, 1.0)
+        inside = lines[:, 4] - np.linalg.norm(away - share[..., None] * along, axis=2)
+        assert inside.max(axis=1).min() >= 1.0 - 1e-9
         # No two overlap: centres along and across the street.
         apart = np.abs(wrapped(blocks[:, None, :2] - blocks[:, :2], m.sides)).max(axis=2)
         assert apart[~np.eye(len(blocks), dtype=bool)].min() > 4.1
