@@ -43,6 +43,14 @@ def test_a_training_episode_lasts_as_long_as_its_target_takes_at_the_pace_and_so
     assert episode["steps"] * curriculum.period == pytest.approx(seconds, abs=curriculum.period)
 
 
+@pytest.mark.parametrize(("pace", "share"), [(0.5, 0.5), (1.0, 1.0), (2.0, 1.0)])
+def test_a_validation_score_is_the_success_rate_and_less_for_slow_drivers_only(curriculum, pace, share):
+    results = np.zeros((2, 4), dtype=RESULT)
+    results["steps"], results["distance"] = 100, 100 * curriculum.period * pace * CONFIG.champion_pace
+    results["end"] = [[End.SUCCESS] * 4, [End.SUCCESS, End.COLLISION, End.TIME, End.SUCCESS]]
+    assert curriculum.validation_score(results) == pytest.approx([share, share / 2])
+
+
 def test_only_who_crashed_or_stood_still_on_the_way_is_remembered(curriculum):
     ends = [End.COLLISION, End.SUCCESS, End.TIME, End.IDLE, End.COLLISION, End.IDLE, End.SUCCESS, End.TIME]
     steps = [50, 50, 50, 50, 10, 11, 50, 50]  # the fifth crashed at its start
