@@ -46,7 +46,7 @@ from cluster.workers.tickets import abandoned
 
 BIN = Path(sys.executable).parent
 SMALL = (  # and so large that it goes on for some time after Ray is up
-    "--scenario", "curved", "--traffic", "2", "--population", "192", "--generations", "40", "--until", "2",
+    "--scenario", "curved", "--traffic", "2", "--population", "192", "--generations", "30", "--until", "2",
     "--seed", "5",
 )  # fmt: skip
 PATIENCE_S = 10  # after which a silent worker is replaced

@@ -90,14 +90,15 @@ class Inspecting(Worker):
 
 
 class Signing(Answering):
-    """Takes its time, and leaves a file named after its process."""
+    """Leaves a file named after its process, and takes its time in one of them."""
 
-    def __init__(self, folder: Path):
-        self._folder = folder
+    def __init__(self, folder: Path, slow: int):
+        self._folder, self._slow = folder, slow
 
     def answer(self, task, maps, recipes, first, stop):
         (self._folder / str(os.getpid())).touch()
-        time.sleep(0.1)
+        if os.getpid() == self._slow:
+            time.sleep(0.1)
         return super().answer(task, maps, recipes, first, stop)
 
 
@@ -422,7 +423,7 @@ def test_workers_that_cannot_start_are_given_up() -> None:
 
 @pytest.mark.usefixtures("no_pool")
 def test_this_process_works_until_a_worker_is_up_also_within_one_call(tmp_path: Path) -> None:
-    signing, progress = functools.partial(Signing, tmp_path), list[tuple[int, int]]()
+    signing, progress = functools.partial(Signing, tmp_path, os.getpid()), list[tuple[int, int]]()
     with contextlib.closing(RayPool(2, never_built, worker_factory=signing, begin_here=True)) as pool:
         assert pool.evaluate(make_task(), make_recipes(8)).results.tobytes() == expected(8)
         assert [int(path.name) for path in tmp_path.iterdir()] == [os.getpid()]
