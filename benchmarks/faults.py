@@ -326,19 +326,18 @@ class Run:
                 campaign.cluster.mend()
                 flags += ("--address", campaign.cluster.address)
             process = self.start("--workers", "2", "--patience", str(PATIENCE_S), *flags)
-            ends = time.monotonic() + LONG_S
+            ends, fault = time.monotonic() + LONG_S, self.rng.choice(campaign.faults)
             while process.poll() is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(self.rng.uniform(0.2, 5.0))
                 if time.monotonic() > ends:
                     os.killpg(process.pid, signal.SIGKILL)
                     raise Wrong(f"{self.name} hangs; it last said: {self.last_words()}")
-                if process.poll() is None and campaign.happened < faults:
-                    fault = self.rng.choice(campaign.faults)
-                    if fault.startswith("worker") and not _workers(self, process):
-                        continue
+                waits = fault.startswith("worker") and not _workers(self, process)
+                if not waits and process.poll() is None and campaign.happened < faults:
                     campaign.counts[fault] += 1
                     FAULTS[fault](self, process)
+                    fault = self.rng.choice(campaign.faults)
             if process.returncode == 0:
                 break
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
