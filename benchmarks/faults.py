@@ -45,7 +45,7 @@ from two_hosts import Cluster  # beside this file
 from cluster.workers.tickets import abandoned
 
 BIN = Path(sys.executable).parent
-SMALL = (  # and so large that it goes on for some time after Ray is up
+SMALL = (  # but large enough to go on for some time after Ray is up
     "--scenario", "curved", "--traffic", "2", "--population", "192", "--generations", "30", "--until", "2",
     "--seed", "5",
 )  # fmt: skip

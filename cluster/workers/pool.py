@@ -23,7 +23,7 @@ Progress = Callable[[int, int], None]  # (members done, members in all), or epis
 Meanwhile = Callable[[], bool | None]  # called while workers are busy, again and again until it returns a false value
 
 SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
-METRE_S = 3e-5  # seconds that a metre of an episode may take, until it is measured: a small network takes a thirtieth
+METRE_S = 3e-5  # assumed seconds for a metre of an episode, until they are measured; small networks take a thirtieth
 WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
 PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
 LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
@@ -218,7 +218,7 @@ class SerialPool(WorkerPool):
     def work_until(
         self, stop: Callable[[], bool], call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None
     ) -> list[Chunk]:
-        """Do what a call asks for until `stop` returns true. Returns what is left of it."""
+        """Do what a call asks for, until `stop` returns true before a parcel. Returns what is still to be done."""
         maps = [self._build_map(*name) for name in call.task.maps]
         finish(meanwhile)
         parcels = cut(call.task, call.asked, SERIAL_PARTS)
@@ -264,7 +264,7 @@ def cut(
     result depends on it.
 
     Args:
-        metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S, until it is measured.
+        metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
         worth_s: the least seconds of evaluation in a parcel; None for what pays when the coordinator sends each.
     """
     rates = [METRE_S] * len(asked) if metre_s is None else metre_s

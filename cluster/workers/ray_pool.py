@@ -97,7 +97,7 @@ class RayPool(WorkerPool):
         address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
         worker_factory: makes what evaluates; must be importable in the workers.
         patience_s: how long to go on without any worker, or wait for a silent one; default 60 s, on a cluster 300 s.
-        begin_here: whether this process does the work until the first worker is up.
+        begin_here: whether this process evaluates and collects itself until the first worker is up.
 
     Raises PoolError at once if nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
@@ -150,7 +150,8 @@ class RayPool(WorkerPool):
         self._serial += 1
         try:
             if self._here:
-                asked, meanwhile = self._here.work_until(partial(self._is_up, call), call, on_progress, meanwhile), None
+                asked = self._here.work_until(partial(self._worker_is_up, call), call, on_progress, meanwhile)
+                meanwhile = None  # it is done
             if asked:
                 self._wait_for_ray()
                 self._share_out(call, asked, on_progress, meanwhile)
@@ -162,7 +163,7 @@ class RayPool(WorkerPool):
         self._measure(call)
         call.wall_s = time.perf_counter() - started
 
-    def _is_up(self, call: Call) -> bool:
+    def _worker_is_up(self, call: Call) -> bool:
         """Whether a worker is prepared, so that the workers can take over."""
         if not self._booted.is_set() and time.monotonic() < self._connect_by:
             return False
@@ -177,7 +178,7 @@ class RayPool(WorkerPool):
         return self._here is None
 
     def _put(self, call: Call) -> None:
-        """Put a call's task where the workers find it, unless it is there."""
+        """Put a call's task into the object store, unless that is done."""
         call.broadcast_bytes = call.broadcast_bytes or self._shared.put(call.task)
 
     def _share_out(

@@ -212,7 +212,7 @@ def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
 
 
 @pytest.mark.parametrize("parcels", [0, 1, 5, 1000])
-def test_what_is_left_of_a_call_that_is_stopped_is_all_that_was_not_done(parcels: int) -> None:
+def test_a_call_that_is_stopped_returns_all_that_is_still_to_be_done(parcels: int) -> None:
     pool = SerialPool(never_built, Answering)
     task, recipes = make_task(episodes=goals(*[400.0] * 16)), make_recipes(512)
     whole, begun, stops = pool.evaluate(task, recipes, asked=GROUPS), Outcome(task, recipes, GROUPS), [False] * parcels

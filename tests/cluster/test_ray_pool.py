@@ -97,8 +97,7 @@ class Signing(Answering):
 
     def answer(self, task, maps, recipes, first, stop):
         (self._folder / str(os.getpid())).touch()
-        if os.getpid() == self._slow:
-            time.sleep(0.1)
+        time.sleep(0.1 if os.getpid() == self._slow else 0.0)
         return super().answer(task, maps, recipes, first, stop)
 
 
@@ -456,7 +455,7 @@ def test_a_ray_that_does_not_start_ends_a_run_that_has_begun_without_it(
 
 
 @pytest.mark.usefixtures("no_pool")
-def test_what_goes_wrong_while_ray_is_being_imported_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_while_ray_is_being_imported_is_shown_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_pool, "CONNECT_S", 0.5)
     monkeypatch.setattr(RayPool, "_boot", lambda pool: pool._closed.wait())
     with contextlib.closing(RayPool(1, never_built, worker_factory=Failing, begin_here=True)) as pool:
