@@ -69,14 +69,24 @@ def read_run(folder: Path) -> Run:
     champion = load_champion(folder / CHAMPION)
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
-        figures = {name: float((summary | summary["held_out"])[name]) for name in RUN_FIGURES}
+        figures = {name: _figure((summary | summary["held_out"])[name], name) for name in RUN_FIGURES}
         found = summary["scenario"], summary["seed"], summary["champion_sha256"]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
         reason = f"{path} is damaged, or of an earlier version ({type(error).__name__})"
         raise GridSimError(f"{reason}; delete it, and make it again with --resume {folder}") from error
     if found != (settings.scenario, settings.seed, champion.sha256):
         raise GridSimError(f"{folder}: {CONFIG}, {CHAMPION} and {SUMMARY} do not belong together; one was edited")
     return Run(folder, settings, champion.sha256, figures)
+
+
+def _figure(value: object, name: str) -> float:
+    """A figure of summary.json. Raises: TypeError, ValueError or OverflowError if it cannot be that."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError
+    figure = float(value)
+    if not 0.0 <= figure <= (1.0 if name.endswith("_rate") else 1e15):
+        raise ValueError
+    return figure
 
 
 def measured(run: Run) -> Run:

@@ -68,10 +68,13 @@ class Champion:
         """
         spec = PolicySpec.parse(self.policy)
         if isinstance(spec, CnnSpec):
-            if not isinstance(observation, dict):
-                raise ValueError(f"{spec} sees a dictionary of grid and speed, not {type(observation).__name__}")
+            if not isinstance(observation, dict) or not {"grid", "speed"} <= observation.keys():
+                given = list(observation) if isinstance(observation, dict) else type(observation).__name__
+                raise ValueError(f"{spec} sees a dictionary of grid and speed, not {given}")
             speeds = observation["speed"][..., 0] * np.float32(self.sim.vehicle.speed_limit)
             return convnet.act_on(spec, self.genome, observation["grid"], speeds)
+        if isinstance(observation, dict):
+            raise ValueError(f"{spec} sees an array of numbers, not a dictionary of {list(observation)}")
         return act_on(spec, self.genome, np.asarray(observation), self.sim)
 
     def make_env(self, scenario: str | None = None, **options: Any) -> Any:

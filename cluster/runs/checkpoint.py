@@ -56,13 +56,13 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
     Raises CheckpointError, and nothing else, for a file that is missing, truncated, edited, hostile or not GridSim's.
     """
     path = Path(path)
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise CheckpointError(f"{path}: not a file")
     try:
-        if path.exists() and not path.is_file():
-            raise CheckpointError(f"{path}: not a file")
         content = path.read_bytes()
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
-    except OSError as error:
+    except (OSError, ValueError) as error:  # the latter for a name with a null byte
         raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
     if not content.startswith(b"PK\x03\x04"):
         raise CheckpointError(f"{path}: {'not a GridSim file' if content else 'the file is empty'}")

@@ -115,6 +115,8 @@ class RunSettings:
         low, high = speed_interval(self.scenario)
         if self.pace and not low <= self.pace <= high:
             raise GridSimError(f"--pace must be {low:g} to {high:g} on {self.scenario}, not {self.pace:g}")
+        if self.observation not in get_args(Observation):
+            raise GridSimError(f"--observation must be {' or '.join(get_args(Observation))}, not {self.observation}")
         try:
             spec = PolicySpec.parse(self.policy)
         except ValueError as error:
@@ -303,8 +305,9 @@ class DqnSettings(RunSettings):
         self._check_range(0, 1, "discount", "epsilon", "converged")
         self._check_positive("updates", "learning_rate")
         self._check_range(0, MAX_UPDATES, "updates")
-        if not self.batch <= self.replay <= MAX_REPLAY:
-            raise GridSimError(f"--replay must be {self.batch:,} (the batch) to {MAX_REPLAY:,}, not {self.replay:,}")
+        if not max(self.batch, 2) <= self.replay <= MAX_REPLAY:
+            least = f"{max(self.batch, 2):,} (the batch, at least 2)"
+            raise GridSimError(f"--replay must be {least} to {MAX_REPLAY:,}, not {self.replay:,}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise GridSimError(f"--device must be auto, cpu or cuda, not {self.device}")
 

@@ -20,6 +20,7 @@ from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.counter import GOLDEN, mix, uniform
+from gridsim.errors import GridSimError
 from gridsim.jit import leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
@@ -54,12 +55,12 @@ class GridBuffers(NamedTuple):
 def policy_buffers(spec: PolicySpec, config: SimConfig) -> tuple[np.ndarray | None, GridBuffers | None]:
     """Buffers for closing speeds, float32 [rays], and for grids; None for what the policy does not see.
 
-    Raises: ValueError if the sensor has a wrong number of rays.
+    Raises: GridSimError if the sensor has a wrong number of rays.
     """
     if isinstance(spec, CnnSpec):
         return None, GridBuffers(grid_table(config), convnet.scratch(spec), np.empty(CELLS * CELLS, dtype=np.uint8))
     if config.sensors.rays != RAYS:
-        raise ValueError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
+        raise GridSimError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
     return np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None, None
 
 

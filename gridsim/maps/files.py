@@ -232,6 +232,8 @@ def read_free(file: MapFile) -> np.ndarray:
         raise GridSimError(f"{file.image}: more than {MAX_PIXELS:,} pixels; make the picture smaller") from None
     except Exception:
         raise GridSimError(f"{file.image}: not a readable picture ({', '.join(PICTURES)})") from None
+    if picture.mode == "F":
+        raise GridSimError(f"{file.image}: its pixels are real numbers; save it with 8 or 16 bits")
     try:
         free = _free(picture, file)
     except Exception as error:  # decoders raise many types of error

@@ -34,6 +34,7 @@ COLUMNS = (
 """The columns of a recorded drive."""
 MAX_TRAFFIC = 1000  # of a drive that is read
 MAX_BYTES = 1 << 28  # of a file that is read
+MOST = (1e5, 1e5, 100.0, 200.0, math.pi)  # m, m, rad, m/s, rad: of a pose that is read
 PERIOD = EpisodeConfig.control_period  # s, of a control step
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
@@ -153,15 +154,20 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
     actions: list[int] = []
     episodes = [-1]
     roads: set[tuple[str, int, int]] = set()
+    steps = 0  # since the episode's start
     for row in reader:
-        poses.append([float(row[name]) for name in COLUMNS[1:6]])
+        time, *pose = (float(row[name]) for name in COLUMNS[:6])
+        poses.append(pose)
         action, episode, traffic, seed = (int(row[name]) for name in ("action", "episode", "traffic", "map_seed"))
         roads.add((row["scenario"], seed, traffic))
         check_name(row["scenario"])
+        steps = steps + 1 if episode == episodes[-1] else 0
         for fits, text in (
-            (all(abs(value) <= 1e5 for value in poses[-1]), "a number of the pose is out of range"),
+            (None not in row, f"it has more than {len(COLUMNS)} columns"),
+            (all(abs(value) <= most for value, most in zip(pose, MOST, strict=True)), "its pose is no car's"),
             (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
             (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
+            (abs(time - steps * PERIOD) < PERIOD / 2, f"time_s must be {steps * PERIOD:g}; is a row missing?"),
             (0 <= traffic <= MAX_TRAFFIC, f"traffic must be 0 to {MAX_TRAFFIC} cars"),
             (0 <= seed < 1 << 63, "map_seed must be 0 or more, and fit 63 bits"),
             (len(roads) == 1, "traffic, scenario and map_seed must be the same in all rows"),

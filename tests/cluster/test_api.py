@@ -140,6 +140,13 @@ def test_bad_champions_are_refused(champion, tmp_path):
         dataclasses.replace(champion, sim=sim).save(tmp_path / "long.npz")
         with pytest.raises(CheckpointError, match=r"long.npz: not a champion: [^\n]*$"):
             load_champion(tmp_path / "long.npz")
+    more = dataclasses.replace(champion.sim, sensors=dataclasses.replace(champion.sim.sensors, rays=60))
+    with pytest.raises(GridSimError, match="sees 31 rays, the sensor has 60"):
+        evaluate(dataclasses.replace(champion, sim=more))
+    with pytest.raises(ValueError, match="sees an array of numbers, not a dictionary"):
+        champion.act({"grid": np.zeros((1, 80, 80), np.uint8), "speed": np.zeros(1)})
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        load_champion("a\0b")
     with pytest.raises(ValueError, match="unknown scenario"):
         evaluate(champion, "moon")
     with pytest.raises(ValueError, match="1 or more"):
@@ -174,6 +181,8 @@ def test_a_champion_of_the_grid_acts_on_grids_and_speed(seer, monkeypatch):
         np.testing.assert_allclose(seer.act({"grid": stack, "speed": shares}), speeds, rtol=1e-6)
     with pytest.raises(ValueError, match="sees a dictionary of grid and speed, not ndarray"):
         seer.act(stack)
+    with pytest.raises(ValueError, match=r"sees a dictionary of grid and speed, not \['grid'\]"):
+        seer.act({"grid": stack})
     for other in (np.zeros(32, dtype=np.float32), stack.astype(np.float32), stack[0, 0], stack[..., None]):
         with pytest.raises(ValueError, match=r"^cnn:8,8,8@2 sees grids uint8"):
             seer.act({"grid": other, "speed": shares})

@@ -46,6 +46,8 @@ def test_runs_are_compared_from_python(tmp_path):
         ("champion.npz", "PK", "truncated|not a GridSim file"),
         ("summary.json", {"champion_sha256": "0" * 64}, "do not belong together"),
         ("summary.json", {"held_out": {**HELD_OUT, "distance_m": None}}, "damaged"),
+        *(("summary.json", {"held_out": HELD_OUT | {"success_rate": x}}, "damaged") for x in (7, True, "0.5", 10**400)),
+        *(("summary.json", {"car_steps": x}, "damaged") for x in (-3, 1e300, float("nan"))),
         ("summary.json", {"held_out": {}}, "make it again with --resume"),
     ],
 )

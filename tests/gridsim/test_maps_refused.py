@@ -56,6 +56,8 @@ def test_pictures_that_are_no_maps(tmp_path):
     assert "not a valid path" in refused("nul\0l.png")
     assert "picture" in refused(tmp_path / "map.tiff")
     assert "all road" in refused(save(tmp_path / "road.png", np.full((99, 99), 255, np.uint8)))
+    (tmp_path / "real.pgm").write_bytes(b"Pf\n99 99\n-1.0\n" + np.ones((99, 99), np.float32).tobytes())
+    assert "8 or 16 bits" in refused(tmp_path / "real.pgm")
     assert "all wall" in refused(save(tmp_path / "wall.png", np.zeros((99, 99), np.uint8)))
     assert "no room" in refused(save(tmp_path / "path.png", picture(strip(50, 20, 0.0, 1.0), 100.0, 40.0)))
     assert "no room" in refused(save(tmp_path / "yard.png", picture(strip(50, 20, 0.0, 5.0, 6.0), 100.0, 40.0)))
