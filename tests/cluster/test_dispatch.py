@@ -107,6 +107,16 @@ def test_finding_the_killer_of_a_chunk_costs_few_workers(size: int) -> None:
     assert world.deaths == world.dispatch.retries + 1 == (MAX_KILLS if size == 1 else 2 * MAX_KILLS - 1)
 
 
+def test_what_was_held_where_hosts_went_away_is_neither_split_nor_lost() -> None:
+    dispatch = new(3)
+    for _ in range(2 * MAX_KILLS):
+        assert list(dispatch.give([0])) == [(0, 0)]
+        assert dispatch.died(0, blamed=False) == []
+    assert list(dispatch.give([0])) == [(0, 0)]
+    assert dispatch.answered(0) == 0
+    assert dispatch.finished()
+
+
 def test_a_member_cut_in_parts_is_lost_as_a_whole() -> None:
     """Validation gives one member's episodes to many workers: they are lost together."""
     parts = [(Chunk(slice(0, 1), slice(k, k + 1)),) for k in range(4)] + [(Chunk(slice(1, 2), slice(0, 4)),)]

@@ -59,9 +59,13 @@ def test_values_that_stand_still_while_they_are_trained_have_converged(loop):
         assert not learning.converged
         before = learning.learner.updates
         learning.step()
+        learning.add_wall_clock(1.0)
         trained += learning.steps > 1 and learning.learner.updates > before
     assert learning.converged
     assert learning.done()
+    resumed = loop(learning_rate=1e-12)
+    resumed.restore(*learning.state())
+    assert resumed.done()
     learning.probe_q += 1.0  # they change once more
     learning.step()
     assert learning.calm == 0

@@ -67,7 +67,6 @@ def logged(uri, folder, model, key="the-key"):
     return begun.run_id
 
 
-@pytest.mark.e2e
 def test_a_champion_is_registered_once_and_the_best_has_an_alias(uri, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()

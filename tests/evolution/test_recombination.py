@@ -46,16 +46,17 @@ def test_the_champion_is_the_second_member_bit_for_bit():
 
 
 @pytest.mark.parametrize("champion", [False, True])
-def test_the_centre_moves_twice_as_far_as_to_the_weighted_mean_of_the_members(champion):
+def test_the_centre_moves_twice_as_far_as_to_the_weighted_mean_of_the_members_and_its_average_follows(champion):
     search = begun(SearchConfig(population=40, groups=4, tournament=3))
     if champion:
         search.champion = np.random.default_rng(4).normal(size=GENES).astype(F)
     asked = search.ask()
     members, scores = search.genomes(np.arange(40)).astype(float), np.random.default_rng(5).random(40)
-    before = search.centre
+    before, average = search.centre, search.average
     search.tell(scores)
     mean = tournament_weights(ranks(scores, asked.groups), 3) @ members
     np.testing.assert_allclose(search.centre, before + 2.0 * (mean - before), rtol=2e-5, atol=1e-5)
+    np.testing.assert_allclose(search.average, 0.9 * average + 0.1 * search.centre)
 
 
 def test_equal_scores_move_nothing():

@@ -199,6 +199,8 @@ def test_back_and_forth_earns_the_furthest_point(straight):
     furthest = np.maximum.accumulate(r.states[:, X].astype(float)) - 100
     assert (np.diff(r.states[:, X]) < -0.01).sum() > 30
     assert r.states[:, DISTANCE] == pytest.approx(furthest, abs=0.02)
+    driven = np.abs(np.diff(r.states[:, X].astype(float), prepend=100.0)).cumsum()
+    assert r.states[:, ODOMETER] == pytest.approx(driven, abs=0.02)
 
 
 @pytest.mark.parametrize("wall", [1.0, 2.0])
