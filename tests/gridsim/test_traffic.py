@@ -347,14 +347,16 @@ def test_a_car_waits_while_the_crossing_car_has_a_permit(crossing):
 @pytest.mark.parametrize("speed", [4.0, 8.0, 15.0])
 @pytest.mark.parametrize("phase", np.arange(0.0, 15.0, 2.5))
 def test_the_ego_car_that_comes_crosswise_goes_first(crossing, speed, phase):
-    """It is two to three seconds from the junction; a car that would be there as soon lets it pass."""
+    """It is two to three seconds from the junction; a car that would be there as soon lets it pass, but does not wait
+    while it drives away."""
     world = cars_on(crossing, (0, 105.0, 6.0, 1.0))
     car = ego(128.0, 128.0 - 2.0 * speed - phase * speed / 15.0, math.pi / 2, speed)
     while car[Y] < 132.0:
         flow(crossing, D, world, car)
         assert world[0, LANE] == 0
         car[Y] += speed * DT
-    assert {1, 2} <= set(watch(crossing, world, 15)[:, 0, LANE])
+    car[Y] = 150.0
+    assert {1, 2} <= set(watch(crossing, world, 15, car)[:, 0, LANE])
 
 
 def test_a_junction_is_left_free_while_there_is_no_room_behind(crossing):
