@@ -156,6 +156,20 @@ def test_more_workers_than_cores_can_use_are_told_of_and_started(tmp_path, monke
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("before", [signal.default_int_handler, signal.SIG_IGN])
+def test_a_command_takes_ctrl_c_unless_its_shell_ignores_it(before, monkeypatch):
+    seen = []
+    module = Mock(main=lambda: seen.append(signal.getsignal(signal.SIGINT)))
+    monkeypatch.setattr(entry, "import_module", lambda name: module)
+    monkeypatch.setattr("gc.set_threshold", lambda *thresholds: None)
+    signal.signal(signal.SIGINT, before)
+    try:
+        entry._enter("cli", "main")
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    assert seen == [signal.SIG_IGN if before == signal.SIG_IGN else entry.interrupt]
+
+
 def test_an_interrupt_during_an_import_or_within_llvm_comes_after_it(tmp_path, monkeypatch):
     (tmp_path / "interrupted_module.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
     monkeypatch.syspath_prepend(tmp_path)

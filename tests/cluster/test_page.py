@@ -1,4 +1,4 @@
-"""The drive's page: what a browser reads from it is the drive."""
+"""The drive's page: what a browser reads from it is the drive. And its picture."""
 
 import base64
 import json
@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import Browser, needs_chromium
+from matplotlib.collections import LineCollection
 from pictures import small_map
 
+from cluster.report import pictures
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
-from cluster.report.pictures import bounds
 from cluster.runs.champion import load_champion
-from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, X, Y
+from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y
 from gridsim.car.vehicle import act
 from gridsim.config import constants
 from gridsim.maps.map import sample_starts
@@ -77,7 +78,7 @@ def shown_drives():
 
 def test_a_map_file_is_shown_from_side_to_side_of_its_road():
     road_map, _ = small_map([[20.0, 40.0, 44.0, 40.0, 4.0]])  # its ends are round
-    assert bounds(road_map) == pytest.approx([16.0 - 5, 48.0 + 5, 36.0 - 5, 44.0 + 5], abs=0.6)
+    assert pictures.bounds(road_map) == pytest.approx([16.0 - 5, 48.0 + 5, 36.0 - 5, 44.0 + 5], abs=0.6)
 
 
 @pytest.mark.e2e
@@ -113,3 +114,13 @@ def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
         browser.wait_for("document.querySelectorAll('#outputs .chosen').length === 1")
         assert browser.faults == []
         assert {url for url in browser.requests if not url.startswith("data:")} == {path.as_uri()}
+
+
+def test_the_picture_of_a_drive_over_the_edge_has_no_line_across(tmp_path, monkeypatch):
+    figure = pictures._figure(4.0, 3.0)
+    monkeypatch.setattr(pictures, "_figure", lambda *size: figure)
+    states = np.zeros((20, FIELDS), dtype=np.float32)
+    states[:, X], states[:, Y] = np.arange(50, 90, 2) % 64, 32.0
+    pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]])[0], states, tmp_path / "drive.png", "a drive")
+    (lines,) = (each for each in figure[1][0].collections if isinstance(each, LineCollection))
+    assert [np.ptp(line, axis=0).tolist() for line in lines.get_segments()] == [[2.0, 0.0]] * 18
