@@ -151,6 +151,7 @@ def test_a_champion_has_cost_what_was_spent_up_to_its_step(straight, monkeypatch
     own, last = learning.history[learning.champion.step], learning.history[-1]
     for name in ("car_steps", "wall_s"):
         assert straight.summary[f"best_{name}"] == own[name] < last[name]
+    assert straight.summary["car_steps"] == last["car_steps"], "drives that measure the champion do not count"
 
 
 def test_elites_that_are_not_those_of_an_ended_run_are_refused(maps, straight):
