@@ -164,7 +164,7 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
         steps = steps + 1 if episode == episodes[-1] else 0
         for fits, text in (
             (None not in row, f"it has more than {len(COLUMNS)} columns"),
-            (all(abs(value) <= most for value, most in zip(pose, MOST, strict=True)), "its pose is no car's"),
+            (all(abs(value) <= most for value, most in zip(pose, MOST, strict=True)), "its pose is out of range"),
             (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
             (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
             (abs(time - steps * PERIOD) < PERIOD / 2, f"time_s must be {steps * PERIOD:g}; is a row missing?"),

@@ -101,7 +101,7 @@ DAMAGES = {
     "a row left out": (lambda text: text.replace(text.splitlines(True)[2], ""), "time_s must be 0.1; is a row missing"),
     "time not a number": (lambda text: _edit(text, 3, "time_s", "nan"), "line 5: .* time_s must be 0.3"),
     "a column more": (lambda text: _edit(text, 3, "map_seed", "11,0"), "line 5: .* more than 11 columns"),
-    "faster than any car": (lambda text: _edit(text, 3, "speed_mps", "5000"), "line 5: .* pose is no car's"),
+    "faster than any car": (lambda text: _edit(text, 3, "speed_mps", "5000"), "line 5: .* pose is out of range"),
     "action 8": (lambda text: _edit(text, 3, "action", "8"), "action must be 0 to 7"),
     "skipped episode": (lambda text: _edit(text, 3, "episode", "2"), "episode"),
     "a seed of 64 bits": (lambda text: _edit(text, 0, "map_seed", str(1 << 63)), "map_seed must be"),
