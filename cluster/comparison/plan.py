@@ -112,7 +112,7 @@ class Plan:
             raise GridSimError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
         for flag, count in (("population", self.population), ("generations", self.generations)):
             if count < 0:
-                raise GridSimError(f"--{flag} must be 1 or more, not {count}")
+                raise GridSimError(f"--{flag} must be positive, not {count}")
         cells = dataclasses.replace(self, seeds=1).cells(Path())
         if len({cell.name for cell in cells}) != len(cells):
             raise GridSimError("two runs would have the same name: rename a map, or name a value of --grid once")

@@ -305,9 +305,10 @@ class DqnSettings(RunSettings):
         self._check_range(0, 1, "discount", "epsilon", "converged")
         self._check_positive("updates", "learning_rate")
         self._check_range(0, MAX_UPDATES, "updates")
-        if not max(self.batch, 2) <= self.replay <= MAX_REPLAY:
-            least = f"{max(self.batch, 2):,} (the batch, at least 2)"
-            raise GridSimError(f"--replay must be {least} to {MAX_REPLAY:,}, not {self.replay:,}")
+        least = max(self.batch, getattr(PolicySpec.parse(self.policy), "frames", 1) + 1)
+        if not least <= self.replay <= MAX_REPLAY:
+            needed = "a batch, and more than the policy's frames"
+            raise GridSimError(f"--replay must be {least:,} ({needed}) to {MAX_REPLAY:,}, not {self.replay:,}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise GridSimError(f"--device must be auto, cpu or cuda, not {self.device}")
 

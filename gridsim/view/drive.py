@@ -34,7 +34,7 @@ COLUMNS = (
 """The columns of a recorded drive."""
 MAX_TRAFFIC = 1000  # of a drive that is read
 MAX_BYTES = 1 << 28  # of a file that is read
-MOST = (1e5, 1e5, 100.0, 200.0, math.pi)  # m, m, rad, m/s, rad: of a pose that is read
+MOST = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
 PERIOD = EpisodeConfig.control_period  # s, of a control step
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
@@ -167,7 +167,7 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
             (all(abs(value) <= most for value, most in zip(pose, MOST, strict=True)), "its pose is out of range"),
             (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
             (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
-            (abs(time - steps * PERIOD) < PERIOD / 2, f"time_s must be {steps * PERIOD:g}; is a row missing?"),
+            (abs(time - steps * PERIOD) < PERIOD / 2, f"time_s must be {steps * PERIOD:g}; rows missing or doubled?"),
             (0 <= traffic <= MAX_TRAFFIC, f"traffic must be 0 to {MAX_TRAFFIC} cars"),
             (0 <= seed < 1 << 63, "map_seed must be 0 or more, and fit 63 bits"),
             (len(roads) == 1, "traffic, scenario and map_seed must be the same in all rows"),

@@ -145,8 +145,9 @@ def test_bad_champions_are_refused(champion, tmp_path):
         evaluate(dataclasses.replace(champion, sim=more))
     with pytest.raises(ValueError, match="sees an array of numbers, not a dictionary"):
         champion.act({"grid": np.zeros((1, 80, 80), np.uint8), "speed": np.zeros(1)})
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        load_champion("a\0b")
+    for name in ("a\0b", "a" * 300):
+        with pytest.raises(CheckpointError, match="cannot be read"):
+            load_champion(name)
     with pytest.raises(ValueError, match="unknown scenario"):
         evaluate(champion, "moon")
     with pytest.raises(ValueError, match="1 or more"):

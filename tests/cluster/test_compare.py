@@ -37,7 +37,7 @@ def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
         ([tmp_path / "a" / "config.json"], "is not a folder"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
-        (["--learners", "dqn", "--population", -5], "--population must be 1 or more, not -5"),
+        (["--learners", "dqn", "--population", -5], "--population must be positive, not -5"),
         (["--jobs", 0], "--jobs must be 1 to 256, not 0"),
         (["--workers", 0, "--address", "auto"], "--address"),
         (["--resume", "a"], "not a comparison's folder"),

@@ -98,7 +98,7 @@ DAMAGES = {
     "header only": (lambda text: text.splitlines()[0] + "\n", "no rows"),
     "other table": (lambda text: "a,b\n1,2\n", "line 1: not a recorded drive, or incomplete: the first line must be"),
     "not a number": (lambda text: _edit(text, 3, "x_m", "nan"), "line 5: "),
-    "a row left out": (lambda text: text.replace(text.splitlines(True)[2], ""), "time_s must be 0.1; is a row missing"),
+    "a row left out": (lambda text: text.replace(text.splitlines(True)[2], ""), "time_s must be 0.1; rows missing"),
     "time not a number": (lambda text: _edit(text, 3, "time_s", "nan"), "line 5: .* time_s must be 0.3"),
     "a column more": (lambda text: _edit(text, 3, "map_seed", "11,0"), "line 5: .* more than 11 columns"),
     "faster than any car": (lambda text: _edit(text, 3, "speed_mps", "5000"), "line 5: .* pose is out of range"),
