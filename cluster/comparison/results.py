@@ -80,7 +80,7 @@ def read_run(folder: Path) -> Run:
 
 
 def _figure(value: object, name: str) -> float:
-    """A figure of summary.json. Raises: TypeError, ValueError or OverflowError if it cannot be that."""
+    """A figure of summary.json. Raises: TypeError, ValueError or OverflowError if the value is impossible."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError
     figure = float(value)

@@ -109,7 +109,7 @@ def load_champion(path: str | os.PathLike[str]) -> Champion:
     hostile or not a champion.
     """
     path = Path(path)
-    if os.path.isdir(path):  # unlike Path's, also for a name that is too long
+    if os.path.isdir(path):  # path.is_dir() raises for a name that is too long
         _check_finished(path)
         path /= CHAMPION
     arrays, meta = checkpoint.load(path)

@@ -307,7 +307,7 @@ class DqnSettings(RunSettings):
         self._check_range(0, MAX_UPDATES, "updates")
         least = max(self.batch, getattr(PolicySpec.parse(self.policy), "frames", 1) + 1)
         if not least <= self.replay <= MAX_REPLAY:
-            needed = "a batch, and more than the policy's frames"
+            needed = "a batch or more, and more rows than frames"
             raise GridSimError(f"--replay must be {least:,} ({needed}) to {MAX_REPLAY:,}, not {self.replay:,}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise GridSimError(f"--device must be auto, cpu or cuda, not {self.device}")

@@ -34,7 +34,7 @@ COLUMNS = (
 """The columns of a recorded drive."""
 MAX_TRAFFIC = 1000  # of a drive that is read
 MAX_BYTES = 1 << 28  # of a file that is read
-MOST = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
+LIMITS = (262_144.0, 262_144.0, 100.0, 200.0, 3.2)  # m, m, rad, m/s, rad: of a pose that is read
 PERIOD = EpisodeConfig.control_period  # s, of a control step
 FPS = 30  # pictures a second in the window
 STANDING = 0.05  # m/s, below which the down key reverses and no longer brakes
@@ -164,7 +164,7 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
         steps = steps + 1 if episode == episodes[-1] else 0
         for fits, text in (
             (None not in row, f"it has more than {len(COLUMNS)} columns"),
-            (all(abs(value) <= most for value, most in zip(pose, MOST, strict=True)), "its pose is out of range"),
+            (all(abs(value) <= limit for value, limit in zip(pose, LIMITS, strict=True)), "its pose is out of range"),
             (0 <= action < len(Action), f"action must be 0 to {len(Action) - 1}"),
             (episode in (max(episodes[-1], 0), episodes[-1] + 1), "its episode does not follow the one before"),
             (abs(time - steps * PERIOD) < PERIOD / 2, f"time_s must be {steps * PERIOD:g}; rows missing or doubled?"),

@@ -107,7 +107,7 @@ def test_finding_the_killer_of_a_chunk_costs_few_workers(size: int) -> None:
     assert world.deaths == world.dispatch.retries + 1 == (MAX_KILLS if size == 1 else 2 * MAX_KILLS - 1)
 
 
-def test_what_was_held_where_hosts_went_away_is_neither_split_nor_lost() -> None:
+def test_a_parcel_whose_hosts_go_away_is_neither_split_nor_lost() -> None:
     dispatch = new(3)
     for _ in range(2 * MAX_KILLS):
         assert list(dispatch.give([0])) == [(0, 0)]

@@ -1,4 +1,4 @@
-"""The drive's page: what a browser reads from it is the drive. And its picture."""
+"""The page of a drive, from which a browser reads the drive unchanged, and its picture."""
 
 import base64
 import json

@@ -102,7 +102,7 @@ def test_there_are_no_more_groups_than_members_for_them(population, groups):
         (EvolveSettings, {"tournament": 0}, "--tournament must be 1 to"),
         (EvolveSettings, {"sigma": float("nan")}, "--sigma must be above 0"),
         (DqnSettings, {"discount": 1.5}, "--discount must be 0 to 1, not 1.5"),
-        (DqnSettings, {"replay": 10}, r"--replay must be 256 \(a batch, .*\) to 10,000,000, not 10"),
+        (DqnSettings, {"replay": 10}, r"--replay must be 256 \(a batch or more, .*\) to 10,000,000, not 10"),
         (DqnSettings, {"batch": 1, "replay": 1}, r"--replay must be 2 \("),
         (DqnSettings, {"observation": "grid", "policy": "cnn:8,8,8@4", "batch": 1, "replay": 4}, "--replay must be 5 "),
         (EvolveSettings, {"observation": "pixels"}, "--observation must be rays or grid, not pixels"),

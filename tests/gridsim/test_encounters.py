@@ -1,4 +1,4 @@
-"""What a car of the traffic foresees of the ego car, against where both will be; how it reacts is in test_traffic."""
+"""Predicted collisions of traffic with the ego car, in closed form; test_traffic.py tests how the cars react."""
 
 import numpy as np
 import pytest
