@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,6 +42,7 @@ from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, check_w
 from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
 from cluster.tracking.address import check_uri
 from cluster.tracking.tracker import count
+from cluster.workers.ray_session import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import is_map_file, label
@@ -194,12 +194,8 @@ def _learn(kind: type[Flags]) -> int:
         return 0
     saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
     uri = check_uri(flags.tracking_uri, saved)
-    address = flags.address or os.environ.get("RAY_ADDRESS") or None
-    if address and flags.workers:
-        from cluster.workers.ray_session import check_address
-
-        address = check_address(address)
-    warn_of_many_workers(prog, flags.workers, flags.address)
+    address = cluster_address(flags.address) if flags.workers else None
+    warn_of_many_workers(prog, flags.workers, address)
     new_folders = [path for path in (run.path, *run.path.parents) if not path.exists()]
     lock(run.path)
     workers = Workers(flags.workers, address, flags.patience)

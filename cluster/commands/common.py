@@ -82,9 +82,11 @@ class WorkFlags:
     output: str = "runs"
     """Folder in which the run's folder is created."""
     address: Annotated[str, IN_WORDS] = ""
-    """An existing Ray cluster: auto, or host:port. By default RAY_ADDRESS, else Ray is started on this machine."""
+    """An existing Ray cluster: auto, or host:port; local starts Ray on this machine. By default RAY_ADDRESS, else
+    local."""
     patience: Annotated[float, IN_WORDS] = 0.0
-    """Seconds without any worker after which a run stops; it can be resumed. By default 60, on a cluster 300."""
+    """Seconds without any worker after which a run stops; it can be resumed. A worker that does not answer for so long
+    is replaced. By default 300, and 60 for an answer on this machine."""
     tracking_uri: Annotated[str, IN_WORDS] = ""
     """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
     experiment: str = "gridsim"
@@ -208,9 +210,9 @@ def command_path(prog: str) -> str:
     return prog if on_path or not (folder / prog).is_file() else short_path(folder / prog)
 
 
-def warn_of_many_workers(prog: str, workers: int, address: str) -> None:
-    """Warn in one line if this machine has far fewer cores than workers."""
-    if workers > MANY_WORKERS * cores() and not (address or os.environ.get("RAY_ADDRESS")):
+def warn_of_many_workers(prog: str, workers: int, address: str | None) -> None:
+    """Warn in one line if this machine has far fewer cores than workers, and no cluster is used."""
+    if workers > MANY_WORKERS * cores() and not address:
         print(
             f"{prog}: warning: {workers:,} workers on {cores()} cores: more than one per core is no faster, and each "
             "takes some 200 MB",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -46,6 +45,7 @@ from cluster.runs.train import Workers, train
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
+from cluster.workers.ray_session import cluster_address
 from gridsim.errors import GridSimError
 
 PROG = "gridsim-compare"
@@ -101,8 +101,9 @@ def _compare() -> int:
     if flags.jobs > 1 and limits(flags.budget)[1]:
         text = "runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps"
         print(f"{PROG}: warning: {text}", file=sys.stderr)
-    warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), flags.address)
-    return _train_and_compare(console, folder, cells, flags)
+    address = cluster_address(flags.address) if flags.workers else None
+    warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
+    return _train_and_compare(console, folder, cells, flags, Workers(flags.workers, address, flags.patience))
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
@@ -125,9 +126,10 @@ def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonF
     return ComparisonFolder(new_folder(Path(flags.output), flags.name, "comparison"), plan), flags
 
 
-def _train_and_compare(console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags) -> int:
+def _train_and_compare(
+    console: Console, folder: ComparisonFolder, cells: list[Cell], flags: CompareFlags, workers: Workers
+) -> int:
     """Train the unfinished runs; write tables and a picture of all runs."""
-    workers = Workers(flags.workers, flags.address or os.environ.get("RAY_ADDRESS") or None, flags.patience)
     if not all(cell.finished() for cell in cells):
         workers.prepare()
     folder.write()

@@ -93,7 +93,6 @@ class Workers:
         if self.number:
             from cluster.workers import ray_session
 
-            self.address = ray_session.check_address(self.address) if self.address else None
             ray_session.prepare(self.address)
 
     def open(self, maps: Maps) -> WorkerPool:

@@ -15,10 +15,8 @@ What differs from Ray's defaults, and why:
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
-import shutil
 import sys
 import threading
 import time
@@ -26,7 +24,6 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from cluster.workers import ray_session
@@ -47,12 +44,11 @@ from cluster.workers.pool import (
     finish,
     metres,
 )
-from cluster.workers.tickets import Tickets, abandoned
+from cluster.workers.tickets import Tickets
 from cluster.workers.worker import AnyTask, CollectTask, Worker
 
 CONNECT_S = 60.0
-ENDING_S = 5.0  # for the last of Ray's processes to end
-PATIENCE_S, CLUSTER_PATIENCE_S = 60.0, 300.0  # a cluster may be growing
+PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a silent worker of this machine; for all else: a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
@@ -96,8 +92,10 @@ class RayPool(WorkerPool):
         build_map: builds a map, here, once; workers see it in shared memory.
         address: an existing cluster's (`host:port` or `auto`); None for a Ray of our own.
         worker_factory: makes what evaluates; must be importable in the workers.
-        patience_s: how long to go on without any worker, or wait for a silent one; default 60 s, on a cluster 300 s.
-        begin_here: whether this process evaluates and collects itself until the first worker is up.
+        patience_s: how long to go on without any worker, or wait for a silent one; default 300 s, but 60 s for a silent
+            one on this machine.
+        begin_here: whether this process evaluates and collects itself until the first worker is up. So long, no
+            patience ends the run.
 
     Raises PoolError at once if nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
@@ -113,7 +111,8 @@ class RayPool(WorkerPool):
         self._asked = workers
         self._build_map = build_map
         self._factory = worker_factory
-        self._patience_s = patience_s or (PATIENCE_S if address is None else CLUSTER_PATIENCE_S)
+        self._patience_s = patience_s or LONG_PATIENCE_S
+        self._silence_s = patience_s or (PATIENCE_S if address is None else LONG_PATIENCE_S)
         self._here = SerialPool(build_map, worker_factory) if begin_here else None  # until the first worker is up
         self._ray: Any = None  # once it is imported
         self._slots: list[_Slot] = []
@@ -121,12 +120,13 @@ class RayPool(WorkerPool):
         self._serial = 0
         self._last_failure = ""  # of a worker's start
         self._metre_s: dict[_Kind, float] = {}  # what a metre of such a part took the last time
-        self._session: str | None = None  # folder of our own Ray's logs
+        self._folder = ""  # of a Ray of our own
         self._tickets: Tickets | None = None  # only workers of this machine can read them
         self._failure: BaseException | None = None
-        self._leaving = self._connected = self._named = False
+        self._leaving = self._connected = self._named = self._warned = False
         self._booted, self._closed = threading.Event(), threading.Event()
-        self._connect_by = time.monotonic() + CONNECT_S
+        self._alone_since = time.monotonic()
+        self._connect_by = self._alone_since + CONNECT_S
         self._thread = threading.Thread(target=self._boot, name="ray", daemon=True)
         self._thread.start()
 
@@ -137,8 +137,8 @@ class RayPool(WorkerPool):
     @property
     def _logs(self) -> str:
         """Where the logs are, in words, for an error that is raised now. Logs that an error names are kept."""
-        self._named = self._session is not None
-        return f" (logs: {self._session}/logs)" if self._named else ""
+        self._named = os.path.exists(f"{self._folder}/session_latest/logs")
+        return f" (logs: {self._folder}/session_latest/logs)" if self._named else ""
 
     def expect(self, maps: Sequence[Name]) -> None:
         if self._connected:
@@ -165,14 +165,17 @@ class RayPool(WorkerPool):
 
     def _worker_is_up(self, call: Call) -> bool:
         """Whether a worker is prepared, so that the workers can take over."""
-        if not self._booted.is_set() and time.monotonic() < self._connect_by:
+        if not self._warned and time.monotonic() - self._alone_since > self._silence_s:
+            self._warned = True
+            text = f"no worker is up after {self._silence_s:.0f} s; this process goes on alone until one is"
+            call.warnings.append(text)
+        if not self._booted.is_set():
             return False
         self._wait_for_ray()  # raises what went wrong
         self._put(call)
         starting = {slot.hello: slot for slot in self._slots if slot.hello}
         for ref in self._ready(list(starting), 0.0):
             self._greet(starting[ref])
-        self._check_patience()
         if any(slot.pid and not slot.hello for slot in self._slots):
             self._here = None
         return self._here is None
@@ -210,10 +213,11 @@ class RayPool(WorkerPool):
         call, retries = self._call, self._call.retries
         self._alone_since = time.monotonic()
         while not dispatch.finished():
+            self._check_own_ray()
             now = time.monotonic()
             for slot in self._slots:
                 silent_s = now - slot.heard if slot.pid and slot.due else 0.0
-                if silent_s > self._patience_s and not self._ready([slot.due], 0.0):
+                if silent_s > self._silence_s and not self._ready([slot.due], 0.0):
                     silence = f"did not answer for {silent_s:.0f} s"
                     call.warnings.append(f"a worker {silence} (--patience) and is replaced")
                     self._bury(slot, f"it {silence}")
@@ -237,10 +241,18 @@ class RayPool(WorkerPool):
         if self.pids():
             self._alone_since = time.monotonic()
         elif time.monotonic() - self._alone_since > self._patience_s:
-            why = ray_session.capacity()
+            if self.address:
+                why = ray_session.capacity()
+            else:
+                why = f"{self._asked} were started on this machine, which may be busy with other programs"
             if self._last_failure:
                 why += f"; the last one: {self._last_failure}{self._logs}"
             raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
+
+    def _check_own_ray(self) -> None:
+        """Raise if a process of our own Ray has ended: calls to Ray may then hang, and after a minute abort."""
+        if self._folder and (lost := ray_session.lost_processes()):
+            raise PoolError(f"Ray's {lost} on this machine was killed or has crashed{self._logs}")
 
     def _measure(self, call: Call) -> None:
         """Remember how long a metre took."""
@@ -349,13 +361,10 @@ class RayPool(WorkerPool):
         self._thread.join(1.0)
         if self._tickets:
             self._tickets.close()
-            mark, self._tickets = Path(self._tickets.path), None
-            if self._named:
-                mark.unlink(missing_ok=True)
-            ends = time.monotonic() + ENDING_S
-            while mark.exists() and not abandoned(mark) and time.monotonic() < ends:
-                time.sleep(0.01)  # Ray's last processes would create the folder again
-            _remove_abandoned(mark.parents[1])
+            self._tickets = None
+        if self._folder and not self._named:
+            ray_session.remove(self._folder)
+        self._folder = ""
 
     def _boot(self) -> None:
         """Bring up Ray and ask it for the workers; then wait, since Ray's processes die with this thread."""
@@ -364,11 +373,16 @@ class RayPool(WorkerPool):
 
             self._ray = ray
             if ray.is_initialized():
-                raise PoolError("Ray is in use in this process already; close the other pool first")
+                raise PoolError(
+                    "Ray is in use in this process already: call ray.shutdown() first, or evaluate in this process "
+                    "(workers=0)"
+                )
             if self._leaving:
                 return
             if self.address is None:
-                ray_session.start_own(self._asked, self._begin)
+                self._folder = ray_session.own_folder()
+                self._tickets = Tickets(f"{self._folder}/tickets", new=True)
+                ray_session.start_own(self._asked, self._folder)
             else:
                 ray_session.join(self.address)
             self._shared = Shared(ray.put, self._build_map)
@@ -382,13 +396,6 @@ class RayPool(WorkerPool):
             self._booted.set()
         self._closed.wait()
 
-    def _begin(self, session: str) -> int:
-        """Make the queue in Ray's session folder. Ray's processes keep it open, to show that it is in use."""
-        self._session = session
-        self._tickets = Tickets(f"{session}/tickets", new=True)
-        _remove_abandoned(Path(session).parent)
-        return self._tickets.fileno()
-
     def _wait_for_ray(self) -> None:
         if self._closed.is_set():
             raise PoolError("the pool of workers is closed")
@@ -398,7 +405,13 @@ class RayPool(WorkerPool):
             raise self._failure
         if self._failure:
             where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
-            raise PoolError(f"{where}: {ray_session.reason(self._failure)}{self._logs}") from self._failure
+            hint = (
+                f"; its folder {self._folder} needs room, or RAY_TMPDIR has to name one that has"
+                if self._folder
+                else ""
+            )
+            raise PoolError(f"{where}: {ray_session.reason(self._failure)}{self._logs}{hint}") from self._failure
+        self._check_own_ray()
 
     def _start(self, number: int) -> _Slot:
         actor: Any = self._actor_class.remote(self._factory)
@@ -427,17 +440,3 @@ class RayPool(WorkerPool):
             self._last_failure = ""
             slot.heard = time.monotonic()
             slot.hello = None if preparing else slot.actor.prepare.remote(*self._update(slot))
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove from Ray's folder, such as /tmp/ray, the session folders that no process uses any more."""
-    for tickets in filter(abandoned, folder.glob("session_*/tickets")):
-        if tickets.parent.is_symlink():  # session_latest, which another Ray may have replaced by now
-            continue
-        with contextlib.suppress(OSError):  # another run removes it, too
-            for path in set(tickets.parent.iterdir()) - {tickets}:
-                if path.is_dir():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink(missing_ok=True)
-        shutil.rmtree(tickets.parent, ignore_errors=True)  # the queue last: the next run goes on if this is cut short

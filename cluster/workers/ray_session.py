@@ -12,8 +12,13 @@ import json
 import logging
 import os
 import secrets
+import shutil
+import site
 import sys
-from collections.abc import Callable, Iterator
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,12 +45,19 @@ OWN_ENVIRONMENT = {
     "RAY_prestart_worker_first_driver": "0",  # with it, init waits forever if a worker dies as it starts
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
+    "RAY_worker_niceness": "0",  # Ray's 15 would let a busy machine starve the workers until patience ends the run
+    # Ray's name for "use the loopback address, as on a laptop": nobody else can connect, and a network that changes
+    # does not matter. Ray reads it when it is imported, so a process that has had a Ray of its own joins no cluster.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
 }
-# Ray listens on all interfaces and lets in whoever has its token. Ours must not outlive the run in ~/.ray, where it
-# would change what `ray start` does from then on.
+# Ray lets in whoever has its token. Ours must not outlive the run in ~/.ray, where it would change what `ray start`
+# does from then on.
 TOKEN = {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
 MODE = {"RAY_AUTH_MODE": "token"}
-STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses /tmp
+STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses its folder
+LONGEST_SOCKET = 107  # bytes that the path of a Unix socket may have
+SOCKET = "/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store"  # the longest path in Ray's folder
+ENDING_S = 5.0  # for the last of Ray's processes to end
 PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
 ELSEWHERE = ("ActorUnavailableError", "NodeDiedError", "ObjectLostError", "OwnerDiedError", "ObjectFetchTimedOutError")
 HOST_DIED = "its node has died"  # in an error's text
@@ -69,6 +81,32 @@ def check_address(address: str) -> str:
             ) from None
     probe(address)
     return address
+
+
+def cluster_address(given: str) -> str | None:
+    """The `host:port` of the Ray cluster that a user gave by --address, else by RAY_ADDRESS; None for Ray of our own.
+
+    An address for Ray's job server, as Ray's guide sets RAY_ADDRESS to, is left out with a warning.
+    Raises PoolError as `check_address`; the line names RAY_ADDRESS if the address comes from there.
+    """
+    usual = os.environ.get("RAY_ADDRESS", "")
+    by_variable = given in ("", "auto") and usual != ""
+    address = usual if by_variable else given
+    if address in ("", "local"):
+        return None
+    if by_variable and not given and address.startswith(("http://", "https://")):
+        warnings.warn(
+            f"RAY_ADDRESS={address} is where Ray takes jobs, so this run uses this machine alone; to use the cluster, "
+            "submit the command with `ray job submit`, or give --address host:port",
+            stacklevel=2,
+        )
+        return None
+    try:
+        return check_address(address)
+    except PoolError as error:
+        if by_variable:
+            raise PoolError(f"{error} (RAY_ADDRESS says so; unset it, or give --address local)") from None
+        raise
 
 
 def prepare(address: str | None) -> list[str]:
@@ -101,16 +139,35 @@ def restore(variables: list[str]) -> None:
     variables.clear()
 
 
-def start_own(workers: int, begun: Callable[[str], int]) -> None:
-    """Start Ray on this machine with one CPU for each worker.
+def own_folder() -> str:
+    """Make a private folder (0700) for a Ray of our own: in RAY_TMPDIR, else in the temporary folder, else in /tmp.
 
-    Args: `begun` gets Ray's session folder, and returns a file descriptor, which all of Ray's processes inherit.
+    Ray's own choice, /tmp/ray, is open to all users of a machine. Raises PoolError.
     """
+    with contextlib.suppress(FileNotFoundError):  # there is no temporary folder that can be used
+        default = tempfile.gettempdir()
+    chosen = os.environ.get("RAY_TMPDIR")
+    problem = "there is no temporary folder"
+    for base in (chosen,) if chosen else (default, "/tmp"):
+        try:
+            folder = tempfile.mkdtemp(prefix="gs-", dir=os.path.abspath(base))
+        except OSError as error:
+            problem = f"{base}: {error.strerror}"
+            continue
+        if len(os.fsencode(folder + SOCKET)) <= LONGEST_SOCKET:
+            return folder
+        os.rmdir(folder)
+        problem = f"the path of {base} is too long for its sockets"
+    raise PoolError(f"Ray cannot be started: {problem}; set RAY_TMPDIR to a folder with room and a short path")
+
+
+def start_own(workers: int, folder: str) -> None:
+    """Start Ray on this machine with one CPU for each worker, its files in a folder of `own_folder`."""
     import ray
 
     _be_quiet()
     _read_token()
-    with _lean_head(begun):
+    with _lean_head():
         ray.init(
             address="local",  # whatever RAY_ADDRESS says
             num_cpus=workers,
@@ -119,7 +176,41 @@ def start_own(workers: int, begun: Callable[[str], int]) -> None:
             include_dashboard=False,
             log_to_driver=False,
             logging_level=logging.CRITICAL,
+            runtime_env=_own_runtime_env(folder),
+            _temp_dir=folder,
         )
+
+
+def _own_runtime_env(folder: str) -> dict[str, Any]:
+    """Ray's `runtime_env` for workers that import what this process imported, as `runtime_env` explains.
+
+    They are not sent our packages: Numba would compile the kernels of unpacked copies anew.
+    """
+    empty = Path(folder, "empty")
+    empty.mkdir()
+    parents = dict.fromkeys(str(Path(package.__path__[0]).parent) for package in PACKAGES)
+    path = [parent for parent in parents if parent not in site.getsitepackages()]
+    path += filter(None, [os.environ.get("PYTHONPATH")])
+    variables = {"PYTHONPATH": os.pathsep.join(path)} if path else {}
+    if cache := os.environ.get("GRIDSIM_CACHE_DIR"):
+        variables["GRIDSIM_CACHE_DIR"] = os.path.abspath(cache)  # the workers' working folder is another one
+    return {"working_dir": str(empty), "env_vars": variables}
+
+
+def lost_processes() -> str:
+    """Which processes of a Ray of our own have ended by themselves, in words, or "". Calls to Ray may then hang."""
+    with contextlib.suppress(ImportError, AttributeError):
+        node = _private("worker")._global_node
+        return ", ".join(str(kind) for kind, _ in node.dead_processes()) if node else ""
+    return ""
+
+
+def remove(folder: str) -> None:
+    """Remove the folder of a Ray of our own that has been left; its last processes would make it again."""
+    ends = time.monotonic() + ENDING_S
+    while os.path.exists(folder) and time.monotonic() < ends:
+        shutil.rmtree(folder, ignore_errors=True)
+        time.sleep(0.1)
 
 
 def join(address: str) -> None:
@@ -132,14 +223,20 @@ def join(address: str) -> None:
 
     _be_quiet()
     _read_token()
-    ray.init(address=address, runtime_env=runtime_env(), log_to_driver=False, logging_level=logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as empty:
+        ray.init(address=address, runtime_env=runtime_env(empty), log_to_driver=False, logging_level=logging.CRITICAL)
 
 
-def runtime_env() -> dict[str, Any]:
-    """Ray's `runtime_env` of a run's workers, some 200 KB, with the Ray job's modules if the run is such a job."""
+def runtime_env(empty: str) -> dict[str, Any]:
+    """Ray's `runtime_env` of a run's workers, some 200 KB, with the Ray job's files if the run is such a job.
+
+    Args: `empty` is an empty folder. Without a `working_dir`, Ray puts this process's working folder first on its
+    workers' path, where a user's `evolution.py` would be found in place of our package.
+    """
     submitted = json.loads(os.environ.get("RAY_JOB_CONFIG_JSON_ENV_VAR", "{}")).get("runtime_env") or {}
     ours = [str(Path(package.__path__[0])) for package in PACKAGES]
-    return {"py_modules": [*ours, *submitted.get("py_modules", [])], "excludes": ["__pycache__"]}
+    own_folder = {} if "working_dir" in submitted else {"working_dir": empty}
+    return {"py_modules": [*ours, *submitted.get("py_modules", [])], "excludes": ["__pycache__"], **own_folder}
 
 
 def leave() -> None:
@@ -204,31 +301,22 @@ def _be_quiet() -> None:
 
 
 @contextlib.contextmanager
-def _lean_head(begun: Callable[[str], int]) -> Iterator[None]:
+def _lean_head() -> Iterator[None]:
     """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
 
-    `begun` gets its session folder before its processes start, and they inherit what it opens. They get groups of
-    their own: a signal to our whole group would end them half started, and `ray.init` would then wait for a minute. Ray
-    has no settings for these, so meanwhile this replaces private names.
+    Its processes get groups of their own: a signal to our whole group would end them half started, and `ray.init` would
+    then wait for a minute. Ray has no settings for these, so meanwhile this replaces private names.
     """
     with contextlib.ExitStack() as undo:
         with contextlib.suppress(ImportError, AttributeError, TypeError):  # a version of Ray without these names
             node, parameter, services = _private("node").Node, _private("parameter"), _private("services")
             lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
             lean()
-            init_temp, popen = node._init_temp, services.ConsolePopen
-            inherited: list[int] = []
-
-            def make_folder(self: Any, *arguments: Any) -> None:
-                init_temp(self, *arguments)
-                inherited.append(begun(self._session_dir))
-
             group = 0 if sys.platform == "linux" else None  # elsewhere Ray ends its processes by our group
             replaced: list[tuple[Any, str, Any]] = [
-                (node, "_init_temp", make_folder),
                 (node, "start_api_server", _no_api_server),
                 (parameter, "RayParams", lean),
-                (services, "ConsolePopen", partial(popen, pass_fds=inherited, process_group=group)),
+                (services, "ConsolePopen", partial(services.ConsolePopen, process_group=group)),
             ]
             for owner, name, value in replaced:
                 undo.callback(setattr, owner, name, getattr(owner, name))

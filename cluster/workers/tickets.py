@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 
 TICKET = struct.Struct("<HH")  # a task's serial number and a parcel's index; a pipe gives each to one reader, whole
 EMPTY = 1 << 20  # more bytes than a pipe holds
@@ -17,12 +15,10 @@ class Tickets:
     """One process's end of the queue, the pipe at `path`; it is created if `new`."""
 
     def __init__(self, path: str, new: bool = False):
-        self.path, made = path, f"{path}.new" if new else path
+        self.path = path
         if new:
-            os.mkfifo(made)
-        self._pipe = os.open(made, os.O_RDWR | os.O_NONBLOCK)
-        if new:
-            os.rename(made, path)  # only now, so that it is never taken for an abandoned one
+            os.mkfifo(path)
+        self._pipe = os.open(path, os.O_RDWR | os.O_NONBLOCK)
 
     def put(self, serial: int, parcels: int) -> None:
         """Put tickets for the parcels of a task in place of all that are left; as many as there is room for."""
@@ -39,19 +35,6 @@ class Tickets:
                     return
                 yield index
 
-    def fileno(self) -> int:
-        """The pipe's file descriptor."""
-        return self._pipe
-
     def close(self) -> None:
         """Close this process's end; the pipe stays where it is."""
         os.close(self._pipe)
-
-
-def abandoned(path: Path) -> bool:
-    """Whether a queue is there that no process has open any more."""
-    try:
-        os.close(os.open(path, os.O_WRONLY | os.O_NONBLOCK))
-    except OSError as error:
-        return error.errno == errno.ENXIO
-    return False
