@@ -1,9 +1,10 @@
-"""Entry points of the console scripts: --version, and what Ctrl-C and SIGTERM do, also while libraries load."""
+"""Entry points of the console scripts: the environment, --version, and what signals do, also while libraries load."""
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import getpass
 import os
 import signal
 import sys
@@ -12,12 +13,35 @@ import time
 import traceback
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from types import FrameType
 
 STARTED = time.perf_counter()  # when the process started, but for Python's own startup of some 30 ms
 #: MLflow and PyTorch create a million objects that are never freed. With Python's default thresholds, garbage
 #: collection takes a sixth of their import time.
 GC_THRESHOLDS = (200_000, 20, 20)
+#: How a notebook or a user's own settings change what matplotlib draws, and whether it can be imported at all.
+PLOTTING = ("MPLBACKEND", "MATPLOTLIBRC")
+#: File descriptors that were a terminal as the command began.
+TERMINALS = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]
+
+
+def settle_environment() -> None:
+    """Keep what the user's environment has, or lacks, from failing in libraries; to be called before there are threads.
+
+    A process may have no HOME and a user id without a name (OpenShift, HTCondor, systemd). HOME is then a folder that
+    does not exist, as Debian's services have it, so that nothing is written there.
+    """
+    for name in PLOTTING:
+        os.environ.pop(name, None)
+    try:
+        Path.home()
+    except RuntimeError:
+        os.environ["HOME"] = "/nonexistent"
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):
+        os.environ["USER"] = str(os.getuid())
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -27,6 +51,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     wait for it forever. Raised in a function that LLVM calls while it loads a kernel, it ends the process with a
     segmentation fault. In a hook that runs after a fork, Python would only print it.
     """
+    if number == signal.SIGHUP:
+        _leave_terminal()
     callers = [caller.f_code for caller, _ in traceback.walk_stack(frame)]
     files = [caller.co_filename for caller in callers]
     if any(caller.co_name == "_after_fork" for caller in callers):
@@ -35,6 +61,13 @@ def interrupt(number: int, frame: FrameType | None) -> None:
         threading.Timer(0.01, os.kill, (os.getpid(), number)).start()
     else:
         raise KeyboardInterrupt
+
+
+def _leave_terminal() -> None:
+    """If the terminal is gone, write to nowhere: an error of writing would keep the run from being saved and closed."""
+    for descriptor in TERMINALS:
+        if not os.isatty(descriptor):
+            os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)
 
 
 def _enter(module: str, name: str) -> None:
@@ -47,6 +80,9 @@ def _enter(module: str, name: str) -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the shell had it ignored
         signal.signal(signal.SIGINT, interrupt)
     signal.signal(signal.SIGTERM, interrupt)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # else by nohup
+        signal.signal(signal.SIGHUP, interrupt)
+    settle_environment()
     try:
         getattr(import_module(f"cluster.commands.{module}"), name)()
     except KeyboardInterrupt:

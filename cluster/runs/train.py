@@ -142,6 +142,7 @@ def train(
             run, workers.open(maps), maps, uri, experiment, reporter, perf_counter() if started is None else started,
             initial, parent_id, wall_limit_s,
         )  # fmt: skip
+        warming.reap()
         maps.ahead(session.learning.curriculum.map_seeds[:3])
         maps.ahead(VALIDATION_SEEDS, later=True)
         kernels.compile_kernels(settings.policy, settings.traffic, settings.command)
@@ -175,8 +176,8 @@ def train(
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Ignore SIGINT and SIGTERM, which must not cut short saving and closing."""
-    before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM)]
+    """Ignore the signals that stop a run, which must not cut short saving and closing."""
+    before = [(s, signal.signal(s, signal.SIG_IGN)) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     try:
         yield
     finally:

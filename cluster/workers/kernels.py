@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import get_args
 
@@ -56,6 +57,11 @@ class Warming:
         """Wait for what the run needs first. If a process fails, this one compiles its part when it is needed."""
         if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
             self._done.touch()
+
+    def reap(self) -> None:
+        """Have threads wait for the processes, which would else stay as zombies until the run ends."""
+        for process in self.processes:
+            threading.Thread(target=process.wait, name="reaper", daemon=True).start()
 
     def stop(self) -> None:
         """End what still runs."""
