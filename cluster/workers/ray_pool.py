@@ -123,7 +123,8 @@ class RayPool(WorkerPool):
         self._folder = ""  # of a Ray of our own
         self._tickets: Tickets | None = None  # only workers of this machine can read them
         self._failure: BaseException | None = None
-        self._leaving = self._connected = self._named = self._warned = False
+        self._starved = 0  # workers that died for want of memory, without an answer in between
+        self._leaving = self._connected = self._named = self._warned = self._memory_noted = False
         self._booted, self._closed = threading.Event(), threading.Event()
         self._alone_since = time.monotonic()
         self._connect_by = self._alone_since + CONNECT_S
@@ -244,9 +245,10 @@ class RayPool(WorkerPool):
             if self.address:
                 why = ray_session.capacity()
             else:
-                why = f"{self._asked} were started on this machine, which may be busy with other programs"
+                why = f"{self._asked} were started on this machine"
+                why += "" if self._last_failure else " and are not up yet, perhaps because it is busy"
             if self._last_failure:
-                why += f"; the last one: {self._last_failure}{self._logs}"
+                why += f"; the last that ended: {self._last_failure}{self._logs}"
             raise PoolError(f"there has been no worker for {self._patience_s:g} s (--patience): {why}")
 
     def _check_own_ray(self) -> None:
@@ -315,7 +317,9 @@ class RayPool(WorkerPool):
             slot.maps.clear()
             answer = pickle.dumps({})
         except self._ray.exceptions.RayError as error:
+            self._note_memory(error)
             return self._bury(slot, ray_session.reason(error), ray_session.is_to_blame(error))
+        self._starved = 0
         slot.sent.popleft()
         slot.heard = time.monotonic()
         parcel = self._dispatch.answered(slot.number) if serial == self._serial else None  # else of an interrupted call
@@ -332,6 +336,7 @@ class RayPool(WorkerPool):
     def _bury(self, slot: _Slot, reason: str, blamed: bool = True) -> bool:
         """Replace a worker, and have what it held sent again. Returns whether anything is lost."""
         dispatch, call = self._dispatch, self._call
+        self._last_failure = reason
         lost = [chunk for parcel in dispatch.died(slot.number, blamed) for chunk in dispatch.parcels[parcel]]
         for part in lost:
             call.lose(part)
@@ -346,6 +351,20 @@ class RayPool(WorkerPool):
             )
         self._replace(slot)
         return bool(lost)
+
+    def _note_memory(self, error: BaseException) -> None:
+        """Warn once, and give up in the end, if workers die because a machine's memory is full."""
+        used = ray_session.memory_used(error)
+        if not used:
+            return
+        self._starved += 1
+        advice = "close other programs there, or give fewer --workers"
+        if self._starved > max(MAX_DEATHS, MAX_KILLS * self._asked):
+            raise PoolError(f"memory is full ({used}) where workers run, and Ray ends them, again and again; {advice}")
+        if not self._memory_noted:
+            self._memory_noted = True
+            said = f"memory is full ({used}), so Ray ends workers; what they held is done again, which takes longer"
+            self._call.warnings.append(f"{said}; {advice}")
 
     def close(self) -> None:
         self._leaving = True
@@ -427,14 +446,14 @@ class RayPool(WorkerPool):
         try:
             slot.pid = self._ray.get(slot.hello)
         except self._ray.exceptions.RayError as error:
+            self._note_memory(error)
             reason, blamed = ray_session.reason(error), ray_session.is_to_blame(error)
             if preparing:  # it has no parcel yet, and so no member is blamed
                 self._bury(slot, reason, blamed)
                 return
-            if blamed:
-                if ray_session.failed_as_it_began(error) and not self.pids():
-                    raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
-                self._last_failure = reason
+            if blamed and ray_session.failed_as_it_began(error) and not self.pids():
+                raise PoolError(f"no worker can be started: {reason}{self._logs}") from error
+            self._last_failure = reason
             self._replace(slot)
         else:
             self._last_failure = ""

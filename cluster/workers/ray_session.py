@@ -11,6 +11,7 @@ import importlib
 import json
 import logging
 import os
+import re
 import secrets
 import shutil
 import site
@@ -261,8 +262,14 @@ def capacity() -> str:
 
 
 def is_to_blame(error: BaseException) -> bool:
-    """Whether a worker may have died because of its work, and not because its host died or is out of reach."""
-    return type(error).__name__ not in ELSEWHERE and HOST_DIED not in str(error)
+    """Whether a worker may have died because of its work, not for want of memory or because its host is gone."""
+    return type(error).__name__ not in ELSEWHERE and HOST_DIED not in str(error) and not memory_used(error)
+
+
+def memory_used(error: BaseException) -> str:
+    """How much memory was in use (`23.1GB of 23.5GB`), if Ray ended a worker because memory was short, else ""."""
+    used = re.search(r"was ([\d.]+ ?\w+) used / ([\d.]+ ?\w+) limit", str(error))
+    return f"{used[1]} of {used[2]}" if used and type(error).__name__ == "OutOfMemoryError" else ""
 
 
 def failed_as_it_began(error: BaseException) -> bool:
@@ -273,7 +280,9 @@ def failed_as_it_began(error: BaseException) -> bool:
 def reason(error: BaseException) -> str:
     """What matters in Ray's long messages."""
     text = (str(error).strip() or type(error).__name__).splitlines()[-1].strip()
-    if HOST_DIED in str(error):
+    if used := memory_used(error):
+        text = f"Ray ended it because its machine's memory is full ({used})"
+    elif HOST_DIED in str(error):
         text = "its host is gone"
     elif "Worker exit detail: " in text:
         text = text.split("Worker exit detail: ")[1].split(". Some common causes")[0]
