@@ -42,8 +42,6 @@ from pathlib import Path
 import psutil  # type: ignore[import-untyped]
 from two_hosts import Cluster  # beside this file
 
-from cluster.workers.tickets import abandoned
-
 BIN = Path(sys.executable).parent
 SMALL = (  # but large enough to go on for some time after Ray is up
     "--scenario", "curved", "--traffic", "2", "--population", "192", "--generations", "30", "--until", "2",
@@ -243,11 +241,15 @@ class Campaign:
     # ----------------------------------------------------------------------------------------------------- leftovers
 
     def processes(self) -> list[psutil.Process]:
-        """Processes that runs of this campaign have started, and their workers on the cluster."""
+        """Processes that runs of this campaign have started, and their workers on the cluster.
+
+        Ray's agents, whose titles overwrite MARK, are known by their working folder, which is that of the runs.
+        """
         found = []
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error, OSError):
-                if process.environ().get(MARK) == str(self.folder) and process.status() != psutil.STATUS_ZOMBIE:
+                ours = process.environ().get(MARK) == str(self.folder) or Path(process.cwd()) == self.disk
+                if ours and process.status() != psutil.STATUS_ZOMBIE:
                     found.append(process)
         return found + self.workers_on_cluster()
 
@@ -263,20 +265,14 @@ class Campaign:
     def leftovers(self) -> dict[str, int]:
         """What is left when all runs are over."""
         self._wait_for_processes()
-        said = "".join(path.read_text() for path in self.folder.glob("said-*"))
         return {
-            "processes_left": len(self.processes()) + len(self.queues_in_use()),
+            "processes_left": len(self.processes()),
             "shared_memory_left": len(set(os.listdir(SHARED_MEMORY)) - self._shared_memory),
-            "ray_sessions_left": sum(str(path) not in said for path in (self.folder / "ray").glob("**/session_2*")),
         }
-
-    def queues_in_use(self) -> list[Path]:
-        """Queues that a process has open. Ray's agents, whose titles overwrite MARK, outlive a kill by a minute."""
-        return [path for path in (self.folder / "ray").glob("**/tickets") if not abandoned(path)]
 
     def _wait_for_processes(self) -> None:
         ends = time.monotonic() + 90.0
-        while (self.processes() or self.queues_in_use()) and time.monotonic() < ends:
+        while self.processes() and time.monotonic() < ends:
             time.sleep(1.0)
 
 

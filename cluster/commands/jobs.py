@@ -8,9 +8,10 @@ resuming are those of any run. If this process dies, a job cannot send its next 
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
+import multiprocessing.util
 import os
 import signal
+import tempfile
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -28,6 +29,7 @@ from cluster.runs.train import Reporter, Session, Workers
 from cluster.workers import kernels
 from gridsim.errors import GridSimError
 
+LONGEST_FOLDER = 70  # bytes of a temporary folder's path, to which multiprocessing adds up to 32; a socket may have 107
 CLOSING_S = 90.0  # for a run to be saved and closed after a signal; Ray takes most of it
 Kind = Literal["begin", "note", "warning", "done", "failed"]
 OnEvent = Callable[[Cell, Kind, Any], None]
@@ -95,6 +97,7 @@ class _Job:
 
     def __init__(self, workers: Workers, train: Train):
         self.cell: Cell | None = None
+        _shorten_socket_paths()
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(["cluster.commands.forked"])
         self.pipe, there = context.Pipe()
@@ -107,6 +110,15 @@ class _Job:
         self.cell = cells.popleft() if cells else None
         with contextlib.suppress(OSError):  # it has died, which shows at the pipe's end
             self.pipe.send(self.cell)
+
+
+def _shorten_socket_paths() -> None:
+    """Have multiprocessing keep its sockets in /tmp if the temporary folder's path is too long, as Slurm's may be."""
+    usual = tempfile.gettempdir()
+    if len(os.fsencode(usual)) > LONGEST_FOLDER:
+        tempfile.tempdir = "/tmp"
+    multiprocessing.util.get_temp_dir()  # remembers what it is now
+    tempfile.tempdir = usual
 
 
 def _at_once(cells: deque[Cell], workers: Workers, train: Train, number: int, on_event: OnEvent) -> None:

@@ -138,8 +138,9 @@ class RayPool(WorkerPool):
     @property
     def _logs(self) -> str:
         """Where the logs are, in words, for an error that is raised now. Logs that an error names are kept."""
-        self._named = os.path.exists(f"{self._folder}/session_latest/logs")
-        return f" (logs: {self._folder}/session_latest/logs)" if self._named else ""
+        logs = ray_session.logs(self._folder)
+        self._named = bool(logs)
+        return f" (logs: {logs})" if logs else ""
 
     def expect(self, maps: Sequence[Name]) -> None:
         if self._connected:
@@ -423,13 +424,10 @@ class RayPool(WorkerPool):
         if isinstance(self._failure, PoolError):
             raise self._failure
         if self._failure:
-            where = f"could not join the Ray cluster at {self.address}" if self.address else "Ray could not be started"
-            hint = (
-                f"; its folder {self._folder} needs room, or RAY_TMPDIR has to name one that has"
-                if self._folder
-                else ""
-            )
-            raise PoolError(f"{where}: {ray_session.reason(self._failure)}{self._logs}{hint}") from self._failure
+            what, hint = f"could not join the Ray cluster at {self.address}", ""
+            if not self.address:
+                what, hint = "Ray could not be started", "; if its folder has no room, set RAY_TMPDIR to one that has"
+            raise PoolError(f"{what}: {ray_session.reason(self._failure)}{self._logs}{hint}") from self._failure
         self._check_own_ray()
 
     def _start(self, number: int) -> _Slot:

@@ -57,7 +57,8 @@ TOKEN = {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
 MODE = {"RAY_AUTH_MODE": "token"}
 STORE_BYTES = 768 << 20  # of shared memory, taken page by page as it is used; where there is less, Ray uses its folder
 LONGEST_SOCKET = 107  # bytes that the path of a Unix socket may have
-SOCKET = "/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store"  # the longest path in Ray's folder
+FILES = "r"  # Ray's files within our private folder: Ray opens the folder that it is given to all users
+SOCKET = f"/{FILES}/session_2026-01-01_00-00-00_000000_4194304/sockets/plasma_store"  # the longest path
 ENDING_S = 5.0  # for the last of Ray's processes to end
 PACKAGES = (cluster, evolution, gridsim)  # that are sent to a cluster's workers
 ELSEWHERE = ("ActorUnavailableError", "NodeDiedError", "ObjectLostError", "OwnerDiedError", "ObjectFetchTimedOutError")
@@ -178,7 +179,7 @@ def start_own(workers: int, folder: str) -> None:
             log_to_driver=False,
             logging_level=logging.CRITICAL,
             runtime_env=_own_runtime_env(folder),
-            _temp_dir=folder,
+            _temp_dir=f"{folder}/{FILES}",
         )
 
 
@@ -204,6 +205,12 @@ def lost_processes() -> str:
         node = _private("worker")._global_node
         return ", ".join(str(kind) for kind, _ in node.dead_processes()) if node else ""
     return ""
+
+
+def logs(folder: str) -> str:
+    """The folder of the logs of a Ray of our own, or "" if there is none yet."""
+    found = f"{folder}/{FILES}/session_latest/logs"
+    return found if os.path.exists(found) else ""
 
 
 def remove(folder: str) -> None:

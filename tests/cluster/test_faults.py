@@ -55,7 +55,7 @@ def test_what_a_stopped_worker_holds_is_done_by_others(tmp_path: Path, workers: 
 
         if prepared:
             wait_until(all_work, 60)
-        pool._patience_s = 5.0 if prepared else 15.0
+        pool._silence_s = 5.0 if prepared else 15.0
         (tmp_path / "stop").touch()
         outcome = pool.evaluate(make_task(), make_recipes(512))
         assert outcome.results.tobytes() == wanted
@@ -64,7 +64,7 @@ def test_what_a_stopped_worker_holds_is_done_by_others(tmp_path: Path, workers: 
         assert re.fullmatch(r"a worker did not answer for \d+ s \(--patience\) and is replaced", said)
         pid = int(next(tmp_path.glob("stopped-*")).name.split("-")[1])
         assert pid not in pool.pids()
-        pool._patience_s = 60.0
+        pool._silence_s = 60.0
         wait_until(all_work, 60)
     wait_until(lambda: not psutil.pid_exists(pid), 30)
 

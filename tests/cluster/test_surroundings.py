@@ -1,0 +1,94 @@
+"""Where commands are started: terminals that close, users without a name or a home, notebooks; nothing may be lost."""
+
+import fcntl
+import os
+import pty
+import shutil
+import signal
+import subprocess
+import tempfile
+import termios
+from pathlib import Path
+
+import psutil  # type: ignore[import-untyped]
+import pytest
+import tracked
+from commands import BIN, finish, rows, running, same_run, start, wait_until
+
+from cluster.runs.settings import EvolveSettings
+from cluster.workers import kernels
+
+SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", "12", "--seed", "5"]
+REFERENCE = ("gridsim-evolve", *SMALL)
+pytestmark = pytest.mark.e2e
+
+
+@pytest.mark.usefixtures("database")
+@pytest.mark.parametrize("closed", [True, False], ids=["the terminal closes", "SIGHUP to the command alone"])
+def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(closed: bool, reference: Path, tmp_path: Path) -> None:
+    run, (ours, theirs) = tmp_path / "runs/r", pty.openpty()
+    command = [str(BIN / "gridsim-evolve"), *SMALL, "--workers", "0", "--name", "r"]
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+    ) as process:
+        os.close(theirs)
+        wait_until(lambda: len(rows(run)) >= 2)
+        if closed:
+            os.close(ours)
+        else:
+            process.send_signal(signal.SIGHUP)
+        process.wait(60)
+    if not closed:
+        os.close(ours)
+    assert process.returncode == 130
+    (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
+    assert logged.status == "KILLED"
+    assert len(rows(run)) < 12
+    finish("gridsim-evolve", "--workers", "0", "--resume", "runs/r", cwd=tmp_path)
+    assert same_run(run, reference)
+
+
+@pytest.mark.usefixtures("database")
+def test_under_nohup_a_run_goes_on_when_the_terminal_closes(tmp_path: Path) -> None:
+    command = (BIN / "gridsim-evolve", *SMALL, "--workers", "0", "--name", "r")
+    with running("/usr/bin/nohup", *map(str, command), cwd=tmp_path) as process:
+        wait_until(lambda: rows(tmp_path / "runs/r"))
+        process.send_signal(signal.SIGHUP)
+        assert process.wait(60) == 0
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becomes another user")
+def test_neither_a_home_nor_a_users_name_is_needed(reference: Path, empty_database: Path) -> None:
+    """As on OpenShift, with HTCondor, in systemd's units. It keeps root's right to read, as Python may lie in /root."""
+    user = ["/usr/bin/setpriv", "--reuid", "54321", "--regid", "54321", "--clear-groups", "--no-new-privs"]
+    user += ["--inh-caps", "+dac_read_search", "--ambient-caps", "+dac_read_search"]
+    with tempfile.TemporaryDirectory(prefix="t-", dir="/tmp") as folder:
+        shutil.copy(empty_database, folder)
+        subprocess.run(["chown", "-R", "54321", folder], check=True)
+        user += ["/usr/bin/env", "-i", f"PATH={os.environ['PATH']}", f"TMPDIR={folder}"]
+        done = finish(*user, str(BIN / "gridsim-evolve"), "--help", cwd=folder)
+        assert done.stdout.startswith("usage: gridsim-evolve")
+        finish(*user, str(BIN / "gridsim-evolve"), *SMALL, "--workers", "0", "--name", "r", cwd=folder)
+        assert same_run(Path(folder, "runs/r"), reference)
+
+
+@pytest.mark.usefixtures("database")
+def test_no_child_of_a_run_stays_as_a_zombie(tmp_path: Path) -> None:
+    kernels._marker(EvolveSettings(scenario="curved", traffic=2)).unlink(missing_ok=True)
+    with start("gridsim-evolve", *SMALL, "--workers", "0", cwd=tmp_path) as process:
+        children: set[psutil.Process] = set()
+
+        def begun() -> bool:
+            children.update(psutil.Process(process.pid).children())
+            return len(children) >= 2
+
+        wait_until(begun)  # the processes that compile, here from the cache
+        wait_until(lambda: not any(child.is_running() for child in children), 60)
+        assert process.poll() is None, "they are gone while the run goes on"
+        process.kill()
