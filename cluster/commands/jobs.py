@@ -158,6 +158,7 @@ def _compile(cells: Sequence[Cell], on_event: OnEvent) -> None:
     for cell in cells:
         warming = kernels.Warming(cell.settings)
         try:
+            warming.start()
             if warming.processes:
                 on_event(cells[0], "note", "compiling the simulator for runs of this kind, once")
                 warming.wait()

@@ -135,6 +135,7 @@ def train(
     try:
         if workers.address:
             workers.open(maps)  # its hosts start, and compile for themselves
+        warming.start()
         if warming.processes:
             with reporter.compiling():
                 warming.wait()

@@ -41,17 +41,20 @@ class Warming:
 
     def __init__(self, settings: RunSettings):
         self._done = _marker(settings)
-        what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
-        self.processes = [
-            subprocess.Popen(
-                [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what],  # -P: not from this folder
+        self._what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def start(self) -> None:
+        """Start the processes. Whether or not all of them could be started, `stop` ends them."""
+        for part in () if self._done.exists() else ("kernels", "roads"):
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *self._what],  # -P: not from this folder
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 start_new_session=True,  # Ctrl-C does not reach it: `stop` ends it
             )
-            for part in (() if self._done.exists() else ("kernels", "roads"))
-        ]
+            self.processes.append(process)
 
     def wait(self) -> None:
         """Wait for what the run needs first. If a process fails, this one compiles its part when it is needed."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import time
 from pathlib import Path
 
 from cluster.workers.pool import PoolError
 
-PROBE_S = 3.0  # to connect, and for each part of the answer
+PROBE_S = 3.0  # to connect, and to answer
 AUTH_ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -52,9 +53,9 @@ def _ask_for_cluster_id(connection: socket.socket) -> bytes:
     literal = b"".join(bytes([0, len(k)]) + k + bytes([len(v)]) + v for k, v in headers.items())
     message = frame(4, 0, 0) + frame(1, 4, 1, literal) + frame(0, 1, 1, bytes(5))  # settings, headers, an empty message
     connection.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + message)
-    answer = b""
+    answer, ends = b"", time.monotonic() + PROBE_S
     with contextlib.suppress(TimeoutError):
-        while b"grpc-status" not in answer and (part := connection.recv(4096)):
+        while b"grpc-status" not in answer and time.monotonic() < ends and (part := connection.recv(4096)):
             answer += part
     return answer
 
