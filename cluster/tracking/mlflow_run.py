@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from cluster.tracking.address import TrackingError, shown, sqlite_path
 from cluster.tracking.commit import DIRTY, git_commit
+from gridsim.jit import CACHE_FOLDER
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,7 +75,7 @@ def quiet() -> None:
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     # Else PyTorch sets it, later.
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{tempfile.gettempdir()}/torchinductor_{os.getuid()}")
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(CACHE_FOLDER / "torchinductor"))
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         if not logger.handlers:

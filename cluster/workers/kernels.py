@@ -11,6 +11,7 @@ started often.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -55,7 +56,8 @@ class Warming:
     def wait(self) -> None:
         """Wait for what the run needs first. If a process fails, this one compiles its part when it is needed."""
         if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
-            self._done.touch()
+            with contextlib.suppress(OSError):  # a full disk: the next run starts these processes again
+                self._done.touch()
 
     def stop(self) -> None:
         """End what still runs."""
