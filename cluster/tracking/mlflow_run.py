@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from cluster.tracking.address import TrackingError, shown, sqlite_path
 from cluster.tracking.commit import DIRTY, git_commit
-from gridsim.jit import CACHE_FOLDER
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,6 +71,8 @@ def quiet() -> None:
 
     To be called before there are threads, as `ray_session.prepare`.
     """
+    from gridsim.jit import CACHE_FOLDER  # here, because it loads Numba, which takes half a second
+
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     # Else PyTorch sets it, later.

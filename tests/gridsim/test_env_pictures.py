@@ -61,6 +61,8 @@ def test_a_window_that_is_closed_leaves_the_others_open_with_their_own_keys() ->
 
     picture = np.full((24, 32, 3), 7, dtype=np.uint8)
     with contextlib.closing(Window((32, 24))) as first, contextlib.closing(Window((32, 24))) as second:
+        Window((32, 24)).close()
+        first.show(picture, 1000.0)
         one, other = Window._open
         pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_n, window=other))
         pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=one))
