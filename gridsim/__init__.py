@@ -30,6 +30,7 @@ for _id, _scenario in ENVIRONMENTS.items():
 
 def __getattr__(name: str) -> _Any:
     if name in _API:
+        _import_module("gridsim.packages").check_packages()
         return getattr(_import_module(_API_MODULE), name)
     raise AttributeError(f"module 'gridsim' has no attribute {name!r}")
 

@@ -6,21 +6,35 @@ a digest of all sources and library versions: any edit leads to a new folder.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
-import importlib.util
-import os
 import platform
-import tempfile
+import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import UserProvidedCacheLocator
+from numba.core.caching import FunctionCache, UserProvidedCacheLocator
+
+from gridsim.cache import cache_folder
+from gridsim.errors import GridSimError
+from gridsim.packages import package_folder
 
 # Packages that may contain kernels. All their files enter the digest, so that no list of files has to be maintained.
 KERNEL_PACKAGES = ("gridsim", "evolution")
+
+
+def _sources() -> list[Path]:
+    """Folders of the packages that may contain kernels."""
+    own = Path(__file__).parent
+    try:
+        evolution = package_folder("evolution")
+    except GridSimError:  # The simulator also works beside a user's file of that name, with the same kernels.
+        evolution = own.parent / "evolution"
+    return [own] if evolution is None else [own, evolution]
 
 
 def kernel_digest() -> str:
@@ -29,31 +43,14 @@ def kernel_digest() -> str:
     for name in ("numba", "llvmlite", "numpy"):
         digest.update(f"{name}=={version(name)}\n".encode())
     digest.update(platform.python_version().encode())
-    for package in KERNEL_PACKAGES:
-        spec = importlib.util.find_spec(package)
-        for folder in (spec.submodule_search_locations or ()) if spec else ():
-            for path in sorted(Path(folder).rglob("*.py")):
-                digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    for folder in _sources():
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def cache_folder() -> Path:
-    """Folder of the compiled kernels: in the user's cache folder, or a temporary one if that is not writable."""
-    base = os.environ.get("GRIDSIM_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "gridsim" / f"kernels-{kernel_digest()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    except OSError:
-        pass
-    folder = Path(tempfile.gettempdir()) / f"gridsim-{os.getuid()}" / folder.name
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
 CONFIG: Any = numba.config  # Any, because its attributes are set at import time, unknown to type checkers
-CACHE_FOLDER = cache_folder()
+CACHE_FOLDER = cache_folder(f"kernels-{kernel_digest()}")
 FAST_MATH = {"contract", "arcp", "nsz", "reassoc"}
 
 
@@ -69,6 +66,38 @@ class CacheLocator(UserProvidedCacheLocator):
         package = next((above for above in (folder, *folder.parents) if above.name in KERNEL_PACKAGES), folder)
         return folder.relative_to(package.parent).as_posix()
 
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> CacheLocator:
+        """Numba's own also tries to write to the folder; `KernelCache` does without a cache if that fails."""
+        return cls(py_func, py_file)
+
+
+class KernelCache(FunctionCache):
+    """Numba's cache of a kernel, without which a run goes on: damaged files and full disks only cost time."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled kernel, or None if it is not in the cache or its files are damaged, which are then emptied."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # whatever unpickling raises
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save the compiled kernel, or warn once that kernels cannot be saved."""
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # an OSError, or a damaged index that could not be emptied
+            reason = getattr(error, "strerror", None) or str(error)
+            _warn(f"compiled kernels cannot be kept in {CACHE_FOLDER} and are compiled anew each time: {reason}")
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    """Warn, once for each text. Numba resets what Python itself knows about earlier warnings."""
+    warnings.warn(text, stacklevel=3)
+
 
 def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable[..., Any]:
     """`numba.njit` with this project's options: cached in `CACHE_FOLDER`, divisions without a zero check.
@@ -81,7 +110,9 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
     before = CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES
     CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = str(CACHE_FOLDER), f"{__name__}.{CacheLocator.__name__}"
     try:
-        return numba.njit(**{"cache": True, "error_model": "numpy", "fastmath": FAST_MATH, **options})(function)
+        kernel = numba.njit(**{"error_model": "numpy", "fastmath": FAST_MATH, **options})(function)
+        kernel._cache = KernelCache(function)  # as `cache=True` does with Numba's own
+        return kernel
     finally:
         CONFIG.CACHE_DIR, CONFIG.CACHE_LOCATOR_CLASSES = before
 

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -83,7 +84,10 @@ def _enter(module: str, name: str) -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # else by nohup
         signal.signal(signal.SIGHUP, interrupt)
     settle_environment()
+    prog = Path(sys.argv[0]).name
+    warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"  # as `common.main`, also of imports
     try:
+        _check_import(prog)
         getattr(import_module(f"cluster.commands.{module}"), name)()
     except KeyboardInterrupt:
         sys.exit(130)
@@ -96,6 +100,19 @@ def _enter(module: str, name: str) -> None:
         if used := sys.modules.get("multiprocessing.util"):
             used._run_finalizers()  # removes the folder of a socket (`jobs`)
         os._exit(int(ended.code or 0))
+
+
+def _check_import(prog: str) -> None:
+    """Exit with one line if a user's file hides our packages, or no folder can keep compiled kernels."""
+    from gridsim.errors import GridSimError
+    from gridsim.packages import check_packages
+
+    try:
+        check_packages()
+        import gridsim.jit  # noqa: F401
+    except GridSimError as error:
+        print(f"{prog}: error: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 evolve_main = partial(_enter, "cli", "evolve_main")

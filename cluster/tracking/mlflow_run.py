@@ -71,10 +71,12 @@ def quiet() -> None:
 
     To be called before there are threads, as `ray_session.prepare`.
     """
+    from gridsim.jit import CACHE_FOLDER  # here, because it loads Numba, which takes half a second
+
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     # Else PyTorch sets it, later.
-    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{tempfile.gettempdir()}/torchinductor_{os.getuid()}")
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", str(CACHE_FOLDER / "torchinductor"))
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         if not logger.handlers:

@@ -11,6 +11,7 @@ started often.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -59,7 +60,8 @@ class Warming:
     def wait(self) -> None:
         """Wait for what the run needs first. If a process fails, this one compiles its part when it is needed."""
         if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
-            self._done.touch()
+            with contextlib.suppress(OSError):  # a full disk: the next run starts these processes again
+                self._done.touch()
 
     def reap(self) -> None:
         """Have threads wait for the processes, which would else stay as zombies until the run ends."""

@@ -23,7 +23,8 @@ import copy
 import dataclasses
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from numbers import Integral
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard
 
 import gymnasium
 import numpy as np
@@ -48,7 +49,7 @@ from gridsim.view.display import has_display
 if TYPE_CHECKING:
     from gridsim.view.render import Renderer, Window
 
-RENDER_FPS, RENDER_SIZE = 10, (640, 480)  # a picture per control period: real time
+RENDER_SIZE = (640, 480)  # pixels
 
 _U = np.uint64
 _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
@@ -72,7 +73,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
     metadata = {  # noqa: RUF012, Gymnasium's own form
         "render_modes": ["rgb_array", "human"],
-        "render_fps": RENDER_FPS,
+        "render_fps": 1.0 / SimConfig().episode.control_period,  # a picture per control step: real time
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
@@ -132,10 +133,12 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             values = ", ".join(mode.value for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode must be one of {values}, not {autoreset_mode!r}") from None
         self.num_envs = num_envs
-        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode, "render_modes": ["rgb_array"]}
-        if render_mode == "human" or has_display():
-            self.metadata["render_modes"].append("human")
         self.config = config or SimConfig()
+        self.metadata = {
+            "render_modes": ["rgb_array", "human"] if render_mode == "human" or has_display() else ["rgb_array"],
+            "render_fps": 1.0 / self.config.episode.control_period,
+            "autoreset_mode": self.autoreset_mode,
+        }
         traffic = default_traffic(scenario) if traffic is None else traffic
         self.simulator = Simulator(num_envs, self.config, max_steps=max_episode_steps, traffic=traffic)
         self._episodes = Episodes(num_envs, scenario, maps, map_seed, traffic, self.config)
@@ -222,15 +225,17 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _seed(self, seed: int | np.integer | Sequence[int | None] | None, which: np.ndarray) -> None:
         """Seed cars `which`, or let them go on to their next episodes."""
         n, episodes = self.num_envs, self._episodes
-        seeds: Sequence[int | None]
-        if seed is None or isinstance(seed, (int, np.integer)):
-            first = None if seed is None else int(seed)
-            super().reset(seed=first)
-            seeds = [None if first is None else first + i for i in range(n)]
+        seeds: list[int | None]
+        if seed is None:
+            seeds = [None] * n
+        elif _is_seed(seed):
+            seeds = [int(seed) + i for i in range(n)]
+        elif np.iterable(seed) and len(seeds := list(seed)) == n and all(s is None or _is_seed(s) for s in seeds):
+            pass
         else:
-            seeds = seed
-            if len(seeds) != n or not all(s is None or (isinstance(s, (int, np.integer)) and s >= 0) for s in seeds):
-                raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
+            raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
+        if not np.iterable(seed):
+            super().reset(seed=seeds[0])
         if self._seeded:
             episodes.numbers[which] += _U(1)
         else:
@@ -284,10 +289,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             if self._window is None:
                 self._window = Window(RENDER_SIZE)
             if not self._window.closed:
-                self._window.show(self._picture(0), RENDER_FPS)
-                self._window.keys()  # a window whose events are not read is shown as hung
-                if self._window.closed:  # by the user: drive on without it
-                    self._window.close()
+                self._window.show(self._picture(0), self.metadata["render_fps"])
+                self._window.keys()  # a window whose events are not read is shown as hung; a user may close it
 
     def _picture(self, i: int) -> np.ndarray:
         """What car i's world looks like: uint8 [height, width, 3]."""
@@ -339,17 +342,24 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return info | {f"_{name}": everyone for name in info}
 
 
+def _is_seed(seed: Any) -> TypeGuard[int]:
+    """Whether it is a whole number from 0, Python's or NumPy's."""
+    return isinstance(seed, Integral) and int(seed) >= 0
+
+
 class GridSimEnv(gymnasium.Env[Any, Any]):
     """One car, as a `GridSimVectorEnv` of one: the same arguments, spaces, reward and info, no automatic resets."""
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": RENDER_FPS}  # noqa: RUF012, Gymnasium's own form
+    metadata = {  # noqa: RUF012, Gymnasium's own form
+        name: GridSimVectorEnv.metadata[name] for name in ("render_modes", "render_fps")
+    }
 
     def __init__(self, scenario: str = "seamless", **options: Any):
         if "autoreset_mode" in options:
             raise ValueError("autoreset_mode is for vector environments; a single one is reset by its caller")
         self.cars = GridSimVectorEnv(1, scenario=scenario, autoreset_mode=AutoresetMode.DISABLED, **options)
         self.render_mode = self.cars.render_mode
-        self.metadata = {**self.metadata, "render_modes": self.cars.metadata["render_modes"]}
+        self.metadata = {name: self.cars.metadata[name] for name in self.metadata}
         self._spec: EnvSpec | None = None
         self.observation_space = self.cars.single_observation_space
         self.action_space = self.cars.single_action_space
@@ -371,9 +381,13 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
                 simulator.max_steps = asked
         self._spec = spec and dataclasses.replace(spec, max_episode_steps=simulator.max_steps)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | np.integer | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see `GridSimVectorEnv.reset`. Returns: (observation, info)."""
-        super().reset(seed=seed)
+        if seed is not None and not _is_seed(seed):
+            raise ValueError(f"seed must be a whole number from 0, not {seed!r}")
+        super().reset(seed=None if seed is None else int(seed))
         observations, info = self.cars.reset(seed=seed, options=options)
         return row(observations, 0), self._own(info)
 

@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -226,7 +226,9 @@ def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Ma
 
 
 class Window:
-    """A window on a display, with its keys."""
+    """A window on a display, with its keys. A process may have several."""
+
+    _open: ClassVar[dict[Any, Window]] = {}  # by pygame's windows, which events name
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
         """Open it. Raises: NoDisplayError with one line that says what to do."""
@@ -244,41 +246,56 @@ class Window:
             pygame.display.init()
             if not chosen and pygame.display.get_driver() in ("dummy", "offscreen", "evdev"):
                 raise pygame.error("no display")
-            self._screen = pygame.display.set_mode(size)
+            self._window: Any = pygame.Window(caption, size)
         except pygame.error as error:
-            pygame.display.quit()
+            self._quit_unused()
             raise NoDisplayError(
                 f"no window can be opened ({error}): set DISPLAY to a running display, or work without a window"
             ) from error
-        pygame.display.set_caption(caption)
+        self._open[self._window] = self
         self._clock = pygame.time.Clock()
+        self._pressed: set[str] = set()
         self.closed = False
 
     def show(self, image: np.ndarray, fps: float) -> None:
         """Show a picture uint8 [h, w, 3], and wait to keep a rate of `fps`."""
         pygame = self._pygame
         height, width = image.shape[:2]
-        self._screen.blit(pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB"), (0, 0))
-        pygame.display.flip()
+        picture = pygame.image.frombuffer(np.ascontiguousarray(image), (width, height), "RGB")
+        self._window.get_surface().blit(picture, (0, 0))
+        self._window.flip()
         self._clock.tick(fps)
 
     def keys(self) -> tuple[set[str], set[str]]:
         """Names of the keys pressed since the last call, and of those held now or pressed since.
 
-        Names are pygame's: "up", "space", "q", "escape". Also sets `closed` if the window was closed.
+        Names are pygame's: "up", "space", "q", "escape". Also closes the windows that a user has closed.
         """
         pygame = self._pygame
-        pressed: set[str] = set()
-        for event in pygame.event.get():
+        for event in pygame.event.get():  # of all windows
+            window = self._open.get(getattr(event, "window", None))
             if event.type == pygame.QUIT:
-                self.closed = True
-            elif event.type == pygame.KEYDOWN:
-                pressed.add(pygame.key.name(event.key))
+                for each in [*self._open.values()]:
+                    each.close()
+            elif window and event.type == pygame.WINDOWCLOSE:
+                window.close()
+            elif window and event.type == pygame.KEYDOWN:
+                window._pressed.add(pygame.key.name(event.key))
+        if self.closed:
+            return set(), set()
+        pressed, self._pressed = self._pressed, set()
         state = pygame.key.get_pressed()
         watched = {name for name in ("up", "down", "left", "right", "space") if state[pygame.key.key_code(name)]}
         return pressed, pressed | watched
 
     def close(self) -> None:
         """Close it."""
-        self._pygame.display.quit()
+        if self._open.pop(self._window, None):
+            self._window.destroy()
+            self._quit_unused()
         self.closed = True
+
+    def _quit_unused(self) -> None:
+        """Leave the display if no window is open any more."""
+        if not self._open:
+            self._pygame.display.quit()

@@ -162,6 +162,13 @@ def test_seeds_may_be_numpys_numbers(maps: Maps) -> None:
     seeds: Any = [(np.int64(3), 3), (np.uint8(254), 254), ([np.int64(3), 4, 5], [3, 4, 5])]
     for seed, plain in seeds:
         np.testing.assert_array_equal(env.reset(seed=seed)[0], env.reset(seed=plain)[0])
+    single = GridSimEnv(maps=maps["seamless"])
+    np.testing.assert_array_equal(single.reset(seed=np.int64(3))[0], env.reset(seed=3)[0][0])
+    wrong: list[Any] = [-1, np.int64(-1), 3.0, np.float64(3), "3", np.array(3.0)]
+    for seed in wrong:
+        for each in (env, single):
+            with pytest.raises(ValueError, match=r"^seed must be a whole number from 0[^\n]*, not [^\n]*$"):
+                each.reset(seed=seed)
 
 
 # --- observations and rewards

@@ -1,5 +1,6 @@
 """The Gymnasium environments' pictures and films, the maps that they share, and copies of them."""
 
+import contextlib
 import copy
 import pickle
 from pathlib import Path
@@ -12,13 +13,14 @@ import pytest
 from gymnasium.wrappers import RecordVideo
 
 from gridsim.car.vehicle import Action
-from gridsim.config import SensorConfig, SimConfig
+from gridsim.config import EpisodeConfig, SensorConfig, SimConfig
 from gridsim.envs import episodes, observing, simulator
 from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
 from gridsim.maps import map
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
 from gridsim.sensing import grid
+from gridsim.view.render import Window
 
 KERNELS = [simulator._control_all, simulator._place_all, observing._observe, grid.grids]
 KERNELS += [episodes._draw, map._starts_at]
@@ -41,16 +43,36 @@ def test_a_window_shows_what_the_pictures_show_until_it_is_closed(maps: dict[str
     picture: Any = array.render()
     assert picture.dtype == np.uint8
     assert picture.shape == (RENDER_SIZE[1], RENDER_SIZE[0], 3)
-    surface: Any = pygame.display.get_surface()
-    shown = pygame.surfarray.array3d(surface).swapaxes(0, 1)
+    (window,) = Window._open
+    shown = pygame.surfarray.array3d(window.get_surface()).swapaxes(0, 1)
     np.testing.assert_array_equal(shown, picture)
 
     pygame.event.post(pygame.event.Event(pygame.QUIT))
     human.step(Action.ACCELERATE)
-    assert pygame.display.get_surface() is None
+    assert not pygame.display.get_init()
     human.step(Action.ACCELERATE)  # drives on, unseen
     human.close()
     human.close()
+
+
+@pytest.mark.usefixtures("dummy")
+def test_a_window_that_is_closed_leaves_the_others_open_with_their_own_keys() -> None:
+    import pygame
+
+    picture = np.full((24, 32, 3), 7, dtype=np.uint8)
+    with contextlib.closing(Window((32, 24))) as first, contextlib.closing(Window((32, 24))) as second:
+        Window((32, 24)).close()
+        first.show(picture, 1000.0)
+        one, other = Window._open
+        pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_n, window=other))
+        pygame.event.post(pygame.event.Event(pygame.WINDOWCLOSE, window=one))
+        assert first.keys() == (set(), set())
+        assert (first.closed, second.closed) == (True, False)
+        first.close()
+        second.show(picture, 1000.0)
+        np.testing.assert_array_equal(pygame.surfarray.array3d(other.get_surface()).swapaxes(0, 1), picture)
+        assert second.keys() == ({"n"}, {"n"})
+    assert not pygame.display.get_init()
 
 
 def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
@@ -72,6 +94,13 @@ def test_record_video_films_in_real_time(tmp_path: Path) -> None:
         env.step(int(Action.ACCELERATE))
     env.close()
     assert len(list(tmp_path.glob("films/*.mp4"))) == 1
+
+
+def test_pictures_a_second_follow_from_the_control_period() -> None:
+    config = SimConfig(episode=EpisodeConfig(control_period=0.05))
+    for env in (GridSimEnv, GridSimVectorEnv):
+        assert env.metadata["render_fps"] == env(maps=1).metadata["render_fps"] == 10
+        assert env(maps=1, config=config).metadata["render_fps"] == 20
 
 
 # --- maps and copies

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecVideoRecorder
 
 from gridsim.envs import sb3
 from gridsim.envs.env import RENDER_SIZE
@@ -76,10 +76,11 @@ def test_sb3_renders_a_window_and_pictures():
     window = SB3VecEnv("GridSim/Curved-v0", num_envs=2, maps=1, render_mode="human")
     window.reset()
     assert window.render() is window.render("human") is None
-    assert pygame.display.get_surface() is not None
+    assert pygame.display.get_init()
     with pytest.raises(NotImplementedError, match=r"call \.cars\.look"):
         window.env_method("look")
     window.close()
+    assert not pygame.display.get_init()
     pictures = SB3VecEnv("GridSim/Curved-v0", num_envs=2, maps=1, render_mode="rgb_array")
     pictures.reset()
     both = pictures.get_images()
@@ -87,6 +88,17 @@ def test_sb3_renders_a_window_and_pictures():
     shown = pictures.render()
     assert shown is not None
     assert shown.shape == (2 * RENDER_SIZE[1], RENDER_SIZE[0], 3)
+
+
+def test_sb3_films_in_real_time(tmp_path):
+    cars = SB3VecEnv("GridSim/Curved-v0", num_envs=1, maps=1, render_mode="rgb_array")
+    film = VecVideoRecorder(cars, str(tmp_path), lambda step: step == 0, video_length=3)
+    assert film.frames_per_sec == 10
+    film.reset()
+    for _ in range(3):
+        film.step(np.zeros(1, dtype=int))
+    film.close()
+    assert len(list(tmp_path.glob("*.mp4"))) == 1
 
 
 def test_the_modules_example_runs():

@@ -1,0 +1,99 @@
+"""The folder of compiled kernels: one that only its user can write to.
+
+Numba's index of a cache is a pickle. So whoever can write it, or can replace a folder above it, runs code as the user.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import grp
+import os
+import pwd
+import shutil
+import stat
+import tempfile
+import warnings
+from multiprocessing.util import Finalize
+from pathlib import Path
+
+from gridsim.errors import GridSimError
+
+VARIABLE = "GRIDSIM_CACHE_DIR"
+_REMEDY = f"set {VARIABLE} to a folder that only you can write to"
+
+
+def cache_folder(name: str) -> Path:
+    """Folder `name` of compiled kernels, made if missing.
+
+    It is in `GRIDSIM_CACHE_DIR`, `XDG_CACHE_HOME` or `~/.cache`; else in the temporary folder; else, with a warning, in
+    a new folder for this process and its children, which is removed when the process ends.
+    Raises: GridSimError with one line if there is none that only the user can write to.
+    """
+    named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME")
+    problems: list[str] = []
+    for place in (_in_users_cache, _in_temporary, _in_private):
+        try:
+            parent = place()
+            folder = _closed(parent / name)
+        except (OSError, RuntimeError) as error:  # RuntimeError: no home folder, or links in a circle
+            where, reason = getattr(error, "filename", None), getattr(error, "strerror", None) or str(error)
+            problems.append(f"{where}: {reason}" if where else reason)
+            continue
+        text = ""
+        if place is _in_private:
+            text = f"kernels are compiled anew each time ({'; '.join(problems)}); {_REMEDY}"
+        elif problems and named:
+            text = f"compiled kernels are kept in {parent.parent} ({problems[0]}); {_REMEDY}"
+        if text:
+            os.environ[VARIABLE] = str(parent.parent)  # child processes use it without another warning
+            warnings.warn(text, stacklevel=2)
+        return folder
+    raise GridSimError(f"no folder can keep compiled kernels ({'; '.join(problems)}); {_REMEDY}")
+
+
+def _in_users_cache() -> Path:
+    named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(named, "gridsim").resolve()
+
+
+def _in_temporary() -> Path:
+    return Path(tempfile.gettempdir()).resolve() / f"gridsim-{os.geteuid()}" / "gridsim"
+
+
+def _in_private() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="gridsim-kernels-")).resolve()
+    # Only this process runs it, not its forks; and commands run it, too, which skip `atexit` (`entry`).
+    Finalize(None, shutil.rmtree, [folder], {"ignore_errors": True}, exitpriority=0)
+    return folder / "gridsim"
+
+
+def _closed(folder: Path) -> Path:
+    """A folder, made if missing. Raises: OSError if it is a link, or others may change what is in it."""
+    user = os.geteuid()
+    trusted = {user, 0, os.stat("/").st_uid}  # in a container, another user may stand for root
+    for path in (*reversed(folder.parents), folder):  # from the top, so that nothing is made where others lead to
+        if not os.path.lexists(path):
+            with contextlib.suppress(FileExistsError):
+                path.mkdir(mode=0o700)
+        info = path.lstat()
+        writable = info.st_mode & stat.S_IWOTH or (info.st_mode & stat.S_IWGRP and not _is_own_group(info.st_gid))
+        sticky = info.st_mode & stat.S_ISVTX  # as /tmp: others can add to it, but not replace what is there
+        if not stat.S_ISDIR(info.st_mode):
+            raise NotADirectoryError(errno.ENOTDIR, "it is a link or a file", str(path))
+        if info.st_uid not in (trusted if path != folder else {user}):
+            raise PermissionError(errno.EPERM, "it belongs to another user", str(path))
+        if writable and (path == folder or not sticky):
+            raise PermissionError(errno.EPERM, "other users can write to it", str(path))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, "it cannot be written", str(folder))
+    return folder
+
+
+def _is_own_group(group: int) -> bool:
+    """Whether a group has the user's name and no other members, as on systems that give each user a group."""
+    try:
+        user, found = pwd.getpwuid(os.geteuid()), grp.getgrgid(group)
+    except KeyError:
+        return False
+    return user.pw_gid == group and user.pw_name == found.gr_name and {*found.gr_mem} <= {user.pw_name}

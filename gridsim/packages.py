@@ -1,0 +1,33 @@
+"""GridSim's other packages, whose names are plain words: a user's file of such a name may hide them."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from gridsim.errors import GridSimError
+
+#: A file in each package, by which it is told from a user's file or folder of the same name.
+_FILES = {"cluster": "api.py", "evolution": "episodes/rollout.py"}
+
+
+def package_folder(name: str) -> Path | None:
+    """The folder of GridSim's package `cluster` or `evolution`, which is not imported; None where there is none.
+
+    Raises: GridSimError with one line that names what hides it.
+    """
+    spec = find_spec(name)
+    if spec is None:
+        return None
+    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    for folder in folders:
+        if (folder / _FILES[name]).is_file():
+            return folder
+    hiding = Path(spec.origin) if spec.origin and not folders else folders[0]
+    raise GridSimError(f"{hiding} hides GridSim's package {name}: rename it, or move it to another folder")
+
+
+def check_packages() -> None:
+    """Raise GridSimError, one line, if a user's file or folder hides one of GridSim's packages."""
+    for name in _FILES:
+        package_folder(name)
