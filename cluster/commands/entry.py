@@ -38,6 +38,8 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _enter(module: str, name: str) -> None:
+    for variable in ("MPLBACKEND", "MATPLOTLIBRC"):
+        os.environ.pop(variable, None)
     gc.set_threshold(*GC_THRESHOLDS)
     if "--version" in sys.argv[1:]:
         from importlib.metadata import version  # which takes longer than all else until Ctrl-C is handled
