@@ -1,5 +1,7 @@
 """The pictures that runs leave are the same whatever the user's Matplotlib is set to."""
 
+from typing import Any
+
 import matplotlib
 import numpy as np
 import pytest
@@ -38,7 +40,7 @@ def test_pictures_do_not_depend_on_settings_of_matplotlib(tmp_path):
 
     usual = drawn()
     assert len(usual) == 4
-    odd = {"text.usetex": True, "image.origin": "lower", "savefig.bbox": "tight", "savefig.format": "pdf"}
-    with matplotlib.rc_context({**odd, "figure.facecolor": "black", "axes.grid": True, "lines.linewidth": 9.0}):
+    odd: dict[Any, Any] = {"text.usetex": True, "image.origin": "lower", "lines.linewidth": 9.0, "axes.grid": True}
+    with matplotlib.rc_context({**odd, "savefig.bbox": "tight", "savefig.format": "pdf", "figure.facecolor": "black"}):
         assert drawn() == usual
         assert matplotlib.rcParams["lines.linewidth"] == 9.0, "the user's stay for the user"
