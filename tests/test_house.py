@@ -1,9 +1,13 @@
 """The house rules: who may import whom, what sits behind one file, how large a file and a folder may be."""
 
 import ast
+import re
+import sys
+import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -80,6 +84,17 @@ def test_no_files_import_each_other_in_a_circle(root: Path) -> None:
         asked = {other for other, _, when in imports(tree) if when != "for types"}
         found[name] = (asked & names.keys()) - {name}
     TopologicalSorter(found).prepare()  # raises CycleError, which names them
+
+
+def test_every_package_that_is_imported_is_declared(root: Path) -> None:
+    """Stable-Baselines3, which `gridsim.envs.sb3` adapts to, is the user's own."""
+    project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {re.split(r"[^\w.-]", line)[0].replace("_", "-") for line in project["dependencies"]}
+    trees = [ast.parse(f.read_text(encoding="utf-8")) for package in RANK for f in (root / package).rglob("*.py")]
+    tops = {name.partition(".")[0] for tree in trees for name, _, _ in imports(tree)} - sys.stdlib_module_names
+    projects = packages_distributions()
+    found = {top: {name.replace("_", "-").lower() for name in projects.get(top, ())} for top in tops - set(RANK)}
+    assert {top for top, names in found.items() if not names & declared} == {"stable_baselines3"}
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from cluster.commands.common import (
     command_path,
     fail,
     main,
+    new_console,
     parse,
     select,
     short_path,
@@ -37,7 +38,7 @@ from cluster.comparison.results import series
 from cluster.report.pictures import errors_table, held_out_table
 from cluster.runs.champion import evaluate, load_champion
 from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
-from cluster.runs.run import RunFolder, is_finished, lock, new_run, open_run, read_config
+from cluster.runs.run import RunFolder, as_argument, is_finished, lock, new_run, open_run, read_config
 from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
 from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
 from cluster.tracking.address import check_uri
@@ -139,7 +140,8 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
             settings, init = read_config(Path(config))
         if settings.command != prog:
             flag, path = ("--resume", resume) if resume else ("--config", config)
-            raise GridSimError(f"{path} belongs to another learner; use {settings.command} {flag} {path}")
+            again = f"{settings.command} {flag} {as_argument(Path(path))}"
+            raise GridSimError(f"{path} belongs to another learner; use {again}")
         base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
             base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
@@ -178,7 +180,7 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
 
 def _learn(kind: type[Flags]) -> int:
     prog, step = kind.command, kind.step_name
-    console = Console()
+    console = new_console()
     flags, run = _prepare(kind, sys.argv[1:])
     if run.saved and is_finished(run):
         sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
@@ -212,7 +214,7 @@ def _learn(kind: type[Flags]) -> int:
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         code, message = FAILED, str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # if resumed, it would fail again
-            hint = f"repeat it with: {command_path(prog)} --config {folder}/config.json --learning-rate ..."
+            hint = f"repeat it with: {command_path(prog)} --config {short_path(run.path / CONFIG)} --learning-rate ..."
     finally:
         with undisturbed():
             workers.close()
@@ -269,9 +271,9 @@ def _evaluate() -> int:
         return 0
     title = f"{flags.champion} on {label(road)}" + (f", {traffic} cars" if traffic else "")
     title += "" if is_map_file(road) else f", maps from seed {flags.seed:,}"
-    Console().print(held_out_table(title, figures))
+    new_console().print(held_out_table(title, figures))
     if missed is not None:
-        Console().print(errors_table("Errors against the reference driver", missed))
+        new_console().print(errors_table("Errors against the reference driver", missed))
     return 0
 
 

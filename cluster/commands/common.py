@@ -21,7 +21,11 @@ from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from docstring_parser import attrdoc
+from rich.console import Console
 
+from cluster.cores import cores
+from cluster.runs.checkpoint import WriteError
+from cluster.runs.run import as_argument
 from cluster.runs.settings import IN_WORDS
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED
@@ -36,7 +40,8 @@ PLAIN = {
     r"Missing from \S+: (\S+) ([^()]*) \(required\)": r"\1 is missing: \2",
 }
 
-# tyro wraps a field's docstring as one paragraph only if its lines are not indented.
+# tyro wraps a field's docstring as one paragraph only if its lines are not indented. It has no setting for this, and no
+# other part of a command reads docstrings.
 _constant = attrdoc.ast_get_constant_value
 attrdoc.ast_get_constant_value = lambda node: (
     " ".join(value.split()) if isinstance(value := _constant(node), str) else value
@@ -66,11 +71,6 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
         is_instance=lambda x: isinstance(x, int),
         str_from_instance=lambda x: [str(x)],
     )
-
-
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
@@ -192,15 +192,21 @@ def select(kind: type[T], flags: Any) -> T:
 
 def fail(prog: str, message: str, hint: str = "", code: int = WRONG_USE) -> NoReturn:
     """Exit with one clear line, and perhaps a second one that says what to do."""
-    line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: command_path(name[0]), " ".join(message.split()))
+    line = " ".join(part.strip() for part in message.splitlines())
+    line = re.sub(r"(?<![\w./-])gridsim-[a-z]+(?= --)", lambda name: command_path(name[0]), line)
     print(f"{prog}: error: {line}", *([hint] if hint else []), sep="\n", file=sys.stderr, flush=True)
     raise SystemExit(code)
 
 
+def new_console(stderr: bool = False) -> Console:
+    """A console that prints names as they are: brackets and colons in them mean nothing."""
+    return Console(stderr=stderr, markup=False, emoji=False)
+
+
 def short_path(path: Path) -> str:
-    """A path as the user would type it: relative to the working directory if it is inside."""
+    """A path as the user would type it in a shell: relative to the working directory if it is inside."""
     absolute, here = path.resolve(), Path.cwd()
-    return str(absolute.relative_to(here) if absolute.is_relative_to(here) else path)
+    return as_argument(absolute.relative_to(here) if absolute.is_relative_to(here) else path)
 
 
 def command_path(prog: str) -> str:
@@ -226,10 +232,18 @@ def main(prog: str, body: Callable[[], int], hints: Mapping[type[GridSimError], 
     Errors for the user are shown in one line, followed by the hint for their type, if any; warnings in one line.
     """
     warnings.formatwarning = lambda message, *_: f"{prog}: warning: {message}\n"
+    for stream in (sys.stdout, sys.stderr):  # a path that the terminal's encoding lacks is no error
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="surrogateescape" if stream.encoding.lower() == "utf-8" else "backslashreplace")
     try:
         sys.exit(body())
     except KeyboardInterrupt:  # before there was anything to save, or a second one
         print(f"{prog}: stopped", file=sys.stderr)
         sys.exit(INTERRUPTED)
     except GridSimError as error:
-        fail(prog, str(error), (hints or {}).get(type(error), ""))
+        code = FAILED if isinstance(error, WriteError) else WRONG_USE
+        fail(prog, str(error), (hints or {}).get(type(error), ""), code)
+    except OSError as error:  # of a path that was only looked at: its name is too long, its folder closed to the user
+        if error.filename is None:
+            raise
+        fail(prog, f"{error.filename}: {error.strerror}")

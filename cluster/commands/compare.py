@@ -16,6 +16,7 @@ import tyro
 from rich.box import MINIMAL
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from cluster.commands.common import (
     FAILED,
@@ -26,6 +27,7 @@ from cluster.commands.common import (
     command_path,
     fail,
     main,
+    new_console,
     parse,
     select,
     short_path,
@@ -89,7 +91,7 @@ def _compare() -> int:
     flags = parse(CompareFlags, PROG, arguments)
     if flags.quick and not flags.resume:
         flags = parse(CompareFlags, PROG, arguments, QUICK)
-    console = Console()
+    console = new_console()
     if flags.runs:
         return _compare_finished(console, flags)
     folder, flags = _prepare(arguments, flags)
@@ -233,7 +235,7 @@ def _compare_finished(console: Console, flags: CompareFlags) -> int:
     results = Results(new_folder(Path(flags.output), flags.name, "comparison"))
     with console.status("measuring errors") as shown:
         for k, run in enumerate(runs):
-            shown.update(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}")
+            shown.update(Text(f"measuring errors, {k + 1} of {len(runs)}: {run.folder.name}"))
             results.runs.append(measured(run))
         shown.update("writing tables and the picture")
         results.path.mkdir(parents=True)

@@ -148,6 +148,7 @@ def _at_once(cells: deque[Cell], workers: Workers, train: Train, number: int, on
     finally:
         for job in jobs:
             job.process.terminate()
+            job.pipe.close()  # ends a job that ignored the signal while it closed its run, and waits for the next one
         for job in jobs:
             job.process.join(CLOSING_S)
             job.process.kill()

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from cluster.commands.common import new_console
 from cluster.runs.train import Reporter, Session
 from cluster.training.trainer import Learning
 
@@ -64,7 +65,7 @@ class Progress(Line, Reporter):
         return self.console.status(text)
 
     def stopping(self) -> None:
-        Console(stderr=True).print("stopping; a moment ...", style="dim")
+        new_console(stderr=True).print("stopping; a moment ...", style="dim")
 
     def learning(self, session: Session) -> Self:
         self._learning = session.learning

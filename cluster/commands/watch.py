@@ -17,11 +17,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.progress import track
 
-from cluster.commands.common import FAILED, RoadFlags, command_path, fail, main, parse
-from cluster.report.film import CODING, Recording, VideoError, frames, other_cars, picture, record, write_video
+from cluster.commands.common import RoadFlags, command_path, main, new_console, parse, short_path
+from cluster.report.film import CODING, Recording, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
 from cluster.runs.champion import Champion, UnfinishedError, load_champion
 from cluster.runs.checkpoint import CHAMPION, CheckpointError
@@ -209,7 +208,7 @@ def _name(road: Map) -> str:
 
 
 def _is_recording(flags: WatchFlags) -> bool:
-    return flags.source.lower().endswith(".csv")
+    return flags.source.lower().endswith(".csv") and not Path(flags.source).is_dir()
 
 
 def _recorded(flags: WatchFlags) -> Iterator[tuple[Recording, str]]:
@@ -263,14 +262,11 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
     total = max(1, round(seconds * fps))
     renderer = Renderer(drives[0][0].scenario, size)
     pictures = itertools.chain.from_iterable(frames(renderer, drive, fps, title) for drive, title in drives)
-    console = Console()
+    console = new_console()
     shown = track(
         itertools.islice(pictures, total), f"filming {seconds:.0f} s of driving", total, console=console, transient=True
     )
-    try:
-        count = write_video(output, shown, size, fps)
-    except VideoError as error:
-        fail(WATCH, str(error), code=FAILED)
+    count = write_video(output, shown, size, fps)
     end = drives[0][0].end
     how = "" if end == End.RUNNING else f", to its end: {end.name.lower()}"
     size_mb = output.stat().st_size / 1e6
@@ -311,8 +307,9 @@ def _drive() -> int:
             print(f"drove {done['seconds']:.1f} s; the longest of {done['episodes']}: {done['distance_m']:,.0f} m")
         finally:  # also if the drive is interrupted
             if recorder is not None:
-                recorder.close()
-                print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {recorder.path}")
+                with contextlib.suppress(OSError):  # the error of a row that could not be written says more
+                    recorder.close()
+                print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {short_path(recorder.path)}")
     return 0
 
 

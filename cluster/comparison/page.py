@@ -42,7 +42,7 @@ def page(folder: Path, groups: Sequence[Group], plan: Plan | None, picture: Path
             runs.append([escape(group.road), escape(group.name), _link(folder, run), f"{run.settings.seed}", *figures])
     parts += ["<h2>Runs, with their champions' drives</h2>", _table(["road", "learner", "run", "seed", *columns], runs)]
     top = f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title><style>\n{STYLE}\n</style>'
-    return "\n".join([top, *parts, ""]).encode()
+    return "\n".join([top, *parts, ""]).encode(errors="surrogateescape")
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -54,4 +54,5 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _link(folder: Path, run: Run) -> str:
     """A run's name, linked to its drive if there is one."""
     name, drive = escape(run.folder.resolve().name), run.folder / PAGE
-    return f'<a href="{escape(quote(os.path.relpath(drive, folder)))}">{name}</a>' if drive.is_file() else name
+    path = quote(os.fsencode(os.path.relpath(drive, folder)))
+    return f'<a href="{escape(path)}">{name}</a>' if drive.is_file() else name

@@ -11,7 +11,6 @@ import itertools
 import json
 import os
 import re
-import shutil
 import uuid
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -21,7 +20,7 @@ from typing import Annotated, Any
 
 from cluster.comparison.results import LEARNERS, Learner, Run, read_run
 from cluster.runs import checkpoint
-from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, open_run, read_config
+from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, as_argument, lock, open_run, read_config
 from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking.address import shown
 from cluster.tracking.description import file_name
@@ -62,11 +61,8 @@ class Cell(RunFolder):
 
     def open(self) -> RunFolder:
         """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""
-        if (self.path / CHECKPOINT).is_file():
-            return open_run(self.path)
-        if self.path.exists():  # killed before its first step
-            shutil.rmtree(self.path)
-        return self
+        lock(self.path)  # first: a job that outlived its comparison may still write its first checkpoint
+        return open_run(self.path) if (self.path / CHECKPOINT).is_file() else self
 
 
 @dataclass(frozen=True)
@@ -249,7 +245,8 @@ def read_runs(folders: Iterable[Path]) -> list[Run]:
             comparison = open_comparison(folder)
             runs = [read_run(cell.path) for cell in comparison.plan.cells(comparison.path) if cell.finished()]
             if not runs:
-                raise GridSimError(f"{folder}: none of its runs is finished; continue it with --resume {folder}")
+                again = f"continue it with --resume {as_argument(folder)}"
+                raise GridSimError(f"{folder}: none of its runs is finished; {again}")
             found += runs
         else:
             found.append(read_run(folder))

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 from cluster.runs.champion import Champion, held_out, load_champion
 from cluster.runs.checkpoint import CHAMPION
-from cluster.runs.run import CONFIG, SUMMARY, read_config
+from cluster.runs.run import CONFIG, SUMMARY, as_argument, read_config
 from cluster.runs.settings import RunSettings
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
 from evolution.episodes.rollout import trajectory
@@ -64,7 +64,8 @@ def read_run(folder: Path) -> Run:
     if not (folder / CONFIG).is_file():
         raise GridSimError(f"{folder} is not a run's folder: it has no {CONFIG}")
     if not path.is_file():
-        raise GridSimError(f"{folder} is not finished: it has no {SUMMARY}; finish it with --resume {folder}")
+        again = f"finish it with --resume {as_argument(folder)}"
+        raise GridSimError(f"{folder} is not finished: it has no {SUMMARY}; {again}")
     settings, _ = read_config(folder / CONFIG)
     champion = load_champion(folder / CHAMPION)
     try:
@@ -73,7 +74,7 @@ def read_run(folder: Path) -> Run:
         found = summary["scenario"], summary["seed"], summary["champion_sha256"]
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError) as error:
         reason = f"{path} is damaged, or of an earlier version ({type(error).__name__})"
-        raise GridSimError(f"{reason}; delete it, and make it again with --resume {folder}") from error
+        raise GridSimError(f"{reason}; delete it, and make it again with --resume {as_argument(folder)}") from error
     if found != (settings.scenario, settings.seed, champion.sha256):
         raise GridSimError(f"{folder}: {CONFIG}, {CHAMPION} and {SUMMARY} do not belong together; one was edited")
     return Run(folder, settings, champion.sha256, figures)

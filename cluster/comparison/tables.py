@@ -107,14 +107,14 @@ def table_csv(groups: Sequence[Group], folder: Path) -> bytes:
             own = {"seed": run.settings.seed, "champion_sha256": run.champion_sha256, "run": where}
             writer.writerow(common | own | numbers)
         writer.writerows(common | {"seed": seed} for seed in each.seeds if seed not in finished)
-    return stream.getvalue().encode()
+    return stream.getvalue().encode(errors="surrogateescape")
 
 
 def table_md(groups: Sequence[Group], plan: Plan | None = None) -> bytes:
     """The plan, two tables, and notes on them."""
     parts = [introduction(plan), *(_markdown(table(groups, columns)) for columns in (DRIVING, ERRORS))]
     parts.append("\n".join(f"- {note}" for note in notes(groups)))
-    return ("\n\n".join(parts) + "\n").encode()
+    return ("\n\n".join(parts) + "\n").encode(errors="surrogateescape")
 
 
 def notes(groups: Sequence[Group]) -> list[str]:

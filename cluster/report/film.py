@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
+import tempfile
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from cluster.runs.champion import Champion
+from cluster.runs.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
 from gridsim.car.ego import DISTANCE, SPEED, STEERING, End, X, Y
 from gridsim.envs.simulator import views
-from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.traffic.world import LANE
 from gridsim.view.render import Renderer, interpolate
@@ -29,7 +30,7 @@ CODING = {
 }
 
 
-class VideoError(GridSimError):
+class VideoError(WriteError):
     """A film that cannot be written; the message is one line for the user."""
 
 
@@ -115,7 +116,8 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int
     except OSError as error:
         raise VideoError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
     return count
 
 
@@ -128,19 +130,21 @@ def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], f
     except RuntimeError as error:
         raise VideoError("there is no ffmpeg here; install one, or name it with IMAGEIO_FFMPEG_EXE") from error
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
-    command = [program, "-y", "-v", "error", *raw, "-an", *coding, str(path)]
-    try:  # in a session of its own, where Ctrl-C does not reach it
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)
-    except OSError as error:
-        raise VideoError(f"ffmpeg cannot be started: {program}: {error.strerror or error}") from error
+    command = [program, "-y", "-v", "error", *raw, "-an", *coding, f"file:{path}"]  # else a:b is b by the protocol a
     count = 0
-    with process:
-        assert process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # ffmpeg's message follows
-            for image in pictures:
-                process.stdin.write(np.ascontiguousarray(image).data)
-                count += 1
-        message = process.communicate()[1].decode(errors="replace").strip()
+    with tempfile.TemporaryFile() as messages:  # of a pipe that nobody reads, ffmpeg would wait for room
+        try:  # in a session of its own, where Ctrl-C does not reach it
+            process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages, start_new_session=True)
+        except OSError as error:
+            raise VideoError(f"ffmpeg cannot be started: {program}: {error.strerror or error}") from error
+        with process, contextlib.suppress(BrokenPipeError):  # its message follows
+            assert process.stdin is not None
+            with process.stdin as stream:
+                for image in pictures:
+                    stream.write(np.ascontiguousarray(image).data)
+                    count += 1
+        messages.seek(0)
+        message = messages.read().decode(errors="replace").strip()
     if process.returncode:
         raise VideoError(f"ffmpeg failed: {message.splitlines()[-1][:160] if message else process.returncode}")
     return count

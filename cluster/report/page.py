@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from cluster.report.film import Recording
-from cluster.report.pictures import bounds
+from cluster.report.pictures import bounds, plain_style
 from cluster.runs.checkpoint import write_atomic
 from gridsim.car.ego import DISTANCE, SPEED
 from gridsim.car.vehicle import Action
@@ -89,7 +89,7 @@ def _place(cars: np.ndarray, size: tuple[float, float]) -> list[np.ndarray]:
 def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig, together: bool = False) -> None:
     """Write a page of drives on one map. It begins with the last of them, or shows all of them `together`.
 
-    Raises: CheckpointError.
+    Raises: WriteError.
     """
     road_map, constant = shown[-1].drive.scenario, constants(config)
     x, y, cosine, sine, half, _ = lane_marks(road_map).T.astype(float)
@@ -111,11 +111,12 @@ def write_page(path: Path, title: str, shown: Sequence[Shown], config: SimConfig
         "together": together,
         "drives": [each.packed() for each in shown],
     }
-    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")  # in HTML, a name with it could end the data
     page = files("cluster.report").joinpath("drive.html").read_text(encoding="utf-8")
     write_atomic(path, page.replace('type="application/json">{}<', f'type="application/json">{text}<').encode())
 
 
+@plain_style()
 def _picture(road_map: Map) -> bytes:
     """The map as a PNG, its road with smooth edges; the first row is the map's upper side."""
     from matplotlib.image import imsave

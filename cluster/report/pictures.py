@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +23,23 @@ _ROAD, _WALL = "#4a4e57", "#e9efe6"
 _LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00", "random": "#868e96"}
 
 
+@contextlib.contextmanager
+def plain_style() -> Iterator[None]:
+    """Matplotlib's defaults, whatever the user's matplotlibrc says, and names as they are: `$` begins no formula."""
+    import matplotlib
+
+    style: dict[Any, Any] = {**matplotlib.rcParamsDefault, "text.parse_math": False}
+    del style["backend"]  # takes 0.8 s to load
+    with matplotlib.rc_context(style), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        yield
+
+
+def _drawable(name: str) -> str:
+    """A name as Matplotlib can draw it: bytes of a file's name that are no text become question marks."""
+    return name.encode(errors="replace").decode()
+
+
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
     """A figure that needs no display and no global state, and the axes of its columns."""
     from matplotlib.figure import Figure
@@ -29,6 +48,7 @@ def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
+@plain_style()
 def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -> None:
     """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
     figure, axes = _figure(15, 3.8, 4)
@@ -80,6 +100,7 @@ def bounds(road_map: Map) -> list[float]:
     return (np.array([x.min(), x.max(), y.min(), y.max()]) / nodes.shape[1] * width + [-5.0, 5.0, -5.0, 5.0]).tolist()
 
 
+@plain_style()
 def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> None:
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
@@ -92,7 +113,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     axis.set_facecolor(_WALL)
     axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
     axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
-    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=title)
+    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=_drawable(title))
     axis.axis(bounds(scenario))
     points = states[:, [X, Y]].astype(np.float64)
     steps = np.stack([points[:-1], points[1:]], axis=1)
@@ -108,6 +129,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     figure.savefig(path, dpi=100)
 
 
+@plain_style()
 def comparison(groups: Sequence[Group], path: Path) -> None:
     """Draw success, velocity error and training time of each road and learner to a PNG.
 
@@ -143,7 +165,7 @@ def comparison(groups: Sequence[Group], path: Path) -> None:
             axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
                       markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
         axis.set_title(title)
-        axis.set_xticks(range(len(roads)), roads)
+        axis.set_xticks(range(len(roads)), map(_drawable, roads))
         axis.set_xlim(-0.5, len(roads) - 0.5)
         axis.set_ylim(bottom=0.0)
         axis.grid(axis="y", alpha=0.25, zorder=0)

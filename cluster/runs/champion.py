@@ -13,7 +13,7 @@ import numpy as np
 
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
-from cluster.runs.run import read_config
+from cluster.runs.run import as_argument, read_config
 from cluster.runs.settings import MAX_TRAFFIC, EvolveSettings
 from cluster.training.trainer import summarise
 from evolution.episodes import rollout
@@ -144,9 +144,9 @@ def _check_finished(run: Path) -> None:
         command = read_config(run / CONFIG)[0].command
     except GridSimError:
         command = EvolveSettings.command
-    again = f"continue it with: {command} --resume {run}"
+    again = f"continue it with: {command} --resume {as_argument(run)}"
     if not (run / CHECKPOINT).is_file():
-        again = f"start it anew with: {command} --config {run / CONFIG}"
+        again = f"start it anew with: {command} --config {as_argument(run / CONFIG)}"
     raise UnfinishedError(f"{run} has no {CHAMPION} yet: it is written when the run ends; if it was stopped, {again}")
 
 

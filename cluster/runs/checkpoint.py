@@ -32,11 +32,15 @@ class CheckpointError(GridSimError):
     """A file that cannot be saved or must not be trusted; the message is one line for the user."""
 
 
+class WriteError(CheckpointError):
+    """A file that cannot be written; the message is one line for the user."""
+
+
 def save(path: str | os.PathLike[str], arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
     """Write `arrays` and `meta` to `path` in one step: afterwards the file is the new one or the old one, complete.
 
     The same content gives the same bytes. `meta` has to be plain JSON (string keys; tuples come back as lists).
-    Raises TypeError or ValueError for what the format cannot hold (objects) and CheckpointError if the file cannot be
+    Raises TypeError or ValueError for what the format cannot hold (objects) and WriteError if the file cannot be
     written (a full disk, a folder that is gone).
     """
     text = json.dumps({"format": "gridsim", "version": VERSION, "meta": meta})
@@ -91,7 +95,7 @@ def load(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, durable: bool = True) -> None:
-    """Replace the file at `path` with `content`, or leave it as it was and raise CheckpointError.
+    """Replace the file at `path` with `content`, or leave it as it was and raise WriteError.
 
     With `durable` it is on the disk when this returns. Without, for files that can be made again, a power cut (but not
     a kill) can lose it.
@@ -107,7 +111,7 @@ def write_atomic(path: str | os.PathLike[str], content: bytes | memoryview, dura
         os.replace(temporary, path)
     except OSError as error:
         kept = "; the one before it is kept" if path.exists() else ""
-        raise CheckpointError(f"{path}: cannot be written: {one_line(error)}{kept}") from error
+        raise WriteError(f"{path}: cannot be written: {one_line(error)}{kept}") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()

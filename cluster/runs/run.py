@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import time
 import uuid
 from dataclasses import dataclass, field
@@ -29,7 +30,15 @@ from gridsim.maps.files import map_digest
 from gridsim.maps.scenarios import is_map_file, label
 
 HISTORY, ELITES, SUMMARY, PAGE = "history.csv", "elites.npz", "summary.json", "drive.html"
+CURVES, TRAJECTORY = "curves.png", "trajectory.png"
+FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, PAGE, ELITES, HISTORY, SUMMARY, TRAJECTORY)
+"""Files of a finished run, which MLflow gets; what else is in its folder is the user's own."""
 CONFIG_FORMAT = 2
+
+
+def as_argument(path: Path) -> str:
+    """A path as an argument of a command that is pasted into a shell."""
+    return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))
 
 
 class RunError(GridSimError):
@@ -108,9 +117,13 @@ def _map_sha256(settings: RunSettings) -> str:
     return map_digest(settings.scenario) if is_map_file(settings.scenario) else ""
 
 
-@functools.cache  # so that a process may lock a folder again
 def lock(path: Path) -> None:
     """Make the folder of a run or a comparison and lock it until this process ends. Raises RunError."""
+    _lock(path.resolve())
+
+
+@functools.cache  # so that a process may lock a folder again
+def _lock(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
         folder = os.open(path, os.O_RDONLY)
@@ -129,15 +142,16 @@ def open_run(folder: Path) -> RunFolder:
         raise RunError(f"{folder}: no such folder")
     if not (folder / CONFIG).is_file():
         raise RunError(f"{folder} is not a run's folder: it has no {CONFIG}")
-    lock(folder.resolve())
+    lock(folder)
     settings, init = read_config(folder / CONFIG)
     run = RunFolder(folder.resolve(), settings, init)
+    anew = f"start it anew with --config {as_argument(folder / CONFIG)}"
     if not (folder / CHECKPOINT).is_file():
-        raise RunError(f"{folder} has no {CHECKPOINT} to resume from; start it anew with --config {folder / CONFIG}")
+        raise RunError(f"{folder} has no {CHECKPOINT} to resume from; {anew}")
     try:
         run.saved = checkpoint.load(folder / CHECKPOINT)
     except CheckpointError as error:
-        raise CheckpointError(f"{error}; start it anew with --config {folder / CONFIG}") from error
+        raise CheckpointError(f"{error}; {anew}") from error
     meta = run.saved[1]
     run.init_sha256 = str(meta.get("init_sha256", ""))
     if meta.get("digest") != run.digest():
@@ -168,7 +182,8 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name
     if path.exists():
-        raise RunError(f"{path} exists already; choose another --name, or continue it with --resume {path}")
+        again = f"continue it with --resume {as_argument(path)}"
+        raise RunError(f"{path} exists already; choose another --name, or {again}")
     parent = output
     while not parent.exists():
         parent = parent.parent

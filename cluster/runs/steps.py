@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError
+from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError, WriteError
 from cluster.runs.run import ELITES
 from cluster.tracking.address import one_line
 from evolution.networks.policy import PolicySpec
@@ -32,7 +32,7 @@ def records(rows: np.ndarray, elites: np.ndarray | Sequence[np.ndarray]) -> np.n
 def append(path: Path, first: int, new: np.ndarray) -> None:
     """Write records from number `first` on and cut off what follows them; they are on the disk when this returns.
 
-    Raises: CheckpointError; the records before are kept.
+    Raises: WriteError; the records before are kept.
     """
     try:
         path.touch()
@@ -43,7 +43,7 @@ def append(path: Path, first: int, new: np.ndarray) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise CheckpointError(f"{path}: cannot be written: {one_line(error)}") from error
+        raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
 
 
 def resume(folder: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], genes: int) -> np.ndarray:

@@ -26,7 +26,20 @@ import numpy as np
 from cluster.runs import checkpoint, steps
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError
-from cluster.runs.run import ELITES, HISTORY, PAGE, SUMMARY, RunError, RunFolder, lock, write_summary
+from cluster.runs.run import (
+    CURVES,
+    ELITES,
+    FILES,
+    HISTORY,
+    PAGE,
+    SUMMARY,
+    TRAJECTORY,
+    RunError,
+    RunFolder,
+    as_argument,
+    lock,
+    write_summary,
+)
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
 from cluster.tracking.address import TrackingError, check_uri, shown, with_password
@@ -320,11 +333,11 @@ class Session:
         self.tracker.log_model(path, description.torch_model(champion, settings, figures))  # meanwhile, in its thread
         seed = episodes.maps[int(episodes.rows[0]["map"])]
         road_map, start, world = self.maps.get(seed), episodes.rows[0]["start"], episodes.worlds[0]
-        pictures.curves(learning.history, path / "curves.png", settings.step_name)
+        pictures.curves(learning.history, path / CURVES, settings.step_name)
         drive = film.record(champion, road_map, start, learning.sim.episode.time_limit, world)
         where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"
         title = f"{label(settings.scenario)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
-        pictures.trajectory(road_map, drive.cars, path / "trajectory.png", title)
+        pictures.trajectory(road_map, drive.cars, path / TRAJECTORY, title)
         shown = [page.Shown("champion", "champion", drive)]
         for k in (np.unique(np.geomspace(1, learning.steps, ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():
             elite = dataclasses.replace(champion, genome=elites[k])
@@ -394,7 +407,7 @@ def log_end(tracker: Tracker, run: RunFolder, step: int, summary: dict[str, Any]
             summary["mlflow_run_id"] = tracker.wait_ready(30.0)
             write_summary(run.path, summary)
     tracker.note = note
-    tracker.log_files(sorted(path for path in run.path.glob("[!.]*") if path.is_file()))
+    tracker.log_files(run.path / name for name in FILES if (run.path / name).is_file())
 
 
 def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | None]:
@@ -415,8 +428,8 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
     except GridSimError as error:
         return "", f"what MLflow lacks is not sent: {error}"
     except (OSError, LookupError, TypeError, ValueError, StopIteration) as error:  # edited by hand
-        reason = f"{path} is damaged ({type(error).__name__}); delete it, and make it again with --resume {run.path}"
-        return "", f"what MLflow lacks is not sent: {reason}"
+        again = f"delete it, and make it again with --resume {as_argument(run.path)}"
+        return "", f"what MLflow lacks is not sent: {path} is damaged ({type(error).__name__}); {again}"
     tracker = make_tracker(run, uri, experiment, finished=True, started=started)
     log_rows(tracker, history)
     tracker.log_model(run.path, model)

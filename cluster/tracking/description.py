@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -83,7 +84,7 @@ def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
         f"**{held_out['success_rate']:.1%}**, drives {held_out['distance_m']:,.0f} m at {held_out['speed_mps']:.2f} "
         f"m/s, and collides in {held_out['collision_rate']:.1%}.",
         "Watch it: `drive.html` among the artifacts, or",
-        f"    gridsim-watch {folder}",
+        f"    gridsim-watch {shlex.quote(str(folder))}",
         f"Load it, a torch model of the environment's observations, float32 [n, {inputs}], which is registered as "
         f"`{model_name(settings)}`:",
         f'    mlflow.pytorch.load_model("runs:/{RUN_ID}/{MODEL}")',

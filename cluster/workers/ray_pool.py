@@ -15,9 +15,7 @@ What differs from Ray's defaults, and why:
 
 from __future__ import annotations
 
-import os
 import pickle
-import sys
 import threading
 import time
 from collections import defaultdict, deque
@@ -26,6 +24,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from cluster.cores import cores
 from cluster.workers import ray_session
 from cluster.workers.actor import Actor, Name, Shared, Work
 from cluster.workers.dispatch import MAX_KILLS, Dispatch
@@ -52,7 +51,7 @@ PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a silent worker of this machine
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
-CORES = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1  # that this process may use
+CORES = cores()
 FROM_QUEUE: Parcel = ()  # tells a worker to take its parcels from the queue
 FINER = 2  # times as many chunks of experience: an untrained driver crashes long before its target
 

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import tempfile
+import time
 from unittest.mock import Mock
 
 import psutil  # type: ignore[import-untyped]
@@ -15,15 +16,16 @@ import tracked
 from commands import call, command_line, finish, refused, running, summary, wait_until
 from finished_runs import make_run
 
-from cluster.commands import compare
+from cluster.commands import compare, jobs
 from cluster.commands.compare import compare_main
 from cluster.commands.jobs import train_all
 from cluster.comparison import results
 from cluster.comparison.plan import ComparisonFolder, Plan
-from cluster.runs.train import Workers
+from cluster.runs.train import Workers, undisturbed
 from cluster.workers.pool import PoolError
 from gridsim import evolve
 
+NO_WORKERS = Workers(0, None, 0.0)
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
 
@@ -102,8 +104,28 @@ def fail(run, reporter):
 
 def test_each_job_goes_on_after_a_run_that_failed(tmp_path):
     cells, events = Plan(("curved",), ("evolution",), 5, budget="1k").cells(tmp_path), []
-    train_all(cells, Workers(0, None, 0.0), fail, 2, lambda *event: events.append(event[1:]))
+    train_all(cells, NO_WORKERS, fail, 2, lambda *event: events.append(event[1:]))
     assert sorted(said for kind, said in events if kind == "failed") == [f"no workers for {c.name}" for c in cells]
+
+
+def close(run, reporter):
+    """A run that is being closed when the signal comes, which it ignores."""
+    with undisturbed():
+        reporter.note("closing")
+        time.sleep(1.0)
+
+
+def test_a_job_that_ignored_the_signal_ends_as_soon_as_its_run_is_closed(tmp_path, monkeypatch):
+    def interrupt(cell, kind, content):
+        if content == "closing":
+            raised.append(time.monotonic())
+            raise KeyboardInterrupt
+
+    raised: list[float] = []
+    monkeypatch.setattr(jobs, "CLOSING_S", 20.0)
+    with pytest.raises(KeyboardInterrupt):
+        train_all(Plan(("curved",), ("evolution",), 1, budget="1k").cells(tmp_path), NO_WORKERS, close, 2, interrupt)
+    assert time.monotonic() - raised[0] < 15.0
 
 
 def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, monkeypatch, capsys):

@@ -1,8 +1,11 @@
 """The paper's comparison: what is asked, what is trained once, what is not what was asked for."""
 
+import contextlib
 import dataclasses
+import fcntl
 import itertools
 import json
+import os
 import shutil
 
 import pytest
@@ -11,6 +14,7 @@ from finished_runs import make_run
 from cluster.comparison.plan import UNBOUND, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.comparison.results import LEARNERS
 from cluster.comparison.tables import group
+from cluster.runs.run import RunError
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY
@@ -158,3 +162,27 @@ def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
     (third.path / "mine.txt").write_text("dear diary")
     with pytest.raises(GridSimError, match="in the way"):
         third.check()
+
+
+def test_a_run_that_was_killed_before_its_first_step_begins_again_and_nothing_is_removed(tmp_path):
+    first, second = PLAN.cells(tmp_path)[:2]
+    for cell in (first, second):
+        cell.path.mkdir()
+        cell.write_config()
+        (cell.path / "notes.txt").write_text("dear diary")
+    with open_folder(first.path) as other:  # a job of a comparison that was killed, which goes on
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(RunError, match="another process is at work on it"):
+            first.open()
+    assert second.open() is second
+    for cell in (first, second):
+        assert sorted(path.name for path in cell.path.iterdir()) == ["config.json", "notes.txt"]
+
+
+@contextlib.contextmanager
+def open_folder(path):
+    number = os.open(path, os.O_RDONLY)
+    try:
+        yield number
+    finally:
+        os.close(number)

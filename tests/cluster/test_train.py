@@ -67,6 +67,18 @@ def test_mlflow_is_told_how_a_run_ended(uri, tmp_path, monkeypatch, error, raise
     assert open_run(run.path).tracking_key == found.data.tags["gridsim.key"]
 
 
+def test_mlflow_gets_the_files_of_the_run_and_none_of_the_users(tmp_path):
+    run = new_run(tmp_path, "r", SETTINGS)
+    sent: list[str] = []
+    run.path.mkdir()
+    for name in ("config.json", "summary.json", "curves.png", "passwords.txt", "notes.md"):
+        (run.path / name).touch()
+    tracker = Mock(log_files=lambda paths: sent.extend(path.name for path in paths))
+    end = {"held_out": {}, "wall_s": 3.0, "validation_success_rate": 0.5, "mlflow_run_id": "x"}
+    train.log_end(tracker, run, 0, end, "a note")
+    assert sent == ["config.json", "curves.png", "summary.json"]
+
+
 def test_the_last_candidates_validation_is_a_step_after_the_last(uri, tmp_path):
     run, names = new_run(tmp_path, "r", SETTINGS), ["validation/success_rate"]
     run.path.mkdir()

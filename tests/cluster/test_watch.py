@@ -1,7 +1,9 @@
 """Films and windows on champions: frame counts and rates read back, runs that are over or still going, wrong use."""
 
+import errno
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -125,6 +127,44 @@ def test_watch_writes_films(tmp_path, monkeypatch, capsys):
     code, _, err = call(watch_main, monkeypatch, capsys, *film)
     assert (code, err.count("\n")) == (1, 1)
     assert "ffmpeg cannot be started" in err
+
+
+@pytest.mark.parametrize("name", ["drive-12:30.mp4", "-v.mp4", "%d.gif", "http:a.gif", "a.csv/b.html"])
+def test_films_and_pages_of_any_name_are_written(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.csv").mkdir()
+    shutil.copy(CHAMPION, "a.csv/champion.npz")
+    code, out, err = call(
+        watch_main, monkeypatch, capsys, "a.csv", "--seconds", 1, "--size", "64x64", f"--output={name}"
+    )
+    assert (code, err) == (0, "")
+    assert f"{name}: " in out
+    assert (tmp_path / name).stat().st_size > 0
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.html"])
+def test_what_cannot_be_written_is_told_in_one_line(name, tmp_path, monkeypatch, capsys):
+    def refuse(path, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("builtins.open", lambda path, *_, **__: refuse(path))
+    for method in ("touch", "unlink"):  # a read-only file system refuses to unlink even what is not there
+        monkeypatch.setattr(Path, method, refuse)
+    code, _, err = call(watch_main, monkeypatch, capsys, CHAMPION, "--seconds", 1, "--size", "64x64", "--output", name)
+    assert (code, err) == (1, f"gridsim-watch: error: {name}: cannot be written: Read-only file system\n")
+
+
+def test_a_film_ends_however_much_ffmpeg_has_to_say(tmp_path, monkeypatch):
+    chatty = tmp_path / "ffmpeg"
+    chatty.write_text(
+        "#!/bin/sh\nyes error | head -c 300000 >&2\ncat > /dev/null\necho >&2\necho the reason >&2\nexit 1\n"
+    )
+    chatty.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(chatty))
+    pictures = (np.zeros((120, 160, 3), np.uint8) for _ in range(20))  # more than a pipe holds
+    with pytest.raises(VideoError, match="ffmpeg failed: the reason"):
+        write_video(tmp_path / "f.mp4", pictures, (160, 120), 10)
 
 
 def test_a_page_of_several_champions_begins_with_all_of_them(tmp_path, monkeypatch, capsys):

@@ -17,7 +17,7 @@ HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 90.0, "speed_mps"
 
 def make_run(folder, learner="evolution", scenario="curved", seed=0, settings=None):
     """A finished run's folder, as small as one can be; `settings` in place of what a comparison asks for."""
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     settings = settings or Plan(traffic=0).settings(scenario, learner, seed)
     rng = np.random.default_rng(np.random.SeedSequence(list(f"{folder.name} {settings.seed}".encode())))
     genome = rng.standard_normal(PolicySpec.parse(settings.policy).size).astype(np.float32)
