@@ -87,8 +87,8 @@ class WorkFlags:
     """Seconds without any worker after which a run stops; it can be resumed. By default 60, on a cluster 300."""
     tracking_uri: Annotated[str, IN_WORDS] = ""
     """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
-    experiment: str = "gridsim"
-    """MLflow's experiment."""
+    experiment: str = field(default_factory=lambda: os.environ.get("MLFLOW_EXPERIMENT_NAME") or "gridsim")
+    """MLflow's experiment; by default MLFLOW_EXPERIMENT_NAME, else gridsim."""
 
 
 @dataclass(frozen=True, kw_only=True)
