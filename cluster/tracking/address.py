@@ -224,6 +224,8 @@ def redacted(uri: str) -> str:
 def one_line(error: BaseException) -> str:
     """The error in one line, without secrets; for errors of the system only the reason."""
     text = str(error) or type(error).__name__
+    if isinstance(error, TrackingError):
+        return text
     reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>:]+)", text)
     if reasons:
         return reasons[-1].strip()

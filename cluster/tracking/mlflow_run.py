@@ -61,7 +61,7 @@ _COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_
 """What the view's run table shows of each run, and the columns' widths in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
-ROOM = 8_000_000  # bytes in the temporary folder for a new database (1 MB), or for a model besides its weights
+ROOM = 3_000_000  # bytes in the temporary folder for a new database (1 MB), or for a model besides its weights
 MAX_BATCH = 1000  # metrics that MLflow takes in one request
 
 # Set unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
@@ -252,15 +252,15 @@ class LoggedRun:
         from mlflow.utils.file_utils import local_file_uri_to_path
         from mlflow.utils.uri import is_local_uri
 
-        if not is_local_uri(self._artifacts):
+        served = self._identity.uri.startswith("http")
+        if not (served or is_database(self._identity.uri)) or not is_local_uri(self._artifacts):
             return
         location = Path(local_file_uri_to_path(self._artifacts)).parents[1]  # without the run's id and `artifacts`
         if not (location.is_dir() or location.parent.is_dir()):
-            served = self._identity.uri.startswith("http")
             remedy = "start the server with --serve-artifacts and " if served else ""
             raise TrackingError(
-                f"the experiment keeps its files in {location}, which is not on this machine; {remedy}"
-                "use another --experiment"
+                f"the experiment keeps its files in {location}, which is not on this machine: create it if they belong "
+                f"here, else {remedy}use a new --experiment"
             )
 
     def store_model(self, folder: Path, model: Model) -> None:
@@ -356,7 +356,7 @@ def write_model(folder: Path, model: Model) -> None:
     built = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(built, ignore_errors=True)
     # In the temporary folder first, with enough room: PyTorch aborts the process if a disk becomes full as it writes.
-    with _scratch(ROOM + 4 * sum(each.nbytes for each in module.parameters())) as scratch, warnings.catch_warnings():
+    with _scratch(ROOM + 3 * sum(each.nbytes for each in module.parameters())) as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch and MLflow cause them themselves
         mlflow.pytorch.save_model(
             module,
