@@ -411,7 +411,7 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
         history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
         model = description.torch_model(load_champion(run.path), run.settings, summary["held_out"])
         note, started = description.describe(run, summary), ended - summary["wall_s"]
-        meta["tracking"]["run_id"] = meta["tracking"]["run_id"] or summary.get("mlflow_run_id")
+        meta["tracking"]["run_id"] = meta["tracking"].get("run_id") or summary.get("mlflow_run_id")
         uri = check_uri(uri or with_password(meta["tracking"]["uri"]))
     except GridSimError as error:
         return "", f"what MLflow lacks is not sent: {error}"

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
-import json
 import logging
 import os
 import shutil
@@ -36,6 +35,7 @@ from cluster.tracking.address import (
     sqlite_uri,
 )
 from cluster.tracking.commit import DIRTY, git_commit
+from cluster.tracking.view import VIEW_TAG, run_table, view
 
 if TYPE_CHECKING:
     import numpy as np
@@ -55,10 +55,6 @@ RUN_ID = "{run_id}"
 """Stands in a description for MLflow's id of the run, which is not yet known when it is written."""
 BEST = "best"
 """Alias of a registered model's version with the greatest success on held-out roads."""
-VIEW, _VIEW_TAG = "gridsim", "mlflow.sharedViewState.gridsim"
-"""The saved view of an experiment in MLflow's UI, and the experiment's tag that holds it."""
-_COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_out/speed_mps": 150, "car_steps": 90}
-"""What the view's run table shows of each run, and the columns' widths in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
 ROOM = 3_000_000  # bytes in the temporary folder for a new database (1 MB), or for a model besides its weights
@@ -457,16 +453,10 @@ def _experiment_id(client: MlflowClient, identity: Identity, database: Path | No
     experiment = client.get_experiment_by_name(name)
     if experiment is None or experiment.lifecycle_stage != "active":
         raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
-    if _VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
+    if VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
         with contextlib.suppress(MlflowException):  # a server may allow nothing but runs
-            client.set_experiment_tag(experiment.experiment_id, _VIEW_TAG, _view())
+            client.set_experiment_tag(experiment.experiment_id, VIEW_TAG, view())
     return experiment.experiment_id
-
-
-def run_table(server: str, experiment_id: str) -> str:
-    """Address of an experiment's run table in an MLflow server's UI, as MLflow 3.17 opens another page by default."""
-    page = f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={VIEW}"
-    return f"{redacted(server)}/{page}"
 
 
 def run_tables(uri: str, server: str) -> dict[str, str]:
@@ -481,15 +471,3 @@ def run_tables(uri: str, server: str) -> dict[str, str]:
     client = MlflowClient(tracking_uri=uri)
     found = [each for each in client.search_experiments() if client.search_runs([each.experiment_id], max_results=1)]
     return {each.name: run_table(server, each.experiment_id) for each in found}
-
-
-def _view() -> str:
-    """The saved view as MLflow's UI writes it: the run table's columns, and curves over car-steps."""
-    columns = {"attributes.`Run Name`": 270, **{f"metrics.`{name}`": width for name, width in _COLUMNS.items()}}
-    state = {
-        "selectedColumns": list(columns),
-        "columnOrder": list(columns),
-        "columnWidths": columns,
-        "globalLineChartConfig": {"xAxisKey": "metric", "selectedXAxisMetricKey": "car_steps", "lineSmoothness": 0},
-    }
-    return json.dumps({"name": "GridSim", "createdAt": int(1000.0 * time.time()), "state": json.dumps(state)})

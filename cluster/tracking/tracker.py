@@ -17,7 +17,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from cluster.tracking.address import UI, TrackingError, is_database, one_line, redacted, sqlite_path
-from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload, run_table
+from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload
+from cluster.tracking.view import run_table
 
 FLUSH_S = 2.0  # rows that come within this time go out as one request: 5 ms of CPU for a row alone, 0.8 ms among many
 RETRY_S = 5.0
@@ -121,7 +122,10 @@ class Tracker:
             self._thread.start()
 
     def _work(self) -> None:
-        """Sync every FLUSH_S seconds, without a request if nothing is new, and once or twice when closed."""
+        """Sync every FLUSH_S seconds, without a request if nothing is new, and once or twice when closed.
+
+        A database that is locked as it is closed is tried again until `close` gives up.
+        """
         while not self._closed.is_set():
             synced = self._sync()
             if synced and self._preload.ident is None:
@@ -130,7 +134,7 @@ class Tracker:
             self._wake.clear()
         if not self._sync():
             time.sleep(CHANCE_S)
-            while not self._sync() and "locked" in (self.error or ""):  # by other runs' writing, which ends
+            while not self._sync() and self._is_locked():
                 time.sleep(CHANCE_S)
 
     def _sync(self) -> bool:
@@ -144,9 +148,14 @@ class Tracker:
                 if self._run is None:
                     break
             finally:
-                self._tried.set()
+                if self._run or not self._is_locked():
+                    self._tried.set()
         self.error = error
         return error is None
+
+    def _is_locked(self) -> bool:
+        """Whether the last sync failed only because others write to the database, which ends."""
+        return "database is locked" in (self.error or "")
 
     @property
     def _opened(self) -> LoggedRun:

@@ -235,7 +235,12 @@ def test_only_one_process_builds_a_database(tmp_path, monkeypatch):
 
     built = []
     real = utils._upgrade_db
-    monkeypatch.setattr(utils, "_upgrade_db", lambda engine: built.append(engine) or real(engine))
+
+    def upgrade(engine):
+        built.append(engine)
+        real(engine)
+
+    monkeypatch.setattr(utils, "_upgrade_db", upgrade)
     threads = [threading.Thread(target=mlflow_run._create_database, args=(tmp_path / "mlflow.db",)) for _ in range(4)]
     for thread in threads:
         thread.start()
