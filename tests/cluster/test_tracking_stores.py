@@ -85,6 +85,7 @@ def older(path):
 
 
 @pytest.mark.e2e
+@pytest.mark.filterwarnings("ignore")  # of SQLAlchemy's, about MLflow
 def test_a_database_of_an_older_mlflow_is_refused_before_it_is_migrated(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "mlflow.db"
@@ -230,6 +231,7 @@ def test_eight_first_runs_at_once_in_an_empty_folder(tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["mlartifacts", "mlflow.db", "runs"]
 
 
+@pytest.mark.filterwarnings("ignore")  # of SQLAlchemy's, about MLflow
 def test_only_one_process_builds_a_database(tmp_path, monkeypatch):
     from mlflow.store.db import utils
 

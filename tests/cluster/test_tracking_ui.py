@@ -110,7 +110,7 @@ def test_a_port_in_use_is_one_line(tmp_path):
 @pytest.mark.parametrize("who", ["make", "the command", "a closed terminal"])
 def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path, monkeypatch, who):
     for name in ("http_proxy", "https_proxy", "ALL_PROXY"):  # where nobody answers
-        monkeypatch.setenv(name, "http://10.255.255.1:3128")
+        monkeypatch.setenv(name, "http://127.0.0.1:1")
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     logged(uri, "first", 0.875)
