@@ -1,5 +1,6 @@
 """`make ui`: MLflow's UI on loopback; links to its run tables are printed once it answers."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -7,12 +8,22 @@ import subprocess
 import sys
 import time
 
-from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, one_line, server_problem
+from cluster.tracking.address import (
+    DEFAULT_URI,
+    TrackingError,
+    check_uri,
+    one_line,
+    reach_loopback_directly,
+    server_problem,
+)
 from cluster.tracking.mlflow_run import run_tables
+
+STOP_S = 10.0  # that the server may take to end
 
 
 def main(port: str) -> None:
     """Show the runs in `mlflow.db` of the working directory, until Ctrl-C."""
+    reach_loopback_directly()
     address = f"http://127.0.0.1:{port}"
     try:
         socket.create_server(("127.0.0.1", int(port))).close()
@@ -24,11 +35,14 @@ def main(port: str) -> None:
         sys.exit(f"make ui: port {port} is in use or not a port; choose another with make ui PORT=...")
     except Exception as error:  # a database of another MLflow version
         sys.exit(f"make ui: {DEFAULT_URI}: {one_line(error)}; move it elsewhere if another MLflow made it")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, signal.default_int_handler)
     command = ["ui", "--backend-store-uri", DEFAULT_URI, "--host", "127.0.0.1", "--port", port, "--workers", "2"]
     server = subprocess.Popen(
         [sys.executable, "-m", "mlflow", *command, "--uvicorn-opts", "--log-level warning"],
         env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "PYTHONWARNINGS": "ignore"},
+        process_group=0,  # so that a terminal's signals end it here, with all of its processes
     )
     try:
         while server.poll() is None and server_problem(address):
@@ -39,9 +53,15 @@ def main(port: str) -> None:
             print(f"MLflow's UI on {address}; Ctrl-C ends it", *links, sep="\n", flush=True)
         sys.exit(server.wait())
     except KeyboardInterrupt:
-        server.wait()
+        pass
     finally:
-        server.terminate()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        with contextlib.suppress(ProcessLookupError, subprocess.TimeoutExpired):
+            os.killpg(server.pid, signal.SIGTERM)
+            server.wait(STOP_S)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGKILL)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from cluster.comparison.results import LEARNERS, Learner, Run, read_run
 from cluster.runs import checkpoint
 from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, as_argument, lock, open_run, read_config
 from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
-from cluster.tracking.address import shown
+from cluster.tracking.address import redacted
 from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
@@ -208,7 +208,7 @@ class ComparisonFolder:
             "command": "gridsim-compare",
             "gridsim": version("gridsim"),
             "plan": dataclasses.asdict(self.plan),
-            "tracking_uri": shown(self.tracking_uri),  # MLflow gets this file, so it must not hold a password
+            "tracking_uri": redacted(self.tracking_uri),  # MLflow gets this file, so it must not hold a password
             "tracking_key": self.tracking_key,
         }
         checkpoint.write_atomic(self.path / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())

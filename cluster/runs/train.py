@@ -42,7 +42,7 @@ from cluster.runs.run import (
 )
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
-from cluster.tracking.address import TrackingError, check_uri, shown, with_password
+from cluster.tracking.address import TrackingError, check_uri, redacted, with_password
 from cluster.tracking.mlflow_run import Identity, Status, quiet
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
@@ -275,7 +275,7 @@ class Session:
 
     def report_outage(self) -> None:
         """Warn once when MLflow cannot be reached, and once when it is back."""
-        error, where = self.tracker.error, shown(self.tracker.uri)
+        error, where = self.tracker.error, redacted(self.tracker.uri)
         if error and not self._away:
             self.reporter.warn(f"MLflow at {where} cannot be used: {error}; the run continues and sends its rows later")
         elif self._away and not error:
@@ -306,7 +306,7 @@ class Session:
             sha256 = self._sha256.copy()
             sha256.update(new.tobytes())
             # MLflow gets the checkpoint, so it must not hold a password.
-            tracking = {"uri": shown(self.tracker.uri), "run_id": self.tracker.run_id, "key": self.run.tracking_key}
+            tracking = {"uri": redacted(self.tracker.uri), "run_id": self.tracker.run_id, "key": self.run.tracking_key}
             meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, "tracking": tracking}
             meta |= {"steps": done, "steps_sha256": sha256.hexdigest()}
             checkpoint.save(path / CHECKPOINT, {k: v for k, v in arrays.items() if k != "history"}, meta)
@@ -384,10 +384,11 @@ class Session:
 
 def make_tracker(run: RunFolder, uri: str, experiment: str, parent_id: str = "", **more: Any) -> Tracker:
     """The run's tracker; `parent_id` is MLflow's run that it belongs to. `more` is for its `Identity`."""
+    saved = run.saved[1]["tracking"] if run.saved else {}
     tags = description.tags(run.settings) | ({"mlflow.parentRunId": parent_id} if parent_id else {})
     return Tracker(Identity(
         uri, experiment, run.name, description.params(run.settings), tags,
-        note=description.describe(run), key=run.tracking_key, **more,
+        note=description.describe(run), key=run.tracking_key, run_id=str(saved.get("run_id") or ""), **more,
     ))  # fmt: skip
 
 
@@ -424,6 +425,7 @@ def send_missing(run: RunFolder, uri: str, experiment: str) -> tuple[str, str | 
         history = [dict(zip(meta["columns"], row, strict=True)) for row in arrays["history"].tolist()]
         model = description.torch_model(load_champion(run.path), run.settings, summary["held_out"])
         note, started = description.describe(run, summary), ended - summary["wall_s"]
+        meta["tracking"]["run_id"] = meta["tracking"].get("run_id") or summary.get("mlflow_run_id")
         uri = check_uri(uri or with_password(meta["tracking"]["uri"]))
     except GridSimError as error:
         return "", f"what MLflow lacks is not sent: {error}"

@@ -1,17 +1,21 @@
-"""Tracking addresses: checked, made absolute, and shown without passwords. Does not import MLflow.
+"""Tracking addresses: checked, made absolute, and shown without secrets. Does not import MLflow.
 
 An address is probed before MLflow is imported: with a dead one MLflow would hang for minutes.
 """
 
 import contextlib
+import functools
+import importlib.util
 import os
 import re
+import shlex
 import socket
 import sqlite3
 import ssl
 import urllib.error
 import urllib.parse
 import urllib.request
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from gridsim.errors import GridSimError
@@ -20,6 +24,10 @@ DEFAULT_URI = "sqlite:///mlflow.db"
 UI = "http://127.0.0.1:5000"  # where `make ui` and `mlflow ui` show it
 PROBE_S = 3.0
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
+_HOSTED = "databricks"  # a scheme of MLflow's own; others come with plug-ins
+_LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
+_SECRET = re.compile("pass|pw|token|secret|key|cred|sig|auth|odbc_connect", re.IGNORECASE)
+"""In the names of a query's parameters whose values are not shown."""
 _PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # also served by a gateway in front of MLflow
 
 
@@ -30,68 +38,153 @@ class TrackingError(GridSimError):
 def check_uri(uri: str | None = None, begun_with: str = "") -> str:
     """The tracking address made absolute and probed, without MLflow.
 
-    None stands for the address that a resumed run was begun with; its server need not answer, as the run goes on and
-    the tracker reports it. Its password, which no file holds, comes from MLFLOW_TRACKING_URI. For a new run it is
-    MLFLOW_TRACKING_URI, or `sqlite:///mlflow.db` in the working directory.
-    Raises TrackingError for a server that does not answer, a database that cannot be written, a folder (MLflow 3
-    stores nothing in folders) and anything unknown.
+    If `uri` is None or "": the address `begun_with` of a resumed run, whose server is not probed, as the run goes on
+    without it and the tracker reports it; else MLFLOW_TRACKING_URI, else `sqlite:///mlflow.db` in the working
+    directory. The password of `begun_with`, which no file holds, comes from MLFLOW_TRACKING_URI.
+    Hosted stores (`databricks`, the schemes of MLflow's plug-ins) are not probed.
+    Raises TrackingError for a server that does not answer, a database that cannot be written or is another MLflow's, a
+    folder (MLflow 3 stores nothing in folders) and anything unknown.
     """
+    reach_loopback_directly()
     resumed = not uri and bool(begun_with)
     uri = uri or with_password(begun_with) or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
-    scheme = uri.partition("://")[0].partition("+")[0].lower() if "://" in uri else ""
-    if resumed and scheme in ("http", "https", *_DATABASES):
-        return uri
+    scheme = address_scheme(uri)
     if scheme == "sqlite":
         return _check_sqlite(uri)
+    if scheme == _HOSTED or scheme in entry_points(group="mlflow.tracking_store").names:
+        return uri
+    if resumed and scheme in ("http", "https", *_DATABASES):
+        return uri
     if scheme in ("http", "https"):
         uri = uri.rstrip("/")
         if problem := server_problem(uri):
-            raise TrackingError(f"no MLflow server at {shown(uri)}: {problem}; start one, or use {DEFAULT_URI}")
+            raise TrackingError(f"no MLflow server at {redacted(uri)}: {problem}; start one, or use {DEFAULT_URI}")
         return uri
     if scheme in _DATABASES:
-        parts = urllib.parse.urlsplit(uri)
+        parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
         try:
             socket.create_connection((parts.hostname or "localhost", parts.port or _DATABASES[scheme]), PROBE_S).close()
         except (OSError, ValueError) as error:
-            raise TrackingError(f"no database server at {shown(uri)}: {one_line(error)}") from error
+            raise TrackingError(f"no database server at {redacted(uri)}: {one_line(error)}") from error
         return uri
     if scheme in ("", "file"):
-        raise TrackingError(f"{uri}: MLflow 3 keeps no runs in folders; use sqlite:///mlflow.db or http://host:port")
-    raise TrackingError(f"{shown(uri)}: not a tracking address; use sqlite:///mlflow.db or http://host:port")
+        use = f"use {DEFAULT_URI} or http://host:port"
+        raise TrackingError(f"{redacted(uri)}: MLflow 3 keeps no runs in folders; {use}")
+    raise TrackingError(f"{redacted(uri)}: not a tracking address; use sqlite:///mlflow.db or http://host:port")
+
+
+def address_scheme(uri: str) -> str:
+    """The scheme of a tracking address, without a database's driver; "" for a folder."""
+    return _HOSTED if uri == _HOSTED else uri.partition(":")[0].partition("+")[0].lower() if ":" in uri else ""
+
+
+def is_database(uri: str) -> bool:
+    """Whether an address is a database's that MLflow opens in this process, not a server's."""
+    return address_scheme(uri) in ("sqlite", *_DATABASES)
 
 
 def with_password(saved: str) -> str:
     """The address that a run was begun with, with the user and password that MLFLOW_TRACKING_URI may have for it."""
     usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
-    return usual if shown(usual) == saved else saved
+    return usual if redacted(usual) == redacted(saved) else saved
+
+
+def reach_loopback_directly() -> None:
+    """Except this machine from the proxies that the environment names: no proxy would reach its loopback addresses.
+
+    To be called before there are threads, as it changes the environment.
+    """
+    proxies = urllib.request.getproxies_environment()
+    excepted = proxies.pop("no", "")
+    names = [name.strip() for name in excepted.split(",") if name.strip()]
+    missing = [name for name in _LOOPBACK if name not in names]
+    if proxies and missing and "*" not in names:
+        os.environ["no_proxy"] = ",".join([*names, *missing])
 
 
 def _check_sqlite(uri: str) -> str:
     """The address with an absolute path. Raises TrackingError if the database, or its folder, cannot be written."""
-    path = sqlite_path(uri)
+    path, shown = sqlite_path(uri), redacted(uri)
     if path is None:
-        raise TrackingError(f"{uri}: names no file; use sqlite:///mlflow.db")
+        raise TrackingError(f"{shown}: names no file; use {DEFAULT_URI}")
     if not path.parent.is_dir():
-        raise TrackingError(f"{uri}: there is no folder {path.parent}; create it first")
+        raise TrackingError(f"{shown}: there is no folder {path.parent}; create it first")
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise TrackingError(f"{uri}: the folder {path.parent} cannot be written")
+        raise TrackingError(f"{shown}: the folder {path.parent} cannot be written")
     if path.is_dir():
-        raise TrackingError(f"{uri}: {path} is a folder; name a file")
+        raise TrackingError(f"{shown}: {path} is a folder; name a file")
+    absolute = sqlite_uri(path, _sqlite_parts(uri)[2])
     if path.exists() and path.stat().st_size:
+        address, found = f"file:{urllib.parse.quote(str(path))}?mode=rw", []
         try:
-            address = f"file:{urllib.parse.quote(str(path))}?mode=rw"
-            with contextlib.closing(sqlite3.connect(address, PROBE_S, isolation_level=None, uri=True)) as database:
+            with contextlib.closing(sqlite3.connect(address, 0.0, isolation_level=None, uri=True)) as database:
                 database.execute("BEGIN IMMEDIATE")  # fails where writing would; closing undoes it
+                if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'alembic_version'").fetchall():
+                    found = database.execute("SELECT version_num FROM alembic_version").fetchall()
         except sqlite3.Error as error:
-            raise TrackingError(f"{uri}: not a database that can be written: {error}") from error
-    query = uri.partition("?")[2]
-    return f"sqlite:///{path}" + (f"?{query}" if query else "")
+            locked = getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY
+            if not locked:  # the tracker waits for it
+                raise TrackingError(f"{shown}: not a database that can be written: {error}") from error
+        if found and (problem := schema_problem(found[0][0], absolute)):
+            raise TrackingError(problem)
+    return absolute
+
+
+def _sqlite_parts(uri: str) -> tuple[str, str, str]:
+    """Driver, path and query of a SQLite address, or three empty texts. A path may have a question mark, too."""
+    match = re.fullmatch(r"sqlite(\+\w+)?:///(.+?)(?:\?((?:[\w.-]+=[^/&]*&?)+))?", uri, re.IGNORECASE | re.DOTALL)
+    return (match[1] or "", match[2], match[3] or "") if match else ("", "", "")
 
 
 def sqlite_path(uri: str) -> Path | None:
     """The database file of a SQLite address, absolute; None for another kind of address or a database in memory."""
-    match = re.fullmatch(r"sqlite(?:\+\w+)?:///([^?]+)(?:\?.*)?", uri)
-    return None if match is None or match[1] == ":memory:" else Path(os.path.abspath(match[1]))
+    driver, text, _ = _sqlite_parts(uri)
+    if not text or ":memory:" in text:
+        return None
+    path = Path(os.path.abspath(text))
+    # SQLAlchemy decodes a path, which users seldom expect.
+    return Path(os.path.abspath(urllib.parse.unquote(text))) if driver or not path.parent.is_dir() else path
+
+
+def sqlite_uri(path: Path, query: str = "") -> str:
+    """The SQLite address of an absolute path.
+
+    SQLAlchemy takes a question mark for a query's beginning, and decodes what follows a percent sign. MLflow makes the
+    folders of an encoded path, unless the address names the driver.
+    """
+    text = str(path).replace("%", "%25").replace("?", "%3F")
+    return f"sqlite{'+pysqlite' if text != str(path) else ''}:///{text}" + (f"?{query}" if query else "")
+
+
+@functools.cache
+def _schema_revisions() -> tuple[frozenset[str], frozenset[str]]:
+    """Revisions of the database's schema that the installed MLflow knows, and the newest of them."""
+    package = importlib.util.find_spec("mlflow")
+    assert package is not None
+    assert package.origin is not None
+    files = (Path(package.origin).parent / "store/db_migrations/versions").glob("*.py")
+    text = "\n".join(file.read_text(encoding="utf-8") for file in files)
+    known, followed = (
+        frozenset(re.findall(rf"^{name} = ['\"](\w+)", text, re.MULTILINE)) for name in ("revision", "down_revision")
+    )
+    return known, known - followed
+
+
+def schema_problem(revision: str | None, uri: str) -> str:
+    """Why a database of this schema is not used, in one line, or "".
+
+    MLflow would migrate an older one at once, after which the older MLflow, of others perhaps, cannot open it any more.
+    """
+    known, newest = _schema_revisions()
+    if not revision or not newest or revision in newest:
+        return ""
+    if revision not in known:
+        return f"{redacted(uri)} is a database of a newer MLflow, or of another program; use another --tracking-uri"
+    upgrade = f"mlflow db upgrade {shlex.quote(redacted(uri))}"
+    return (
+        f"{redacted(uri)} was made by an older MLflow, which cannot open it once it is upgraded; copy it, then run "
+        f"{upgrade}, or use another --tracking-uri"
+    )
 
 
 def server_problem(uri: str) -> str:
@@ -99,7 +192,7 @@ def server_problem(uri: str) -> str:
     unchecked = ssl.create_default_context()
     unchecked.check_hostname, unchecked.verify_mode = False, ssl.CERT_NONE
     try:
-        with urllib.request.urlopen(shown(uri) + _PAGE, timeout=PROBE_S, context=unchecked) as answer:
+        with urllib.request.urlopen(redacted(uri) + _PAGE, timeout=PROBE_S, context=unchecked) as answer:
             return "" if answer.read(64).lstrip().startswith(b"{") else "something else answers there"
     except urllib.error.HTTPError as error:
         if b"Invalid Host header" in error.read(200):
@@ -111,14 +204,28 @@ def server_problem(uri: str) -> str:
         return one_line(error)
 
 
-def shown(uri: str) -> str:
-    """An address, or a text that may hold one, without user and password."""
-    return re.sub(r"(?<=:)//[^/@\s]*@", "//", uri)
+def redacted(uri: str) -> str:
+    """An address without user, password and other secrets: all up to the last @ before its path, and secret parameters.
+
+    What can be read in two ways, as an @ behind a question mark, is left out as a whole.
+    """
+    start, rest = re.fullmatch(r"((?:[\w.+-]*:)?//|)(.*)", uri, re.DOTALL).groups()  # type: ignore[union-attr]
+    head, mark, query = rest.partition("?")
+    if "@" in rest and not rest.startswith("/") and (start or ":" in rest.partition("@")[0]):
+        if "@" in query and re.search("[:@]", head):
+            return f"{start}..."
+        head = head.rpartition("@")[2]
+    # A value may itself hold parameters (odbc_connect).
+    names = {part: urllib.parse.unquote_plus(part.rpartition("=")[0]) for part in query.split("&")}
+    kept = "&".join(part for part, name in names.items() if not _SECRET.search(name))
+    return start + head + (mark + kept if kept or not query else "")
 
 
 def one_line(error: BaseException) -> str:
-    """The error in one line, without a password; of what the system refused only why."""
+    """The error in one line, without secrets; for errors of the system only the reason."""
     text = str(error) or type(error).__name__
+    if isinstance(error, TrackingError):
+        return text
     reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>:]+)", text)
     if reasons:
         return reasons[-1].strip()
@@ -126,4 +233,6 @@ def one_line(error: BaseException) -> str:
         return "no answer in time"
     lines = text.splitlines()
     # SQLAlchemy may put a hint of its own before what went wrong.
-    return shown(lines[1] if text.startswith("(raised as") and len(lines) > 1 else lines[0])[:200]
+    line = lines[1] if text.startswith("(raised as") and len(lines) > 1 else lines[0]
+    line = re.sub(r"[\w.+-]*:?//\S+|\S*:\S*@\S*", lambda address: redacted(address[0]), line)
+    return re.sub(rf"([\w.%-]*(?:{_SECRET.pattern})[\w.%-]*)=\S+", r"\1=...", line, flags=re.IGNORECASE)[:200]

@@ -10,8 +10,8 @@ pickled module, and load where MLFLOW_ALLOW_PICKLE_DESERIALIZATION is `false`. W
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
-import json
 import logging
 import os
 import shutil
@@ -25,8 +25,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from cluster.tracking.address import TrackingError, shown, sqlite_path
+from cluster.tracking.address import (
+    TrackingError,
+    is_database,
+    one_line,
+    redacted,
+    schema_problem,
+    sqlite_path,
+    sqlite_uri,
+)
 from cluster.tracking.commit import DIRTY, git_commit
+from cluster.tracking.view import VIEW_TAG, run_table, view
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,12 +55,9 @@ RUN_ID = "{run_id}"
 """Stands in a description for MLflow's id of the run, which is not yet known when it is written."""
 BEST = "best"
 """Alias of a registered model's version with the greatest success on held-out roads."""
-VIEW, _VIEW_TAG = "gridsim", "mlflow.sharedViewState.gridsim"
-"""The saved view of an experiment in MLflow's UI, and the experiment's tag that holds it."""
-_COLUMNS = {"held_out/success_rate": 165, "validation/success_rate": 175, "held_out/speed_mps": 150, "car_steps": 90}
-"""What the view's run table shows of each run, and the columns' widths in pixels."""
 MODEL = "model"
 """Folder of the champion as a torch model, in a run's folder and among its artifacts."""
+ROOM = 3_000_000  # bytes in the temporary folder for a new database (1 MB), or for a model besides its weights
 MAX_BATCH = 1000  # metrics that MLflow takes in one request
 
 # Set unless the user has set them. MLflow's own retries would go on for minutes; ours replace them.
@@ -107,6 +113,7 @@ class Identity:
     tags: Mapping[str, str]
     note: str = ""  # its description, Markdown
     key: str = field(default_factory=lambda: uuid.uuid4().hex)  # made before MLflow is imported; the run's KEY_TAG
+    run_id: str = ""  # MLflow's id of the run, if it is known
     finished: bool = False  # whether it has ended, so that what MLflow has of it stays as it is: status, times, files
     started: float | None = None  # s since the epoch at which a new one began; None: now
 
@@ -126,7 +133,7 @@ class Model:
 
 
 class LoggedRun:
-    """A run in MLflow, found by its key or created; `run_id` and `experiment_id` are MLflow's."""
+    """A run in MLflow, found by its id or key, or created; `run_id` and `experiment_id` are MLflow's."""
 
     def __init__(self, identity: Identity):
         quiet()
@@ -136,17 +143,39 @@ class LoggedRun:
         path = sqlite_path(identity.uri)
         if path and not path.exists():
             _create_database(path)
+        _check_schema(identity.uri)
         self._client = MlflowClient(tracking_uri=identity.uri)
-        self.experiment_id = _experiment_id(self._client, identity.experiment, path)
         self._logged: defaultdict[str, set[int]] = defaultdict(set)  # the steps that MLflow has of each metric
-        everywhere = [each.experiment_id for each in self._client.search_experiments()]
-        found = self._client.search_runs(everywhere, f"tags.`{KEY_TAG}` = '{identity.key}'", max_results=1)
-        run = found[0] if found else self._create()
+        run = self._known()
+        self.experiment_id: str = run.info.experiment_id if run else _experiment_id(self._client, identity, path)
+        run = run or self._with_key() or self._create()
         self.run_id: str = run.info.run_id
         self._artifacts: str = run.info.artifact_uri
         self._started: int = run.info.start_time
         self._has_ended = identity.finished and run.info.status == "FINISHED"
         self._complete(run)
+
+    def _known(self) -> Run | None:
+        """The run with the id that the run's folder has; None if this store has no such run, or it was deleted."""
+        from mlflow.exceptions import MlflowException
+
+        if not self._identity.run_id:
+            return None
+        try:
+            run = self._client.get_run(self._identity.run_id)
+        except MlflowException as error:
+            if error.error_code not in ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE"):
+                raise
+            return None
+        ours = run.data.tags.get(KEY_TAG) == self._identity.key and run.info.lifecycle_stage == "active"
+        return run if ours else None
+
+    def _with_key(self) -> Run | None:
+        """The run of the experiment that has the key: a run that was killed may not have saved its id."""
+        found = self._client.search_runs(
+            [self.experiment_id], f"tags.`{KEY_TAG}` = '{self._identity.key}'", max_results=1
+        )
+        return found[0] if found else None
 
     def _create(self) -> Run:
         from mlflow.tracking.context.git_context import GitRunContext
@@ -201,23 +230,62 @@ class LoggedRun:
         """Store a file among the artifacts. Returns: False for a finished run's file that MLflow has in the same size.
 
         Files are sent one by one: MLflow's own pool of threads would hold up the exit if a server hangs.
+        Raises: TrackingError, which names the folder, if they are kept in one that is not there or cannot be written.
         """
+        self._check_artifacts()
         if self._identity.finished:
             listed: list[FileInfo] = self._client.list_artifacts(self.run_id, folder)
             if (path.name, path.stat().st_size) in [(Path(each.path).name, each.file_size) for each in listed]:
                 return False
-        self._client.log_artifact(self.run_id, str(path), folder)
+        try:
+            self._client.log_artifact(self.run_id, str(path), folder)
+        except OSError as error:
+            if not error.filename:  # of a server
+                raise
+            raise TrackingError(f"{error.filename2 or error.filename}: {error.strerror}") from error
         return True
 
-    def log_model(self, folder: Path, model: Model) -> bool:
-        """Write a model into a run's folder, store it, and make it the newest version of its name.
+    def _check_artifacts(self) -> None:
+        """Raise TrackingError if files go to a folder of another machine, which MLflow would make on this one."""
+        from mlflow.utils.file_utils import local_file_uri_to_path
+        from mlflow.utils.uri import is_local_uri
 
-        The best of all versions gets the alias. Returns: whether there is a new version; a champion gets only one.
-        """
+        served = self._identity.uri.startswith("http")
+        if not (served or is_database(self._identity.uri)) or not is_local_uri(self._artifacts):
+            return
+        location = Path(local_file_uri_to_path(self._artifacts)).parents[1]  # without the run's id and `artifacts`
+        if not (location.is_dir() or location.parent.is_dir()):
+            remedy = "start the server with --serve-artifacts and " if served else ""
+            raise TrackingError(
+                f"the experiment keeps its files in {location}, which is not on this machine: create it if they belong "
+                f"here, else {remedy}use a new --experiment"
+            )
+
+    def store_model(self, folder: Path, model: Model) -> None:
+        """Write a model into a run's folder, and store it."""
         write_model(folder / MODEL, model)
         for path in sorted((folder / MODEL).rglob("*")):
             if path.is_file():
                 self.upload(path, path.parent.relative_to(folder).as_posix())
+
+    def register(self, model: Model) -> bool:
+        """Make a stored model the newest version of its name. The best of all versions gets the alias.
+
+        Returns: whether there is a new version; a champion gets only one.
+        Raises: TrackingError with the registry's address if it is not the run's.
+        """
+        registry = os.environ.get("MLFLOW_REGISTRY_URI") or self._identity.uri
+        if registry == self._identity.uri:
+            return self._register(model)
+        try:
+            _check_schema(registry)
+            return self._register(model)
+        except Exception as error:  # whatever MLflow raises
+            raise TrackingError(
+                f"the registry {redacted(registry)} (MLFLOW_REGISTRY_URI): {one_line(error)}"
+            ) from error
+
+    def _register(self, model: Model) -> bool:
         client = self._client
         found = client.search_model_versions(f"name = '{model.name}' and run_id = '{self.run_id}'")
         new = all(each.tags.get(CHAMPION_TAG) != model.champion_sha256 for each in found)
@@ -285,8 +353,8 @@ def write_model(folder: Path, model: Model) -> None:
     module, example = model.build()
     built = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(built, ignore_errors=True)
-    # In the temporary folder first: if the disk becomes full while PyTorch writes, it aborts the process.
-    with tempfile.TemporaryDirectory() as scratch, warnings.catch_warnings():
+    # In the temporary folder first, with enough room: PyTorch aborts the process if a disk becomes full as it writes.
+    with _scratch(ROOM + 3 * sum(each.nbytes for each in module.parameters())) as scratch, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch and MLflow cause them themselves
         mlflow.pytorch.save_model(
             module,
@@ -303,27 +371,63 @@ def write_model(folder: Path, model: Model) -> None:
     built.rename(folder)
 
 
+@contextlib.contextmanager
+def _scratch(room: int) -> Iterator[str]:
+    """A folder in the temporary folder, with so many bytes of room. Raises TrackingError if there is less."""
+    with contextlib.ExitStack() as stack:
+        try:
+            scratch = stack.enter_context(tempfile.TemporaryDirectory())
+            tried = Path(scratch, "room")
+            tried.write_bytes(bytes(room))
+            tried.unlink()
+        except OSError as error:
+            where = f"the temporary folder, {tempfile.gettempdir()}, has no {room / 1e6:.0f} MB left"
+            raise TrackingError(f"{where}: {error.strerror or error}; make room, or set TMPDIR") from error
+        yield scratch
+
+
+def _check_schema(uri: str) -> None:
+    """Raise TrackingError for a database of another version of MLflow, which would migrate it without asking."""
+    from mlflow.store.db import utils
+
+    if is_database(uri):
+        engine = utils.create_sqlalchemy_engine(uri)
+        try:
+            problem = schema_problem(utils._get_schema_version(engine), uri)
+        finally:
+            engine.dispose()
+        if problem:
+            raise TrackingError(problem)
+
+
 def _create_database(path: Path) -> None:
     """Make a new, complete MLflow database appear at `path`, unless another process is first.
 
     MLflow builds it by 60 migrations in a second. If it is killed in the middle, or two runs start together, what is
-    left is a database that it can never open again. So it is built elsewhere.
+    left is a database that it can never open again. So it is built elsewhere, by one process at a time.
     """
-    from mlflow.tracking import MlflowClient
+    from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
 
-    whole = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with tempfile.TemporaryDirectory() as folder:
+    whole, locked = (path.with_name(f".{path.name}.{end}") for end in (f"{os.getpid()}.tmp", "lock"))
+    with open(locked, "wb") as lock, contextlib.ExitStack() as last:
+        last.callback(locked.unlink, missing_ok=True)
+        last.callback(whole.unlink, missing_ok=True)
+        with contextlib.suppress(
+            OSError
+        ):  # NFS may not lock; then several processes build one, and the first one's stays
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if path.exists():
+            return
+        with _scratch(ROOM) as folder:
             built = Path(folder, "mlflow.db")
-            MlflowClient(tracking_uri=f"sqlite:///{built}").search_experiments(max_results=1)
+            # An address as MLflow's own default location: it breaks at some folders' names.
+            SqlAlchemyStore(sqlite_uri(built), (path.parent / "mlartifacts").as_uri()).engine.dispose()
             shutil.copyfile(built, whole)
         try:
             os.link(whole, path)
         except OSError:
             if not path.exists():  # on a file system without hard links
                 os.rename(whole, path)
-    finally:
-        whole.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -338,28 +442,23 @@ def _may_exist() -> Iterator[None]:
             raise
 
 
-def _experiment_id(client: MlflowClient, name: str, database: Path | None) -> str:
+def _experiment_id(client: MlflowClient, identity: Identity, database: Path | None) -> str:
     """The experiment of that name, created if need be with its artifacts beside the database, and its saved view."""
     from mlflow.exceptions import MlflowException
 
-    http = client.tracking_uri.startswith("http")  # the server knows best where artifacts go
-    location = None if http else ((database.parent if database else Path.cwd()) / "mlartifacts").as_uri()
+    name, location = identity.experiment, None  # a server, or a hosted store, knows best where artifacts go
+    if is_database(identity.uri):
+        location = ((database.parent if database else Path.cwd()) / "mlartifacts").as_uri()
     if client.get_experiment_by_name(name) is None:
         with _may_exist():
             client.create_experiment(name, artifact_location=location)
     experiment = client.get_experiment_by_name(name)
     if experiment is None or experiment.lifecycle_stage != "active":
         raise TrackingError(f"experiment {name!r} has been deleted; restore it or choose another name")
-    if _VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
+    if VIEW_TAG not in experiment.tags:  # it may have been changed in the UI
         with contextlib.suppress(MlflowException):  # a server may allow nothing but runs
-            client.set_experiment_tag(experiment.experiment_id, _VIEW_TAG, _view())
+            client.set_experiment_tag(experiment.experiment_id, VIEW_TAG, view())
     return experiment.experiment_id
-
-
-def run_table(server: str, experiment_id: str) -> str:
-    """Address of an experiment's run table in an MLflow server's UI, as MLflow 3.17 opens another page by default."""
-    page = f"#/experiments/{experiment_id}/runs?workflowType=machine_learning&viewStateShareKey={VIEW}"
-    return f"{shown(server)}/{page}"
 
 
 def run_tables(uri: str, server: str) -> dict[str, str]:
@@ -370,18 +469,7 @@ def run_tables(uri: str, server: str) -> dict[str, str]:
     path = sqlite_path(uri)
     if path and not path.exists():
         return {}
+    _check_schema(uri)
     client = MlflowClient(tracking_uri=uri)
     found = [each for each in client.search_experiments() if client.search_runs([each.experiment_id], max_results=1)]
     return {each.name: run_table(server, each.experiment_id) for each in found}
-
-
-def _view() -> str:
-    """The saved view as MLflow's UI writes it: the run table's columns, and curves over car-steps."""
-    columns = {"attributes.`Run Name`": 270, **{f"metrics.`{name}`": width for name, width in _COLUMNS.items()}}
-    state = {
-        "selectedColumns": list(columns),
-        "columnOrder": list(columns),
-        "columnWidths": columns,
-        "globalLineChartConfig": {"xAxisKey": "metric", "selectedXAxisMetricKey": "car_steps", "lineSmoothness": 0},
-    }
-    return json.dumps({"name": "GridSim", "createdAt": int(1000.0 * time.time()), "state": json.dumps(state)})

@@ -9,14 +9,16 @@ be sent later (`train.send_missing`).
 
 from __future__ import annotations
 
+import shlex
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cluster.tracking.address import UI, TrackingError, one_line, shown
-from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload, run_table
+from cluster.tracking.address import UI, TrackingError, is_database, one_line, redacted, sqlite_path
+from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload
+from cluster.tracking.view import run_table
 
 FLUSH_S = 2.0  # rows that come within this time go out as one request: 5 ms of CPU for a row alone, 0.8 ms among many
 RETRY_S = 5.0
@@ -42,6 +44,7 @@ class Tracker:
         self._rows: list[Row] = []
         self._files: list[Path] = []
         self._model: tuple[Path, Model] | None = None
+        self._stored = False  # whether MLflow has the model's files
         self._wall_s: float | None = None
         self._status: Status | None = None  # set by close()
         self._ended = False
@@ -55,19 +58,21 @@ class Tracker:
         self._start()
         self._tried.wait(timeout_s)
         if self.run_id is None:
-            raise TrackingError(f"{shown(self.uri)}: {self.error or f'MLflow not ready after {timeout_s:g} s'}")
+            raise TrackingError(f"{redacted(self.uri)}: {self.error or f'MLflow not ready after {timeout_s:g} s'}")
         return self.run_id
 
     def where(self, mlflow: str) -> str:
         """How to see the run beside others in MLflow's UI, in words for the terminal; `mlflow` is how to call it."""
-        served = self.uri.startswith("http")
+        served, shown = self.uri.startswith("http"), redacted(self.uri)
+        if not (served or is_database(self.uri)):
+            return shown
         table = run_table(self.uri if served else UI, self._run.experiment_id) if self._run else ""
         if served:
-            return table or shown(self.uri)
-        make = "make ui, or " if self.uri == f"sqlite:///{Path.cwd()}/mlflow.db" else ""  # the store that it shows
-        return f"{make}MLFLOW_DISABLE_TELEMETRY=true {mlflow} ui --backend-store-uri {self.uri}" + (
-            f"; then open\n{table}" if table else ""
-        )
+            return table or shown
+        make = "make ui, or " if sqlite_path(self.uri) == Path.cwd() / "mlflow.db" else ""  # the store that it shows
+        command = f"{make}MLFLOW_DISABLE_TELEMETRY=true {mlflow} ui --backend-store-uri {shlex.quote(shown)}"
+        without = "" if shown == self.uri else " (add its user and password, which are not shown)"
+        return f"{command}{without}" + (f"; then open\n{table}" if table else "")
 
     def log_row(self, step: int, row: Mapping[str, float], wall_s: float | None = None) -> None:
         """Send metrics of a step, at `wall_s` after the run's start, or now. The last of these ends MLflow's run."""
@@ -104,19 +109,23 @@ class Tracker:
         span = f"{steps[0]} to {steps[-1]}" if len(steps) > 1 else f"{steps[0]}" if steps else ""
         lost = [f"{count(len(steps), 'row')} (step {span})"] if steps else []
         lost += [count(len(self._files), "file")] if self._files else []
-        lost += ["the model"] if self._model else []
+        if self._model:
+            lost.append("the registration of the model, whose files are stored" if self._stored else "the model")
         lost += [] if self._ended else [f"the status {self._status}"]
         if not lost:
             return None
         reason = self.error or f"no answer within {timeout_s:g} s"
-        return f"not logged to MLflow at {shown(self.uri)}: {', '.join(lost)}: {reason}"
+        return f"not logged to MLflow at {redacted(self.uri)}: {', '.join(lost)}: {reason}"
 
     def _start(self) -> None:
         if self._thread.ident is None:
             self._thread.start()
 
     def _work(self) -> None:
-        """Sync every FLUSH_S seconds, without a request if nothing is new, and once or twice when closed."""
+        """Sync every FLUSH_S seconds, without a request if nothing is new, and once or twice when closed.
+
+        A database that is locked as it is closed is tried again until `close` gives up.
+        """
         while not self._closed.is_set():
             synced = self._sync()
             if synced and self._preload.ident is None:
@@ -125,7 +134,8 @@ class Tracker:
             self._wake.clear()
         if not self._sync():
             time.sleep(CHANCE_S)
-            self._sync()
+            while not self._sync() and self._is_locked():
+                time.sleep(CHANCE_S)
 
     def _sync(self) -> bool:
         """Send what MLflow lacks; a failure does not hold up the rest. Returns whether MLflow has all of it."""
@@ -138,9 +148,14 @@ class Tracker:
                 if self._run is None:
                     break
             finally:
-                self._tried.set()
+                if self._run or not self._is_locked():
+                    self._tried.set()
         self.error = error
         return error is None
+
+    def _is_locked(self) -> bool:
+        """Whether the last sync failed only because others write to the database, which ends."""
+        return "database is locked" in (self.error or "")
 
     @property
     def _opened(self) -> LoggedRun:
@@ -162,7 +177,11 @@ class Tracker:
 
     def _send_model(self) -> None:
         if self._model:
-            self.sent["model"] += self._opened.log_model(*self._model)
+            folder, model = self._model
+            if not self._stored:
+                self._opened.store_model(folder, model)
+                self._stored = True
+            self.sent["model"] += self._opened.register(model)
             self._model = None
 
     def _end(self) -> None:

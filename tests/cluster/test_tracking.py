@@ -8,12 +8,13 @@ import sqlite3
 import subprocess
 import time
 
+import pytest
 from commands import finish, start
 from tracked import PARAMS, PYTHONPATH, TAGS, begin, client, row, runs, steps, tracker
 
 import cluster.tracking.commit
 from cluster.tracking import mlflow_run
-from cluster.tracking.address import check_uri
+from cluster.tracking.address import TrackingError, check_uri
 
 
 def test_a_run_read_back(uri, tmp_path, monkeypatch):
@@ -80,7 +81,7 @@ def test_resume_logs_only_what_is_missing(uri, tmp_path, monkeypatch):
     assert begun.close("KILLED") is None
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    resumed = tracker(uri, 15, experiment="other")
+    resumed = tracker(uri, 15, experiment="other", run_id=begun.run_id)
     resumed.wait_ready()
     assert client(uri).get_run(begun.run_id).info.status == "RUNNING"
     assert resumed.close("FINISHED") is None
@@ -145,9 +146,12 @@ def test_a_database_that_is_no_longer_mlflows_prints_nothing(tmp_path, empty_dat
         database.commit()
     with contextlib.closing(sqlite3.connect(broken)) as database:
         database.execute("ALTER TABLE metrics RENAME COLUMN is_nan TO is_gone")  # MLflow logs a traceback
-    for path in (foreign, broken):
-        done = finish("python", "-c", QUIET, f"sqlite:///{path}", cwd="/", timeout=600, PYTHONPATH=PYTHONPATH)
-        assert (done.stdout, done.stderr) == ("", "")
+    with pytest.raises(TrackingError, match="or of another program; use another --tracking-uri"):
+        check_uri(f"sqlite:///{foreign}")
+    with contextlib.closing(sqlite3.connect(foreign)) as database:  # and nothing was made in it
+        assert database.execute("SELECT name FROM sqlite_master").fetchall() == [("alembic_version",)]
+    done = finish("python", "-c", QUIET, f"sqlite:///{broken}", cwd="/", timeout=600, PYTHONPATH=PYTHONPATH)
+    assert (done.stdout, done.stderr) == ("", "")
 
 
 def test_git_commit(tmp_path):

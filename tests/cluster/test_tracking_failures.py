@@ -29,7 +29,9 @@ def test_files_that_cannot_be_stored(uri, tmp_path, impatient):
     (tmp_path / "store" / "mlartifacts").write_text("in the way")
     logged.log_files([tmp_path / "store" / "mlflow.db"])
     report = logged.close("FINISHED")
-    assert re.fullmatch(rf"not logged to MLflow at {uri}: 1 file: (Not a directory|File exists).*", report)
+    assert re.fullmatch(
+        rf"not logged to MLflow at {uri}: 1 file: /.*/mlartifacts.*: (Not a directory|File exists)", report
+    )
     assert logged.close("FINISHED") == report
     assert steps(uri, logged.run_id) == [0]
     assert client(uri).get_run(logged.run_id).info.status == "FINISHED"
@@ -42,8 +44,7 @@ def test_a_database_that_is_locked_for_a_while(uri, impatient):
         database.execute("BEGIN IMMEDIATE")
         logged.log_row(0, row(0))
         time.sleep(0.5)
-        with pytest.raises(TrackingError, match="database is locked"):
-            check_uri(uri)
+        assert check_uri(uri) == uri
         database.execute("ROLLBACK")
     assert logged.close("FINISHED") is None
     assert steps(uri, logged.run_id) == [0]

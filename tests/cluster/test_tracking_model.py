@@ -1,10 +1,13 @@
 """The champion as a torch model: written without pickle, read back by MLflow, registered once."""
 
+import contextlib
 import dataclasses
 import os
+import subprocess
 
 import numpy as np
 import pytest
+from commands import finish
 from tracked import client, steps, tracker
 
 from cluster.runs.champion import Champion
@@ -114,3 +117,41 @@ def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):
     begun.log_model(tmp_path, champion_model(1))
     assert begun.close("KILLED", timeout_s=120) is None
     assert client(uri).search_model_versions() == []
+
+
+def test_a_registry_that_is_elsewhere_and_away_is_named(uri, tmp_path, monkeypatch, impatient):
+    monkeypatch.setenv("MLFLOW_REGISTRY_URI", "http://someone:secret@127.0.0.1:1")
+    run_id = None
+    for _ in range(2):  # a run, and the command that sends what is missing
+        begun = tracker(uri, 1)
+        begun.log_model(tmp_path, champion_model())
+        said = begun.close("FINISHED", timeout_s=120)
+        assert said == (
+            f"not logged to MLflow at {uri}: the registration of the model, whose files are stored: "
+            "the registry http://127.0.0.1:1 (MLFLOW_REGISTRY_URI): Connection refused"
+        )
+        assert run_id in (None, begun.run_id)
+        run_id = begun.run_id
+    assert {each.path for each in client(uri).list_artifacts(run_id, "model")} >= {"model/MLmodel"}
+    monkeypatch.delenv("MLFLOW_REGISTRY_URI")
+    assert logged(uri, tmp_path, champion_model()) == run_id
+    assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
+
+
+@pytest.mark.e2e
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small file system")
+def test_a_full_temporary_folder_costs_the_model_only_which_is_sent_later(tmp_path, database):
+    (tmp_path / "small").mkdir()
+    flags = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--generations", "2", "--workers", "0")
+    with contextlib.ExitStack() as stack:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=32k", "small", tmp_path / "small"], check=True)
+        stack.callback(subprocess.run, ["umount", "-l", tmp_path / "small"], check=True)
+        done = finish("gridsim-evolve", *flags, "--name", "a", cwd=tmp_path, TMPDIR=str(tmp_path / "small"))
+        full = f"the temporary folder, {tmp_path}/small, has no 3 MB left: No space left on device"
+        assert f"the model: {full}; make room, or set TMPDIR; send it later with: " in done.stderr
+        assert done.stderr.count("\n") == 1
+        run = tmp_path / "runs/a"
+        assert {"summary.json", "drive.html", "curves.png", "trajectory.png"} <= {path.name for path in run.iterdir()}
+    again = finish("gridsim-evolve", "--resume", "runs/a", cwd=tmp_path)
+    assert again.stderr == ""
+    assert "sent to MLflow: 1 model" in again.stdout

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import urllib.request
 
+import psutil  # type: ignore[import-untyped]
 import pytest
 from browser import Browser, needs_chromium
 from commands import finish
@@ -64,7 +65,8 @@ def make_ui(root, folder, port):
             assert ui.stdout
             yield next(line.split()[-1] for line in ui.stdout if line.startswith("runs of gridsim: "))
         finally:
-            os.killpg(ui.pid, signal.SIGINT)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(ui.pid, signal.SIGINT)
 
 
 @pytest.mark.e2e
@@ -102,3 +104,24 @@ def test_a_port_in_use_is_one_line(tmp_path):
         done = finish("python", "-m", "cluster.commands.ui", port, cwd=tmp_path, code=1)
     assert done.stderr == f"make ui: port {port} is in use or not a port; choose another with make ui PORT=...\n"
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("who", ["make", "the command", "a closed terminal"])
+def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path, monkeypatch, who):
+    for name in ("http_proxy", "https_proxy", "ALL_PROXY"):  # where nobody answers
+        monkeypatch.setenv(name, "http://127.0.0.1:1")
+    for name in ("no_proxy", "NO_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    logged(uri, "first", 0.875)
+    with make_ui(root, tmp_path / "store", port := free_port()) as link:
+        assert link.startswith(f"http://127.0.0.1:{port}/#/experiments/")
+        (made,) = [each for each in psutil.process_iter(["cmdline"]) if (each.info["cmdline"] or [])[:1] == ["make"]
+                   and f"PORT={port}" in each.info["cmdline"]]  # fmt: skip
+        left = made.children(recursive=True)
+        assert len(left) >= 3  # the command, MLflow, and its workers
+        if who == "a closed terminal":
+            os.killpg(made.pid, signal.SIGHUP)
+        else:
+            os.kill(made.pid if who == "make" else left[0].pid, signal.SIGTERM)
+        assert not psutil.wait_procs(left, 15)[1]

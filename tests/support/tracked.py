@@ -69,10 +69,17 @@ def free_port():
 
 
 @contextlib.contextmanager
-def mlflow_server(folder, port):
+def mlflow_server(folder, port, *flags):
     """MLflow's own, with a database and artifacts in `folder`, until it is killed at the end."""
     command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1", "--port", str(port)]
-    command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
+    command += [
+        "--backend-store-uri",
+        f"sqlite:///{folder}/served.db",
+        "--artifacts-destination",
+        f"{folder}/served",
+        *flags,
+    ]
+    command += flags
     with open(folder / "server.log", "a") as log:
         quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
         server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)

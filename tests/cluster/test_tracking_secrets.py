@@ -1,0 +1,125 @@
+"""No secret of a tracking address is printed, written or sent, and none is lost to a run that is resumed."""
+
+import io
+import re
+import shlex
+import zipfile
+
+import pytest
+from commands import finish, refused, summary
+from hypothesis import given
+from hypothesis import strategies as st
+from tracked import client, free_port, mlflow_server, tracker
+
+from cluster.commands.cli import evolve_main
+from cluster.comparison.plan import ComparisonFolder, Plan
+from cluster.tracking.address import check_uri, one_line, redacted
+
+TINY = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--generations", "2", "--workers", "0")
+
+
+@pytest.mark.parametrize(
+    ("uri", "shown"),
+    [
+        ("http://u:se%40cret@h:5000", "http://h:5000"),
+        ("https://u:se@cret@h/prefix", "https://h/prefix"),
+        ("http://secret@h", "http://h"),
+        ("postgresql://u:se/cr@et@h:1/db", "postgresql://h:1/db"),
+        ("mysql+pymysql://u:sec/ret@h/db?charset=utf8mb4", "mysql+pymysql://h/db?charset=utf8mb4"),
+        ("postgresql://u:secret@[::1]:5432/db", "postgresql://[::1]:5432/db"),
+        ("postgresql://u:sec?ret@h/db", "postgresql://..."),
+        ("postgresql://h/db?user=u&password=secret&timeout=9", "postgresql://h/db?user=u&timeout=9"),
+        ("postgresql://h/db?PASSWORD=se@cret", "postgresql://h/db"),
+        ("postgresql://h/db?p%61ssword=secret", "postgresql://h/db"),
+        ("postgresql://h/db?sslkey=/secret&sslpassword=secret&sslmode=require", "postgresql://h/db?sslmode=require"),
+        ("mssql+pyodbc://u:secret@h/db?driver=ODBC+Driver+18", "mssql+pyodbc://h/db?driver=ODBC+Driver+18"),
+        ("mssql+pyodbc:///?odbc_connect=DRIVER%3Dx%3BUID%3Du%3BPWD%3Dsecret", "mssql+pyodbc:///"),
+        ("mssql+pyodbc:///?odbc_connect=DRIVER=x;UID=u;PWD=secret", "mssql+pyodbc:///"),
+        ("https://h/?token=secret", "https://h/"),
+        ("https://h/?access_key=secret&signature=secret&credential=secret", "https://h/"),
+        ("u:secret@h/db", "h/db"),
+        ("//u:secret@h/db", "//h/db"),
+        ("sqlite:////a/with@sign/mlflow.db?timeout=9", "sqlite:////a/with@sign/mlflow.db?timeout=9"),
+        ("databricks://profile", "databricks://profile"),
+        ("some/folder", "some/folder"),
+    ],
+)  # fmt: skip
+def test_what_is_shown_of_an_address(uri, shown):
+    assert redacted(uri) == shown
+    assert redacted(shown) == shown
+    said = one_line(ValueError(f"(psycopg2.OperationalError) {uri}: no such host\nmore of {uri}"))
+    assert not re.search("secret|se%40cret|cret|ret@|sec/", said.replace("access_key", ""))
+
+
+SPECIAL = st.lists(st.sampled_from([*list("@/?#:&=;%+, '\"[]"), "hunter"]), min_size=1).map("".join)
+
+
+@given(SPECIAL, st.sampled_from(["postgresql", "mysql+pymysql", "http"]), st.booleans())
+def test_no_part_of_a_password_is_shown_whatever_characters_it_has(password, scheme, query):
+    assert "hunter" not in redacted(f"{scheme}://user:{password}@host:1/db{'?timeout=9' if query else ''}")
+    value = password.replace("&", "")
+    assert "hunter" not in redacted(f"{scheme}://host:1/db?password={value}{'&timeout=9' if query else ''}")
+
+
+def test_what_a_run_prints_at_its_end_is_quoted_and_has_no_password():
+    where = tracker("postgresql://u:secret@db/ml flow").where("mlflow")
+    assert where == (
+        "MLFLOW_DISABLE_TELEMETRY=true mlflow ui --backend-store-uri 'postgresql://db/ml flow'"
+        " (add its user and password, which are not shown)"
+    )
+    assert shlex.split(tracker("sqlite:////a b/it's/mlflow.db").where("mlflow"))[-1] == "sqlite:////a b/it's/mlflow.db"
+
+
+def test_files_hold_no_secret_and_a_resumed_run_finds_it_again(tmp_path, monkeypatch):
+    whole = "postgresql://u:se/cr@et@h/db?sslkey=/my/secret&sslmode=require"
+    comparison = ComparisonFolder(tmp_path, Plan(), whole)
+    comparison.write()
+    assert '"postgresql://h/db?sslmode=require"' in (tmp_path / "comparison.json").read_text()
+    saved = redacted(whole)
+    assert check_uri(begun_with=saved) == saved
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", whole)
+    assert check_uri(begun_with=saved) == whole
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["postgresql://u:se/cr@et@127.0.0.1:1/db", "http://u:se/cr@et@127.0.0.1:1", "mysql://u:cret@127.0.0.1:1/d?token=cret",
+     "u:cret@127.0.0.1/db", "ftp://u:cret@h", "sqlite://u:cret@/x.db", "sqlite:////no/folder/x.db?key=cret",
+     "http://127.0.0.1:1/?token=cret"],
+)  # fmt: skip
+def test_an_address_that_is_refused_is_shown_without_its_secret(uri, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    said = "\n".join(refused(evolve_main, monkeypatch, capsys, "--tracking-uri", uri))
+    assert "cret" not in said.replace("secret", "")
+    assert "se/" not in said
+
+
+def everything(folder):
+    """The bytes of all files of a folder, and of all members of those that are archives."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            yield path, path.read_bytes()
+            if zipfile.is_zipfile(path):
+                with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as archive:
+                    yield from ((f"{path}:{name}", archive.read(name)) for name in archive.namelist())
+
+
+@pytest.mark.e2e
+def test_a_secret_is_in_nothing_that_a_run_prints_writes_or_sends(tmp_path):
+    secret, port = "hunter2", free_port()
+    address = f"http://someone:p%40{secret}@127.0.0.1:{port}"
+    with mlflow_server(tmp_path, port):
+        done = finish("gridsim-evolve", *TINY, "--name", "a", cwd=tmp_path, MLFLOW_TRACKING_URI=address)
+        again = finish("gridsim-evolve", "--resume", "runs/a", cwd=tmp_path, MLFLOW_TRACKING_URI=address)
+        compared = ("--scenarios", "curved", "--learners", "evolution", "--seeds", "1", "--budget", "10k")
+        more = finish(
+            "gridsim-compare", *compared, "--workers", "0", "--population", "16", "--generations", "1", "--traffic",
+            "0", "--name", "c", "--tracking-uri", address, cwd=tmp_path,
+        )  # fmt: skip
+        run = client(f"http://127.0.0.1:{port}").get_run(summary(tmp_path / "runs/a")["mlflow_run_id"])
+        assert run.info.status == "FINISHED"
+        assert f"http://127.0.0.1:{port}/#/experiments/" in done.stdout
+    assert secret not in done.stdout + done.stderr + again.stdout + again.stderr + more.stdout + more.stderr
+    checked = list(everything(tmp_path))  # the server's database and artifacts, too
+    assert len([name for name, _ in checked if "served/" in str(name)]) > 30
+    assert [name for name, content in checked if secret.encode() in content] == []
