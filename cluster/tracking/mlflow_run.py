@@ -69,11 +69,11 @@ _ENVIRONMENT = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
 }
-_LOGGERS = ("mlflow", "alembic", "sqlalchemy", "urllib3", "torch")
+_LOGGERS = ("mlflow", "alembic", "sqlalchemy", "urllib3", "torch", "matplotlib")
 
 
 def quiet() -> None:
-    """Keep MLflow from writing to the terminal: its errors reach the caller. What the user has set stays.
+    """Keep MLflow and others from writing to the terminal: errors reach the caller. What the user has set stays.
 
     To be called before there are threads, as `ray_session.prepare`.
     """
@@ -412,9 +412,8 @@ def _create_database(path: Path) -> None:
     with open(locked, "wb") as lock, contextlib.ExitStack() as last:
         last.callback(locked.unlink, missing_ok=True)
         last.callback(whole.unlink, missing_ok=True)
-        with contextlib.suppress(
-            OSError
-        ):  # NFS may not lock; then several processes build one, and the first one's stays
+        # NFS may not lock. Then several processes build a database, and the first one's stays.
+        with contextlib.suppress(OSError):
             fcntl.flock(lock, fcntl.LOCK_EX)
         if path.exists():
             return

@@ -40,7 +40,7 @@ def test_the_address_of_a_database_in_an_odd_folder(tmp_path, monkeypatch, name)
 
 @pytest.mark.e2e
 def test_a_run_in_a_folder_with_an_odd_name(tmp_path):
-    folder, elsewhere = tmp_path / "what now? #1 100%41;a&b'\" ü", tmp_path / "elsewhere"
+    folder, elsewhere = tmp_path / "what now? #1 100%41;a&b'\" ü [c]", tmp_path / "elsewhere"
     folder.mkdir()
     elsewhere.mkdir()
     done = finish("gridsim-evolve", *TINY, "--name", "a", cwd=folder)
