@@ -146,11 +146,13 @@ def own_folder() -> str:
 
     Ray's own choice, /tmp/ray, is open to all users of a machine. Raises PoolError.
     """
-    with contextlib.suppress(FileNotFoundError):  # there is no temporary folder that can be used
-        default = tempfile.gettempdir()
-    chosen = os.environ.get("RAY_TMPDIR")
-    problem = "there is no temporary folder"
-    for base in (chosen,) if chosen else (default, "/tmp"):
+    bases, problem = ["/tmp"], "there is no temporary folder"
+    if chosen := os.environ.get("RAY_TMPDIR"):
+        bases = [chosen]
+    else:
+        with contextlib.suppress(FileNotFoundError):  # no temporary folder can be written to
+            bases.insert(0, tempfile.gettempdir())
+    for base in bases:
         try:
             folder = tempfile.mkdtemp(prefix="gs-", dir=os.path.abspath(base))
         except OSError as error:
