@@ -47,9 +47,6 @@ OWN_ENVIRONMENT = {
     "RAY_enable_metrics_collection": "0",
     "RAY_task_events_report_interval_ms": "0",
     "RAY_worker_niceness": "0",  # Ray's 15 would let a busy machine starve the workers until patience ends the run
-    # Ray's name for "use the loopback address, as on a laptop": nobody else can connect, and a network that changes
-    # does not matter. Ray reads it when it is imported, so a process that has had a Ray of its own joins no cluster.
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
 }
 # Ray lets in whoever has its token. Ours must not outlive the run in ~/.ray, where it would change what `ray start`
 # does from then on.
@@ -194,8 +191,8 @@ def _own_runtime_env(folder: str) -> dict[str, Any]:
     empty.mkdir()
     parents = dict.fromkeys(str(Path(package.__path__[0]).parent) for package in PACKAGES)
     path = [parent for parent in parents if parent not in site.getsitepackages()]
-    path += filter(None, [os.environ.get("PYTHONPATH")])
-    variables = {"PYTHONPATH": os.pathsep.join(path)} if path else {}
+    path += filter(None, [os.environ.get("PYTHONPATH"), os.path.abspath(sys.path[0])])  # the latter is the script's
+    variables = {"PYTHONPATH": os.pathsep.join(path)}
     if cache := os.environ.get("GRIDSIM_CACHE_DIR"):
         variables["GRIDSIM_CACHE_DIR"] = os.path.abspath(cache)  # the workers' working folder is another one
     return {"working_dir": str(empty), "env_vars": variables}
@@ -320,18 +317,21 @@ def _be_quiet() -> None:
 
 @contextlib.contextmanager
 def _lean_head() -> Iterator[None]:
-    """Start Ray's head without the helpers that only its dashboard, autoscaler and terminal output need.
+    """Start Ray's head on loopback, without the helpers that only its dashboard, autoscaler and terminal output need.
 
+    Nobody else can connect then, and a network that changes does not matter: as Ray does by itself on macOS.
     Its processes get groups of their own: a signal to our whole group would end them half started, and `ray.init` would
     then wait for a minute. Ray has no settings for these, so meanwhile this replaces private names.
     """
     with contextlib.ExitStack() as undo:
         with contextlib.suppress(ImportError, AttributeError, TypeError):  # a version of Ray without these names
             node, parameter, services = _private("node").Node, _private("parameter"), _private("services")
+            constants = _private("ray_constants")
             lean = partial(parameter.RayParams, no_monitor=True, include_log_monitor=False)
             lean()
             group = 0 if sys.platform == "linux" else None  # elsewhere Ray ends its processes by our group
             replaced: list[tuple[Any, str, Any]] = [
+                (constants, "ENABLE_RAY_CLUSTER", False),
                 (node, "start_api_server", _no_api_server),
                 (parameter, "RayParams", lean),
                 (services, "ConsolePopen", partial(services.ConsolePopen, process_group=group)),

@@ -9,6 +9,7 @@ from typing import Any
 
 import psutil  # type: ignore[import-untyped]
 import pytest
+import ray  # before a Ray of our own is started, as in a notebook that uses Ray itself
 import tracked
 from commands import (
     BIN,
@@ -158,7 +159,7 @@ def test_memory_that_is_full_costs_no_member_and_is_said_once(reference: Path, t
 
 
 def test_a_ray_that_is_in_use_in_this_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ray.is_initialized", lambda: True)
+    monkeypatch.setattr(ray, "is_initialized", lambda: True)
     with (
         contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool,
         pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or evaluate in this process \(workers=0\)$"),
