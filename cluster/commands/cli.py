@@ -209,7 +209,7 @@ def _learn(kind: type[Flags]) -> int:
         initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
         progress = Progress(console, prog, folder, resume)
         session = train(run, workers, uri, flags.experiment, progress, STARTED, initial=initial)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
         code = INTERRUPTED
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         code, message = FAILED, str(error) or type(error).__name__

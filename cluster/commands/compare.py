@@ -103,7 +103,8 @@ def _compare() -> int:
     if flags.jobs > 1 and limits(flags.budget)[1]:
         text = "runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps"
         print(f"{PROG}: warning: {text}", file=sys.stderr)
-    address = cluster_address(flags.address) if flags.workers else None
+    to_do = not all(cell.finished() for cell in cells)
+    address = cluster_address(flags.address) if flags.workers and to_do else None
     warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
     return _train_and_compare(console, folder, cells, flags, Workers(flags.workers, address, flags.patience))
 
@@ -158,7 +159,7 @@ def _train_and_compare(
                 wall_limit_s=limits(folder.plan.budget)[1] or math.inf,
             )  # fmt: skip
             train_all([cell for cell in cells if not cell.finished()], workers, train_cell, flags.jobs, shown.show)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
         code, status = INTERRUPTED, "KILLED"
     except (GridSimError, MemoryError, OSError) as error:
         problem, status = str(error) or type(error).__name__, "FAILED"

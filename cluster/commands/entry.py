@@ -28,7 +28,7 @@ TERMINALS = [descriptor for descriptor in (0, 1, 2) if os.isatty(descriptor)]
 
 
 def settle_environment() -> None:
-    """Keep what the user's environment has, or lacks, from failing in libraries; to be called before there are threads.
+    """Change the environment where libraries would fail with it; to be called before there are threads.
 
     A process may have no HOME and a user id without a name (OpenShift, HTCondor, systemd). HOME is then a folder that
     does not exist, as Debian's services have it, so that nothing is written there.

@@ -168,8 +168,10 @@ def _compile(cells: Sequence[Cell], on_event: OnEvent) -> None:
 
 
 def _main(pipe: Connection, workers: Workers, train: Train) -> None:
-    """A job's process: train the runs that come through the pipe. SIGTERM stops it."""
+    """A job's process: train the runs that come through the pipe. SIGTERM and SIGHUP stop it."""
     signal.signal(signal.SIGTERM, interrupt)
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, interrupt)
 
     def on_event(cell: Cell, kind: Kind, content: Any) -> None:
         try:

@@ -8,14 +8,8 @@ import subprocess
 import sys
 import time
 
-from cluster.tracking.address import (
-    DEFAULT_URI,
-    TrackingError,
-    check_uri,
-    one_line,
-    reach_loopback_directly,
-    server_problem,
-)
+from cluster.redaction import one_line
+from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, reach_loopback_directly, server_problem
 from cluster.tracking.mlflow_run import run_tables
 
 STOP_S = 10.0  # that the server may take to end

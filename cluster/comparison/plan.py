@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cluster.comparison.results import LEARNERS, Learner, Run, read_run
+from cluster.redaction import redacted
 from cluster.runs import checkpoint
 from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, as_argument, lock, open_run, read_config
 from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
-from cluster.tracking.address import redacted
 from cluster.tracking.description import file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError

@@ -30,8 +30,9 @@ def plain_style() -> Iterator[None]:
 
     style: dict[Any, Any] = {**matplotlib.rcParamsDefault, "text.parse_math": False}
     del style["backend"]  # takes 0.8 s to load
-    with matplotlib.rc_context(style), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+    # For good: to undo it would undo what another thread, in which MLflow writes the model, has set meanwhile.
+    warnings.filterwarnings("ignore", "Glyph .* missing from font")
+    with matplotlib.rc_context(style):
         yield
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cluster.tracking.address import one_line
+from cluster.redaction import one_line
 from gridsim.errors import GridSimError
 
 CONFIG, CHECKPOINT, STEPS, CHAMPION = "config.json", "checkpoint.npz", "steps.part", "champion.npz"

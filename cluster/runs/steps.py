@@ -15,10 +15,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from cluster.redaction import one_line
 from cluster.runs import checkpoint
 from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError, WriteError
 from cluster.runs.run import ELITES
-from cluster.tracking.address import one_line
 from evolution.networks.policy import PolicySpec
 
 

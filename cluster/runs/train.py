@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from cluster.redaction import redacted
 from cluster.runs import checkpoint, steps
 from cluster.runs.champion import Champion, load_champion
 from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError
@@ -42,7 +43,7 @@ from cluster.runs.run import (
 )
 from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.tracking import description
-from cluster.tracking.address import TrackingError, check_uri, redacted, with_password
+from cluster.tracking.address import TrackingError, check_uri, with_password
 from cluster.tracking.mlflow_run import Identity, Status, quiet
 from cluster.tracking.tracker import Tracker, count
 from cluster.training.evolution import Evolution
@@ -177,7 +178,8 @@ def train(
     finally:
         with undisturbed():
             if status == "KILLED":
-                reporter.stopping()
+                with contextlib.suppress(OSError, SystemExit):  # by rich, if what reads the output has ended, too
+                    reporter.stopping()
             warming.stop()
             maps.close()
             if session:

@@ -18,6 +18,7 @@ import urllib.request
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from cluster.redaction import UNCLEAR, one_line, redacted
 from gridsim.errors import GridSimError
 
 DEFAULT_URI = "sqlite:///mlflow.db"
@@ -26,8 +27,6 @@ PROBE_S = 3.0
 _DATABASES = {"postgresql": 5432, "mysql": 3306, "mssql": 1433}  # usual ports
 _HOSTED = "databricks"  # a scheme of MLflow's own; others come with plug-ins
 _LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
-_SECRET = re.compile("pass|pw|token|secret|key|cred|sig|auth|odbc_connect", re.IGNORECASE)
-"""In the names of a query's parameters whose values are not shown."""
 _PAGE = "/api/2.0/mlflow/experiments/search?max_results=1"  # also served by a gateway in front of MLflow
 
 
@@ -61,11 +60,15 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
             raise TrackingError(f"no MLflow server at {redacted(uri)}: {problem}; start one, or use {DEFAULT_URI}")
         return uri
     if scheme in _DATABASES:
+        if redacted(uri).endswith(UNCLEAR):
+            raise TrackingError(f"{redacted(uri)}: in a password, write ? as %3F, @ as %40 and / as %2F")
         parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
+        if not parts.hostname:  # it is reached by a Unix socket
+            return uri
         try:
-            socket.create_connection((parts.hostname or "localhost", parts.port or _DATABASES[scheme]), PROBE_S).close()
+            socket.create_connection((parts.hostname, parts.port or _DATABASES[scheme]), PROBE_S).close()
         except (OSError, ValueError) as error:
-            raise TrackingError(f"no database server at {redacted(uri)}: {one_line(error)}") from error
+            raise TrackingError(f"no database server at {redacted(uri)}: {one_line(error, uri)}") from error
         return uri
     if scheme in ("", "file"):
         use = f"use {DEFAULT_URI} or http://host:port"
@@ -86,7 +89,7 @@ def is_database(uri: str) -> bool:
 def with_password(saved: str) -> str:
     """The address that a run was begun with, with the user and password that MLFLOW_TRACKING_URI may have for it."""
     usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
-    return usual if redacted(usual) == redacted(saved) else saved
+    return usual if redacted(usual) == redacted(saved) and not saved.endswith(UNCLEAR) else saved
 
 
 def reach_loopback_directly() -> None:
@@ -202,37 +205,3 @@ def server_problem(uri: str) -> str:
         return "" if error.code in (400, 401, 403, 405, 429) else "something else answers there"
     except Exception as error:  # refused, unknown host, timed out, no HTTP, no address at all
         return one_line(error)
-
-
-def redacted(uri: str) -> str:
-    """An address without user, password and other secrets: all up to the last @ before its path, and secret parameters.
-
-    What can be read in two ways, as an @ behind a question mark, is left out as a whole.
-    """
-    start, rest = re.fullmatch(r"((?:[\w.+-]*:)?//|)(.*)", uri, re.DOTALL).groups()  # type: ignore[union-attr]
-    head, mark, query = rest.partition("?")
-    if "@" in rest and not rest.startswith("/") and (start or ":" in rest.partition("@")[0]):
-        if "@" in query and re.search("[:@]", head):
-            return f"{start}..."
-        head = head.rpartition("@")[2]
-    # A value may itself hold parameters (odbc_connect).
-    names = {part: urllib.parse.unquote_plus(part.rpartition("=")[0]) for part in query.split("&")}
-    kept = "&".join(part for part, name in names.items() if not _SECRET.search(name))
-    return start + head + (mark + kept if kept or not query else "")
-
-
-def one_line(error: BaseException) -> str:
-    """The error in one line, without secrets; for errors of the system only the reason."""
-    text = str(error) or type(error).__name__
-    if isinstance(error, TrackingError):
-        return text
-    reasons = re.findall(r"\[Errno -?\d+\] ([^'\")\]>:]+)", text)
-    if reasons:
-        return reasons[-1].strip()
-    if "timed out" in text.lower():
-        return "no answer in time"
-    lines = text.splitlines()
-    # SQLAlchemy may put a hint of its own before what went wrong.
-    line = lines[1] if text.startswith("(raised as") and len(lines) > 1 else lines[0]
-    line = re.sub(r"[\w.+-]*:?//\S+|\S*:\S*@\S*", lambda address: redacted(address[0]), line)
-    return re.sub(rf"([\w.%-]*(?:{_SECRET.pattern})[\w.%-]*)=\S+", r"\1=...", line, flags=re.IGNORECASE)[:200]

@@ -25,15 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from cluster.tracking.address import (
-    TrackingError,
-    is_database,
-    one_line,
-    redacted,
-    schema_problem,
-    sqlite_path,
-    sqlite_uri,
-)
+from cluster.redaction import one_line, redacted
+from cluster.tracking.address import TrackingError, is_database, schema_problem, sqlite_path, sqlite_uri
 from cluster.tracking.commit import DIRTY, git_commit
 from cluster.tracking.view import VIEW_TAG, run_table, view
 
@@ -282,7 +275,7 @@ class LoggedRun:
             return self._register(model)
         except Exception as error:  # whatever MLflow raises
             raise TrackingError(
-                f"the registry {redacted(registry)} (MLFLOW_REGISTRY_URI): {one_line(error)}"
+                f"the registry {redacted(registry)} (MLFLOW_REGISTRY_URI): {one_line(error, registry)}"
             ) from error
 
     def _register(self, model: Model) -> bool:

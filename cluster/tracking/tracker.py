@@ -16,7 +16,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cluster.tracking.address import UI, TrackingError, is_database, one_line, redacted, sqlite_path
+from cluster.redaction import one_line, redacted
+from cluster.tracking.address import UI, TrackingError, is_database, sqlite_path
 from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload
 from cluster.tracking.view import run_table
 
@@ -144,7 +145,7 @@ class Tracker:
             try:
                 send()
             except Exception as failure:  # whatever it is, the tracked run goes on
-                self.error = error = one_line(failure)
+                self.error = error = one_line(failure, self.uri)
                 if self._run is None:
                     break
             finally:

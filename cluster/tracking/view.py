@@ -3,7 +3,7 @@
 import json
 import time
 
-from cluster.tracking.address import redacted
+from cluster.redaction import redacted
 
 VIEW, VIEW_TAG = "gridsim", "mlflow.sharedViewState.gridsim"
 """The saved view of an experiment in MLflow's UI, and the experiment's tag that holds it."""

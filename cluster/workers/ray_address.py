@@ -8,6 +8,7 @@ import socket
 import time
 from pathlib import Path
 
+from cluster.redaction import redacted
 from cluster.workers.pool import PoolError
 
 PROBE_S = 3.0  # to connect, and to answer
@@ -18,7 +19,7 @@ def probe(address: str) -> None:
     """Raises PoolError, one line, within seconds unless a Ray cluster answers at `host:port` and would let us in."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65_536 or "/" in address:
-        raise PoolError(f"{address!r} is not a Ray address; give host:port (of `ray start --head`) or auto")
+        raise PoolError(f"{redacted(address)!r} is not a Ray address; give host:port (of `ray start --head`) or auto")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), PROBE_S) as connection:
             if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):

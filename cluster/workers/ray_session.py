@@ -27,8 +27,10 @@ from typing import Any
 import cluster
 import evolution
 import gridsim
+from cluster.redaction import redacted
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_address import AUTH_ENVIRONMENT, has_token, probe
+from gridsim.jit import CACHE_FOLDER
 
 # Read when Ray is imported and when it connects. Ray sets the last two itself, but only after threads have started.
 ENVIRONMENT = {
@@ -95,8 +97,8 @@ def cluster_address(given: str) -> str | None:
         return None
     if by_variable and not given and address.startswith(("http://", "https://")):
         warnings.warn(
-            f"RAY_ADDRESS={address} is where Ray takes jobs, so this run uses this machine alone; to use the cluster, "
-            "submit the command with `ray job submit`, or give --address host:port",
+            f"RAY_ADDRESS={redacted(address)} is where Ray takes jobs, so this run uses this machine alone; to use the "
+            "cluster, submit the command with `ray job submit`, or give --address host:port",
             stacklevel=2,
         )
         return None
@@ -190,11 +192,14 @@ def _own_runtime_env(folder: str) -> dict[str, Any]:
     empty = Path(folder, "empty")
     empty.mkdir()
     parents = dict.fromkeys(str(Path(package.__path__[0]).parent) for package in PACKAGES)
-    path = [parent for parent in parents if parent not in site.getsitepackages()]
+    installed = [
+        *site.getsitepackages(),
+        site.getusersitepackages(),
+    ]  # on the workers' path anyway, behind Python's own
+    path = [parent for parent in parents if parent not in installed]
     path += filter(None, [os.environ.get("PYTHONPATH"), os.path.abspath(sys.path[0])])  # the latter is the script's
-    variables = {"PYTHONPATH": os.pathsep.join(path)}
-    if cache := os.environ.get("GRIDSIM_CACHE_DIR"):
-        variables["GRIDSIM_CACHE_DIR"] = os.path.abspath(cache)  # the workers' working folder is another one
+    # A relative name of the cache's folder would mean another one there.
+    variables = {"PYTHONPATH": os.pathsep.join(path), "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1])}
     return {"working_dir": str(empty), "env_vars": variables}
 
 

@@ -140,9 +140,11 @@ def test_a_network_that_goes_away_is_no_matter(reference: Path, tmp_path: Path) 
     network = [f"ip link {words}" if words.startswith("add") else f"ip link set {words}" for words in up]
     network += ["ip addr add 10.9.8.7/24 dev eth7", "ip route add default dev eth7"]
     command = f"{BIN}/gridsim-evolve {' '.join(SMALL)} --workers 1 --name r"
-    goes = f"while ! [ -s runs/r/history.csv ]; do sleep 0.1; done; sleep 5; ip link del eth7; {BIN}/python -c pass"
+    goes = "while ! [ -s runs/r/history.csv ]; do sleep 0.1; done; sleep 4; ip link del eth7; touch gone"
     script = "; ".join([*network, f"({goes}) & {command}"])
     finish("/usr/bin/unshare", "-n", "/bin/sh", "-e", "-c", script, cwd=tmp_path)
+    rows_until = (tmp_path / "runs/r/history.csv").stat().st_mtime
+    assert (tmp_path / "gone").stat().st_mtime < rows_until, "the run was over before its network went"
     assert same_run(tmp_path / "runs/r", reference)
 
 
@@ -171,7 +173,7 @@ def test_a_ray_that_is_in_use_in_this_process_is_named(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("main", [evolve_main, compare_main])
-@pytest.mark.parametrize("address", ["ray://127.0.0.1:10001", "127.0.0.1:1"])
+@pytest.mark.parametrize("address", ["ray://u:secret@127.0.0.1:10001", "127.0.0.1:1"])
 def test_an_address_from_the_environment_is_refused_with_the_variables_name(
     main: Any, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
@@ -179,11 +181,12 @@ def test_an_address_from_the_environment_is_refused_with_the_variables_name(
     monkeypatch.setenv("RAY_ADDRESS", address)
     (line,) = refused(main, monkeypatch, capsys, "--workers", "1")
     assert line.endswith(" (RAY_ADDRESS says so; unset it, or give --address local)")
-    assert address in line
+    assert address.rpartition("@")[2] in line
+    assert "secret" not in line
 
 
 def test_the_address_of_rays_jobs_is_left_out_and_local_means_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", "http://127.0.0.1:8265")
+    monkeypatch.setenv("RAY_ADDRESS", "http://u:secret@127.0.0.1:8265")
     with pytest.warns(UserWarning, match=r"^RAY_ADDRESS=http://127.0.0.1:8265 is where Ray takes jobs, so this run"):
         assert ray_session.cluster_address("") is None
     assert ray_session.cluster_address("local") is None

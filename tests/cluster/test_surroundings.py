@@ -53,6 +53,20 @@ def test_a_closed_terminal_stops_a_run_as_ctrl_c_does(closed: bool, reference: P
 
 
 @pytest.mark.usefixtures("database")
+def test_a_run_is_closed_when_what_reads_its_output_is_interrupted_with_it(tmp_path: Path) -> None:
+    command = f"{BIN}/gridsim-evolve {' '.join(SMALL)} --generations 400 --workers 0 --name r 2>&1 | tee log"
+
+    def status() -> str:
+        found = tracked.runs(f"sqlite:///{tmp_path}/mlflow.db")
+        return "".join(each.info.status for each in found if each.info.run_name == "r")
+
+    with running("/bin/sh", "-c", command, cwd=tmp_path) as shell:
+        wait_until(lambda: len(rows(tmp_path / "runs/r")) > 1 and status() == "RUNNING", pause=0.5)
+        os.killpg(shell.pid, signal.SIGINT)
+        wait_until(lambda: status() == "KILLED", 60, pause=0.5)
+
+
+@pytest.mark.usefixtures("database")
 def test_under_nohup_a_run_goes_on_when_the_terminal_closes(tmp_path: Path) -> None:
     command = (BIN / "gridsim-evolve", *SMALL, "--workers", "0", "--name", "r")
     with running("/usr/bin/nohup", *map(str, command), cwd=tmp_path) as process:
@@ -83,7 +97,7 @@ def test_neither_a_home_nor_a_users_name_is_needed(reference: Path, tmp_path: Pa
 @pytest.mark.usefixtures("database")
 def test_no_child_of_a_run_stays_as_a_zombie(tmp_path: Path) -> None:
     kernels._marker(EvolveSettings(scenario="curved", traffic=2)).unlink(missing_ok=True)
-    with start("gridsim-evolve", *SMALL, "--workers", "0", cwd=tmp_path) as process:
+    with start("gridsim-evolve", *SMALL, "--generations", "4000", "--workers", "0", cwd=tmp_path) as process:
         children: set[psutil.Process] = set()
 
         def begun() -> bool:

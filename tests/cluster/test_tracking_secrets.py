@@ -13,7 +13,8 @@ from tracked import client, free_port, mlflow_server, tracker
 
 from cluster.commands.cli import evolve_main
 from cluster.comparison.plan import ComparisonFolder, Plan
-from cluster.tracking.address import check_uri, one_line, redacted
+from cluster.redaction import one_line, redacted
+from cluster.tracking.address import TrackingError, check_uri
 
 TINY = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--generations", "2", "--workers", "0")
 
@@ -37,6 +38,11 @@ TINY = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--gener
         ("mssql+pyodbc:///?odbc_connect=DRIVER=x;UID=u;PWD=secret", "mssql+pyodbc:///"),
         ("https://h/?token=secret", "https://h/"),
         ("https://h/?access_key=secret&signature=secret&credential=secret", "https://h/"),
+        ("https://h/?sas=secret&code=secret#token=secret", "https://h/"),
+        ("http://h#token=secret", "http://h"),
+        ("postgresql://h/db?password=a&rest-secret&port=5", "postgresql://h/db?port=5"),
+        ("postgresql://h/db?options=-c%20password%3Dsecret", "postgresql://h/db"),
+        ("http://127.0.0.1:8765/user/jane@example.com/proxy/5000", "http://127.0.0.1:8765/user/jane@example.com/proxy/5000"),
         ("u:secret@h/db", "h/db"),
         ("//u:secret@h/db", "//h/db"),
         ("sqlite:////a/with@sign/mlflow.db?timeout=9", "sqlite:////a/with@sign/mlflow.db?timeout=9"),
@@ -56,9 +62,28 @@ SPECIAL = st.lists(st.sampled_from([*list("@/?#:&=;%+, '\"[]"), "hunter"]), min_
 
 @given(SPECIAL, st.sampled_from(["postgresql", "mysql+pymysql", "http"]), st.booleans())
 def test_no_part_of_a_password_is_shown_whatever_characters_it_has(password, scheme, query):
-    assert "hunter" not in redacted(f"{scheme}://user:{password}@host:1/db{'?timeout=9' if query else ''}")
+    uri = f"{scheme}://user:{password}@host:1/db{'?timeout=9' if query else ''}"
+    assert "hunter" not in redacted(uri)
+    assert "hunter" not in one_line(ValueError(f"API request to {uri}/api/2.0 failed"), uri)
     value = password.replace("&", "")
     assert "hunter" not in redacted(f"{scheme}://host:1/db?password={value}{'&timeout=9' if query else ''}")
+
+
+def test_a_password_with_a_space_is_not_in_an_errors_line():
+    for text in ("request to http://u:p secret@h/api failed", "{'password': 'secret'}", "connect(password = secret)"):
+        assert "secret" not in one_line(ValueError(text))
+
+
+def test_a_password_that_makes_an_address_unclear_is_refused_with_what_to_write():
+    with pytest.raises(
+        TrackingError, match=r"^postgresql://\.\.\.: in a password, write \? as %3F, @ as %40 and / as %2F$"
+    ):
+        check_uri("postgresql://u:p?secret@127.0.0.1:5999/db")
+
+
+def test_a_database_on_a_unix_socket_is_not_looked_for_on_a_port():
+    uri = "postgresql://u:p@/db?host=/var/run/postgresql"
+    assert check_uri(uri) == uri
 
 
 def test_what_a_run_prints_at_its_end_is_quoted_and_has_no_password():

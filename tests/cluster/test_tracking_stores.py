@@ -217,8 +217,8 @@ def test_files_of_a_server_that_does_not_serve_them(tmp_path, impatient):
 
 
 @pytest.mark.e2e
-def test_eight_first_runs_at_once_in_an_empty_folder(tmp_path):
-    names = [str(number) for number in range(8)]
+def test_several_first_runs_at_once_in_an_empty_folder(tmp_path):
+    names = [str(number) for number in range(4)]
     started = [start("gridsim-evolve", *TINY, "--seed", name, "--name", name, cwd=tmp_path) for name in names]
     for process in started:
         out, err = process.communicate(timeout=600)
