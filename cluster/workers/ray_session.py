@@ -192,12 +192,11 @@ def _own_runtime_env(folder: str) -> dict[str, Any]:
     empty = Path(folder, "empty")
     empty.mkdir()
     parents = dict.fromkeys(str(Path(package.__path__[0]).parent) for package in PACKAGES)
-    installed = [
-        *site.getsitepackages(),
-        site.getusersitepackages(),
-    ]  # on the workers' path anyway, behind Python's own
+    # The workers have these on their path anyway, behind Python's own.
+    installed = [*site.getsitepackages(), site.getusersitepackages()]
     path = [parent for parent in parents if parent not in installed]
-    path += filter(None, [os.environ.get("PYTHONPATH"), os.path.abspath(sys.path[0])])  # the latter is the script's
+    script = os.path.dirname(os.path.realpath(sys.argv[0]))
+    path += filter(None, [os.environ.get("PYTHONPATH"), script if script in sys.path else ""])
     # A relative name of the cache's folder would mean another one there.
     variables = {"PYTHONPATH": os.pathsep.join(path), "GRIDSIM_CACHE_DIR": str(CACHE_FOLDER.parents[1])}
     return {"working_dir": str(empty), "env_vars": variables}
