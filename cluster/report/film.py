@@ -130,9 +130,10 @@ def _encode(path: Path, pictures: Iterable[np.ndarray], size: tuple[int, int], f
     except RuntimeError as error:
         raise VideoError("there is no ffmpeg here; install one, or name it with IMAGEIO_FFMPEG_EXE") from error
     raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
-    command = [program, "-y", "-v", "error", *raw, "-an", *coding, f"file:{path}"]  # else a:b is b by the protocol a
+    # Without `file:`, ffmpeg takes what stands before a colon in a name for a protocol.
+    command = [program, "-y", "-v", "error", *raw, "-an", *coding, f"file:{path}"]
     count = 0
-    with tempfile.TemporaryFile() as messages:  # of a pipe that nobody reads, ffmpeg would wait for room
+    with tempfile.TemporaryFile() as messages:  # a pipe that nobody reads would fill up and stop ffmpeg
         try:  # in a session of its own, where Ctrl-C does not reach it
             process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=messages, start_new_session=True)
         except OSError as error:

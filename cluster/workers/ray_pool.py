@@ -47,7 +47,8 @@ from cluster.workers.tickets import Tickets
 from cluster.workers.worker import AnyTask, CollectTask, Worker
 
 CONNECT_S = 60.0
-PATIENCE_S, LONG_PATIENCE_S = 60.0, 300.0  # for a silent worker of this machine; for all else: a cluster may be growing
+PATIENCE_S = 60.0  # for an answer of a worker on this machine
+LONG_PATIENCE_S = 300.0  # for an answer on a cluster, and for a first worker: a cluster may be growing
 MAX_DEATHS = 24  # of workers in a row, without an answer in between: two members that kill workers cause fewer
 QUEUED_S = 0.5  # of evaluation per worker, up to which parcels are queued: progress shows only as a worker ends
 WORTH_QUEUING_S = 0.002  # of evaluation: a parcel from the queue costs next to nothing
@@ -93,8 +94,8 @@ class RayPool(WorkerPool):
         worker_factory: makes what evaluates; must be importable in the workers.
         patience_s: how long to go on without any worker, or wait for a silent one; default 300 s, but 60 s for a silent
             one on this machine.
-        begin_here: whether this process evaluates and collects itself until the first worker is up. So long, no
-            patience ends the run.
+        begin_here: whether this process evaluates and collects itself until the first worker is up. Until then, a lack
+            of workers does not end the run.
 
     Raises PoolError at once if nothing answers at `address`; all else that goes wrong is raised by its calls.
     """
