@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from cluster.runs.settings import EvolveSettings
-from cluster.training.evolution import Evolution
-from cluster.training.trainer import Maps
+from cluster.learn.evolution import Evolution
+from cluster.learn.learning import Maps
+from cluster.settings import EvolveSettings
 from cluster.workers.pool import SerialPool
 from evolution.episodes import curriculum
 from evolution.episodes.curriculum import Curriculum, success_rate

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from simulated_workers import ROWS  # beside this file
 
-from cluster.runs.run import new_run
-from cluster.runs.settings import EvolveSettings
-from cluster.runs.train import Session
+from cluster.learn.learning import Maps
+from cluster.run import Session
+from cluster.settings import EvolveSettings
+from cluster.store.folder import new_run
 from cluster.tracking.address import check_uri
-from cluster.training.trainer import Maps
 from cluster.workers import ray_pool
 from cluster.workers.pool import Chunk, Outcome, WorkerPool
 from cluster.workers.ray_pool import RayPool

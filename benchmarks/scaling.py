@@ -60,8 +60,8 @@ from coordinator import (  # beside this file
 from coordinator import POLICY as MLP
 from simulated_workers import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, table
 
-from cluster.runs.settings import MAX_STEPS, EvolveSettings
-from cluster.training.trainer import Maps
+from cluster.learn.learning import Maps
+from cluster.settings import MAX_STEPS, EvolveSettings
 from cluster.workers.kernels import compile_kernels
 from cluster.workers.ray_pool import RayPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS

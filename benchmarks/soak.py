@@ -25,9 +25,9 @@ from pathlib import Path
 
 from coordinator import learn, session  # beside this file
 
-from cluster.runs.champion import load_champion
-from cluster.runs.settings import EvolveSettings
-from cluster.training.trainer import Maps
+from cluster.learn.learning import Maps
+from cluster.settings import EvolveSettings
+from cluster.store.champion import load_champion
 from cluster.workers.kernels import compile_kernels
 from cluster.workers.ray_pool import RayPool
 from gridsim.config import SimConfig

@@ -35,8 +35,8 @@ import numpy as np
 from peers import NOT_INSTALLED, PEERS  # beside this file
 
 import gridsim.envs.env
-from cluster.runs.champion import Champion, load_champion
-from cluster.runs.checkpoint import CheckpointError
+from cluster.store.champion import Champion, load_champion
+from cluster.store.checkpoint import CheckpointError
 from evolution.episodes.rollout import evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, decide, encode, pack, scratch_size

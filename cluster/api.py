@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from cluster.runs.champion import Champion, evaluate, load_champion
-from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
-from cluster.runs.train import Workers, new_learning
-from cluster.training.evolution import Evolution
-from cluster.training.trainer import Maps
+from cluster.learn.evolution import Evolution
+from cluster.learn.learning import Maps
+from cluster.run import Workers, new_learning
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.store.champion import Champion, evaluate, load_champion
 from gridsim.config import SimConfig
 
 __all__ = ["Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn"]
@@ -76,8 +76,8 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
     error that could not be measured is nan.
     Raises: GridSimError, with a one-line message, for a folder that is not a finished run.
     """
-    from cluster.comparison.plan import read_runs
-    from cluster.comparison.results import measured
+    from cluster.compare.plan import read_runs
+    from cluster.compare.results import measured
 
     names = ("scenario", "learner", "seed", "traffic")
     return [

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from cluster.report.film import picture, record
-from cluster.runs.champion import load_champion
+from cluster.store.champion import load_champion
 from evolution.episodes.starts import lane_starts
 from gridsim.maps.scenarios import HELD_OUT_SEED, build
 from gridsim.view.render import Renderer

@@ -20,7 +20,7 @@ from packaging.utils import canonicalize_name
 from tracked import free_port
 
 from cluster.commands import cli, common
-from cluster.runs.settings import DqnSettings, EvolveSettings
+from cluster.settings import DqnSettings, EvolveSettings
 from cluster.workers.kernels import everything_by_default
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_session import check_address

@@ -34,15 +34,15 @@ from cluster.commands.common import (
 )
 from cluster.commands.entry import STARTED
 from cluster.commands.progress import Progress
-from cluster.comparison.results import series
-from cluster.report.pictures import errors_table, held_out_table
-from cluster.runs.champion import evaluate, load_champion
-from cluster.runs.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
-from cluster.runs.run import RunFolder, as_argument, is_finished, lock, new_run, open_run, read_config
-from cluster.runs.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
-from cluster.runs.train import Session, Workers, send_missing, train, undisturbed
+from cluster.commands.tables import errors_table, held_out_table
+from cluster.compare.results import series
+from cluster.run import Session, Workers, send_missing, train, undisturbed
+from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
+from cluster.store.champion import evaluate, load_champion
+from cluster.store.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
+from cluster.store.folder import RunFolder, is_finished, lock, new_run, open_run, read_config
+from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
-from cluster.tracking.tracker import count
 from cluster.workers.ray_session import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError

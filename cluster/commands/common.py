@@ -23,10 +23,10 @@ import tyro
 from docstring_parser import attrdoc
 from rich.console import Console
 
-from cluster.cores import cores
-from cluster.runs.checkpoint import WriteError
-from cluster.runs.run import as_argument
-from cluster.runs.settings import IN_WORDS
+from cluster.settings import IN_WORDS
+from cluster.store.checkpoint import WriteError
+from cluster.text import as_argument
+from cluster.workers.cores import cores
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED
 

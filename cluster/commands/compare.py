@@ -35,15 +35,14 @@ from cluster.commands.common import (
 )
 from cluster.commands.jobs import Kind, train_all
 from cluster.commands.progress import Line, clock
-from cluster.comparison import tables
-from cluster.comparison.page import page
-from cluster.comparison.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import Run, measured, read_run
-from cluster.report import pictures
-from cluster.runs import checkpoint
-from cluster.runs.run import lock, new_folder
-from cluster.runs.settings import IN_WORDS, check_workers
-from cluster.runs.train import Workers, train
+from cluster.compare import picture, tables
+from cluster.compare.page import page
+from cluster.compare.plan import COMPARISON, Cell, ComparisonFolder, Plan, limits, open_comparison, read_runs
+from cluster.compare.results import Run, measured, read_run
+from cluster.run import Workers, train
+from cluster.settings import IN_WORDS, check_workers
+from cluster.store import checkpoint
+from cluster.store.folder import lock, new_folder
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
@@ -205,7 +204,7 @@ class Results:
         """Write tables, the picture and the page."""
         self.write_tables()
         groups = self.groups
-        pictures.comparison(groups, self.path / PICTURE)
+        picture.comparison(groups, self.path / PICTURE)
         checkpoint.write_atomic(self.path / REPORT, page(self.path, groups, self.plan, self.path / PICTURE))
 
     def show(self, console: Console) -> None:

@@ -23,9 +23,9 @@ from typing import Any, Literal
 from cluster.commands.common import command_path, short_path
 from cluster.commands.entry import interrupt
 from cluster.commands.progress import progress_of
-from cluster.comparison.plan import Cell
-from cluster.comparison.results import measured, read_run
-from cluster.runs.train import Reporter, Session, Workers
+from cluster.compare.plan import Cell
+from cluster.compare.results import measured, read_run
+from cluster.run import Reporter, Session, Workers
 from cluster.workers import kernels
 from gridsim.errors import GridSimError
 

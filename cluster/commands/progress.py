@@ -13,8 +13,8 @@ from rich.live import Live
 from rich.text import Text
 
 from cluster.commands.common import new_console
-from cluster.runs.train import Reporter, Session
-from cluster.training.trainer import Learning
+from cluster.learn.learning import Learning
+from cluster.run import Reporter, Session
 
 LINE_S = 5.0  # between lines without a terminal
 WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time

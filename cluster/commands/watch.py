@@ -22,11 +22,11 @@ from rich.progress import track
 from cluster.commands.common import RoadFlags, command_path, main, new_console, parse, short_path
 from cluster.report.film import CODING, Recording, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
-from cluster.runs.champion import Champion, UnfinishedError, load_champion
-from cluster.runs.checkpoint import CHAMPION, CheckpointError
-from cluster.runs.run import CHECKPOINT, CONFIG, RunError, read_config
-from cluster.runs.settings import IN_WORDS, MAX_TRAFFIC
-from cluster.runs.steps import read_elites
+from cluster.settings import IN_WORDS, MAX_TRAFFIC
+from cluster.store.champion import Champion, UnfinishedError, load_champion
+from cluster.store.checkpoint import CHAMPION, CheckpointError
+from cluster.store.folder import CHECKPOINT, CONFIG, RunError, read_config
+from cluster.store.steps import read_elites
 from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.runs.champion import Champion
-from cluster.runs.checkpoint import WriteError
+from cluster.store.champion import Champion
+from cluster.store.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
 from gridsim.car.ego import DISTANCE, SPEED, STEERING, End, X, Y

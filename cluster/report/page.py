@@ -21,7 +21,7 @@ import numpy as np
 
 from cluster.report.film import Recording
 from cluster.report.pictures import bounds, plain_style
-from cluster.runs.checkpoint import write_atomic
+from cluster.store.checkpoint import write_atomic
 from gridsim.car.ego import DISTANCE, SPEED
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig, constants

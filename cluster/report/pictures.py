@@ -1,4 +1,4 @@
-"""What a run leaves to look at: pictures for its folder, tables for the terminal."""
+"""The pictures of a run: its curves, and the path of a drive."""
 
 from __future__ import annotations
 
@@ -6,21 +6,16 @@ import contextlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from rich.table import Column, Table
 
 from gridsim.car.ego import SPEED, X, Y
 from gridsim.maps.map import Map
 from gridsim.maps.roads import node_clearance
 
-if TYPE_CHECKING:
-    from cluster.comparison.tables import Group
-
 _BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL = "#4a4e57", "#e9efe6"
-_LEARNERS = {"evolution": "#0b7285", "two-parents": "#7048e8", "dqn": "#f08c00", "random": "#868e96"}
 
 
 @contextlib.contextmanager
@@ -36,12 +31,12 @@ def plain_style() -> Iterator[None]:
         yield
 
 
-def _drawable(name: str) -> str:
+def drawable(name: str) -> str:
     """A name as Matplotlib can draw it: bytes of a file's name that are no text become question marks."""
     return name.encode(errors="replace").decode()
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
+def figure_of(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
     """A figure that needs no display and no global state, and the axes of its columns."""
     from matplotlib.figure import Figure
 
@@ -52,7 +47,7 @@ def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, Any]:
 @plain_style()
 def curves(history: Sequence[Mapping[str, float]], path: Path, step_name: str) -> None:
     """Draw fitness (of the DQN: Q values), distance, speed and success over generations or evaluations to a PNG."""
-    figure, axes = _figure(15, 3.8, 4)
+    figure, axes = figure_of(15, 3.8, 4)
     step = np.arange(len(history))
 
     def plot(axis: Any, name: str, color: str, label: str, **style: Any) -> np.ndarray:
@@ -106,7 +101,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     """Draw a map and a car's path on it, coloured by speed, to a PNG. states float32 [steps, FIELDS]."""
     from matplotlib.collections import LineCollection
 
-    figure, (axis,) = _figure(8.6, 7.6)
+    figure, (axis,) = figure_of(8.6, 7.6)
     road = scenario.road
     nodes = node_clearance(road)
     width, height = float(road.width), float(road.height)
@@ -114,7 +109,7 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     axis.set_facecolor(_WALL)
     axis.contourf(nodes, levels=[0.0, 100.0], colors=[_ROAD], extent=extent)
     axis.contour(nodes, levels=[0.0], colors=["#ffffff"], linewidths=0.8, extent=extent)
-    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=_drawable(title))
+    axis.set(aspect="equal", xlabel="x, m", ylabel="y, m", title=drawable(title))
     axis.axis(bounds(scenario))
     points = states[:, [X, Y]].astype(np.float64)
     steps = np.stack([points[:-1], points[1:]], axis=1)
@@ -128,79 +123,3 @@ def trajectory(scenario: Map, states: np.ndarray, path: Path, title: str) -> Non
     axis.legend(loc="upper right")
     figure.colorbar(lines, ax=axis, shrink=0.8, label="speed, m/s")
     figure.savefig(path, dpi=100)
-
-
-@plain_style()
-def comparison(groups: Sequence[Group], path: Path) -> None:
-    """Draw success, velocity error and training time of each road and learner to a PNG.
-
-    Bars are medians over seeds, whiskers quartiles, dots the seeds.
-    """
-    roads = list(dict.fromkeys(group.road for group in groups))
-    names = list(dict.fromkeys(group.name for group in groups))
-    several_observations = len({group.observation for group in groups}) > 1
-    width = 0.8 / len(names)
-    figure, axes = _figure(max(12.0, 4.0 + 3.0 * len(roads)), 4.6, 3)
-    panels = (
-        ("success_rate", 100.0, "success on held-out roads, %"),
-        ("velocity_error_percent", 1.0, "velocity error, % of the reference's speed"),
-        ("best_wall_s", 1.0, "time to the champion, s"),
-    )
-    for axis, (name, scale, title) in zip(axes, panels, strict=True):
-        for group in groups:
-            place = roads.index(group.road) + (names.index(group.name) - (len(names) - 1) / 2) * width
-            n, *found = group.spread(name)
-            if not n:
-                axis.text(place, 0.0, " no run", rotation=90, ha="center", va="bottom", fontsize=7, color="#868e96")
-                continue
-            color = f"C{names.index(group.name) % 10}" if group.variant else _LEARNERS[group.learner]
-            lower, median, upper = (scale * value for value in found)
-            whiskers = [[median - lower], [upper - median]] if n > 1 else None
-            hatch = "//" if group.observation == "grid" and several_observations else None
-            axis.bar(
-                place, median, 0.92 * width, color=color, alpha=0.75, yerr=whiskers, capsize=3,
-                hatch=hatch, error_kw={"ecolor": "#212529", "elinewidth": 1.1}, zorder=2, label=group.name,
-            )  # fmt: skip
-            seeds = [scale * value for value in group.values(name)]
-            beside = place + width * np.linspace(-0.22, 0.22, len(seeds)) if len(seeds) > 1 else [place]
-            axis.plot(beside, seeds, linestyle="", marker="o", markersize=3.5, color="white",
-                      markeredgecolor="#212529", markeredgewidth=0.8, zorder=4)  # fmt: skip
-        axis.set_title(title)
-        axis.set_xticks(range(len(roads)), map(_drawable, roads))
-        axis.set_xlim(-0.5, len(roads) - 0.5)
-        axis.set_ylim(bottom=0.0)
-        axis.grid(axis="y", alpha=0.25, zorder=0)
-        axis.spines[["top", "right"]].set_visible(False)
-    bars = {bar.get_label(): bar for bar in axes[-1].containers if hasattr(bar, "patches")}
-    figure.legend(
-        bars.values(), bars, loc="outside lower center", ncols=len(names), frameon=False, title_fontsize=9,
-        title="bars: medians over seeds; whiskers: quartiles; dots: the seeds",
-    )  # fmt: skip
-    figure.savefig(path, dpi=100)
-
-
-def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
-    """How well a champion drives on roads it never saw."""
-    table = Table("", Column(justify="right"), title=title, title_justify="left", show_header=False)
-    table.add_row("episodes", f"{figures['episodes']:.0f}")
-    table.add_row("success (2,000 m without a collision)", f"{figures['success_rate']:.1%}")
-    table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
-    table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
-    table.add_row("collisions", f"{figures['collision_rate']:.1%}")
-    table.add_row("stopped, or out of time", f"{1.0 - figures['success_rate'] - figures['collision_rate']:.1%}")
-    return table
-
-
-def errors_table(title: str, figures: Mapping[str, float]) -> Table:
-    """Velocity and steering errors, as from `gridsim.reference.errors.errors`."""
-    numbers = Column("mean", justify="right"), Column("max", justify="right")
-    table = Table("", *numbers, title=title, title_justify="left")
-    for head, mean, largest, digits in (
-        ("velocity error, m/s", "velocity_mean_mps", "velocity_max_mps", 2),
-        ("  % of the reference's mean speed", "velocity_mean_percent", "velocity_max_percent", 1),
-        ("steering error, degrees", "steering_mean_deg", "steering_max_deg", 1),
-        ("  % of the steering limit", "steering_mean_percent", "steering_max_percent", 1),
-    ):
-        table.add_row(head, f"{figures[mean]:.{digits}f}", f"{figures[largest]:.{digits}f}")
-    table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
-    return table

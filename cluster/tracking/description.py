@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from cluster.runs.settings import RunSettings
+from cluster.settings import RunSettings
 from cluster.tracking.mlflow_run import MODEL, RUN_ID, Model
 from evolution.networks.policy import PolicySpec
 from gridsim.maps.scenarios import label
@@ -17,13 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     import torch
 
-    from cluster.runs.champion import Champion
-    from cluster.runs.run import RunFolder
-
-
-def file_name(words: str) -> str:
-    """A scenario's label and other words as a folder's name."""
-    return re.sub(r"[^\w.+=@-]", "_", words)
+    from cluster.store.champion import Champion
+    from cluster.store.folder import RunFolder
 
 
 def group(settings: RunSettings) -> str:

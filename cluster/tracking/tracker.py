@@ -17,6 +17,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from cluster.redaction import one_line, redacted
+from cluster.text import count
 from cluster.tracking.address import UI, TrackingError, is_database, sqlite_path
 from cluster.tracking.mlflow_run import Identity, LoggedRun, Model, Row, Status, preload
 from cluster.tracking.view import run_table
@@ -189,8 +190,3 @@ class Tracker:
         if self._status is not None:
             self._opened.end(self._status, self._wall_s, self.note)
             self._ended = True
-
-
-def count(number: int, noun: str) -> str:
-    """As in `1 row` or `2 rows`."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"

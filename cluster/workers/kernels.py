@@ -22,7 +22,7 @@ from typing import get_args
 import llvmlite.binding
 import numpy as np
 
-from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import EPISODE, trajectory
 from evolution.networks.policy import Observation, PolicySpec

@@ -24,9 +24,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from cluster.cores import cores
 from cluster.workers import ray_session
 from cluster.workers.actor import Actor, Name, Shared, Work
+from cluster.workers.cores import cores
 from cluster.workers.dispatch import MAX_KILLS, Dispatch
 from cluster.workers.pool import (
     METRE_S,

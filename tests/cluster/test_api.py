@@ -9,10 +9,10 @@ import pytest
 import gridsim
 from cluster import api
 from cluster.api import Champion, EvolveSettings, evaluate, evolve, load_champion
-from cluster.runs.champion import held_out
-from cluster.runs.checkpoint import CheckpointError, save
-from cluster.runs.run import RunFolder
-from cluster.runs.settings import DqnSettings
+from cluster.settings import DqnSettings
+from cluster.store.champion import held_out
+from cluster.store.checkpoint import CheckpointError, save
+from cluster.store.folder import RunFolder
 from evolution.episodes.rollout import trajectory
 from evolution.networks import convnet
 from evolution.networks.policy import PolicySpec

@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CheckpointError, load, save
+from cluster.store import checkpoint
+from cluster.store.checkpoint import CheckpointError, load, save
 
 META = {"generation": 7, "history": [{"fitness/best": 0.1 + 0.2, "mean": float("-inf")}], "name": "Straße"}
 RECIPE = np.dtype([("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])

@@ -16,11 +16,11 @@ from commands import all_in_mlflow, descendants, finish, refused, rows, same_run
 
 from cluster.commands.cli import dqn_main, evolve_main
 from cluster.commands.compare import compare_main
-from cluster.comparison.plan import ComparisonFolder, Plan
-from cluster.runs.champion import Champion
-from cluster.runs.checkpoint import save
-from cluster.runs.run import RunFolder
-from cluster.runs.settings import EvolveSettings
+from cluster.compare.plan import ComparisonFolder, Plan
+from cluster.settings import EvolveSettings
+from cluster.store.champion import Champion
+from cluster.store.checkpoint import save
+from cluster.store.folder import RunFolder
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
@@ -244,7 +244,7 @@ def test_config_of_a_run_that_began_with_a_champion_begins_with_it_again(monkeyp
 def test_a_folder_that_another_process_works_on_is_refused_in_one_line(main, monkeypatch, capsys, tmp_path):
     RunFolder(tmp_path, EvolveSettings("curved")).write_config()
     ComparisonFolder(tmp_path, Plan(("curved",), ("dqn",), 1, budget="1k")).write()
-    hold = f"from cluster.runs.run import lock, Path; lock(Path({str(tmp_path)!r})); print(flush=True); input()"
+    hold = f"from cluster.store.folder import lock, Path; lock(Path({str(tmp_path)!r})); print(flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout
         other.stdout.readline()

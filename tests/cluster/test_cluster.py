@@ -23,7 +23,7 @@ from packaging.requirements import Requirement
 
 from cluster.commands.cli import EvolveFlags
 from cluster.commands.common import parse
-from cluster.comparison.plan import Plan
+from cluster.compare.plan import Plan
 from cluster.workers.ray_session import PACKAGES, runtime_env
 from gridsim import evolve
 from gridsim.jit import CACHE_FOLDER

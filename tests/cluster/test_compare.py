@@ -19,9 +19,9 @@ from finished_runs import make_run
 from cluster.commands import compare, jobs
 from cluster.commands.compare import compare_main
 from cluster.commands.jobs import train_all
-from cluster.comparison import results
-from cluster.comparison.plan import ComparisonFolder, Plan
-from cluster.runs.train import Workers, undisturbed
+from cluster.compare import results
+from cluster.compare.plan import ComparisonFolder, Plan
+from cluster.run import Workers, undisturbed
 from cluster.workers.pool import PoolError
 from gridsim import evolve
 

@@ -7,8 +7,8 @@ import subprocess
 import pytest
 from commands import BIN
 
-from cluster import cores as module
-from cluster.cores import cores
+from cluster.workers import cores as module
+from cluster.workers.cores import cores
 
 V1 = "9:name=systemd:/\n4:cpu,cpuacct:/kubepods/pod1\n3:cpuset:/\n"
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cluster.runs.settings import DqnSettings
-from cluster.training import dqn as dqn_loop
-from cluster.training.dqn import Dqn
-from cluster.training.trainer import Maps
+from cluster.learn import dqn as dqn_loop
+from cluster.learn.dqn import Dqn
+from cluster.learn.learning import Maps
+from cluster.settings import DqnSettings
 from cluster.workers.pool import Chunk, PoolError, SerialPool, finish
 from gridsim.config import SimConfig
 

@@ -12,7 +12,7 @@ import pytest
 from commands import BIN, all_in_mlflow, finish, ray_workers, rows, running, summary, wait_until
 from tracked import client
 
-from cluster.runs.checkpoint import load
+from cluster.store.checkpoint import load
 
 SMALL = [
     *("--scenario", "curved", "--traffic", "2", "--policy", "mlp:12", "--seed", "5"),

@@ -9,8 +9,8 @@ import pytest
 from commands import call, refused
 
 from cluster.commands.cli import evaluate_main
-from cluster.comparison.results import series
-from cluster.runs.champion import load_champion
+from cluster.compare.results import series
+from cluster.store.champion import load_champion
 from gridsim.config import VehicleConfig
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
 from gridsim.reference.errors import Series, error_series

@@ -11,10 +11,10 @@ import shutil
 import pytest
 from finished_runs import make_run
 
-from cluster.comparison.plan import UNBOUND, ComparisonFolder, Plan, limits, open_comparison, read_runs
-from cluster.comparison.results import LEARNERS
-from cluster.comparison.tables import group
-from cluster.runs.run import RunError
+from cluster.compare.plan import UNBOUND, ComparisonFolder, Plan, limits, open_comparison, read_runs
+from cluster.compare.results import LEARNERS
+from cluster.compare.tables import group
+from cluster.store.folder import RunError
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY

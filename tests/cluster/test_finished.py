@@ -7,7 +7,7 @@ import pytest
 from finished_runs import HELD_OUT, make_run
 
 import gridsim
-from cluster.comparison.results import ERROR_FIGURES, errors_of, read_run
+from cluster.compare.results import ERROR_FIGURES, errors_of, read_run
 from gridsim.errors import GridSimError
 
 

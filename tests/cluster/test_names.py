@@ -19,7 +19,7 @@ from pictures import small_map
 from cluster.commands.cli import dqn_main, evaluate_main, evolve_main
 from cluster.commands.compare import compare_main
 from cluster.commands.watch import watch_main
-from cluster.comparison import results
+from cluster.compare import results
 from cluster.report import pictures
 from gridsim.car.ego import FIELDS
 

@@ -15,7 +15,7 @@ from pictures import small_map
 from cluster.report import pictures
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
-from cluster.runs.champion import load_champion
+from cluster.store.champion import load_champion
 from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y
 from gridsim.car.vehicle import act
 from gridsim.config import constants
@@ -117,8 +117,8 @@ def test_a_browser_plays_the_page_offline_and_without_a_fault(tmp_path):
 
 
 def test_the_picture_of_a_drive_over_the_edge_has_no_line_across(tmp_path, monkeypatch):
-    figure = pictures._figure(4.0, 3.0)
-    monkeypatch.setattr(pictures, "_figure", lambda *size: figure)
+    figure = pictures.figure_of(4.0, 3.0)
+    monkeypatch.setattr(pictures, "figure_of", lambda *size: figure)
     states = np.zeros((20, FIELDS), dtype=np.float32)
     states[:, X], states[:, Y] = np.arange(50, 90, 2) % 64, 32.0
     pictures.trajectory(small_map([[0, 32, 64, 32, 4.0]])[0], states, tmp_path / "drive.png", "a drive")

@@ -9,7 +9,8 @@ from commands import finish
 from finished_runs import run
 from pictures import small_map
 
-from cluster.comparison.tables import group
+from cluster.compare import picture
+from cluster.compare.tables import group
 from cluster.report import page, pictures
 from gridsim.car.ego import FIELDS
 
@@ -35,7 +36,7 @@ def test_pictures_do_not_depend_on_settings_of_matplotlib(tmp_path):
     def drawn():
         pictures.curves(history, tmp_path / "curves.png", "evaluation")
         pictures.trajectory(road_map, states, tmp_path / "trajectory.png", "a drive")
-        pictures.comparison(group([run("dqn", "curved", 0, 5.0)]), tmp_path / "comparison.png")
+        picture.comparison(group([run("dqn", "curved", 0, 5.0)]), tmp_path / "comparison.png")
         return [page._picture(road_map), *(path.read_bytes() for path in sorted(tmp_path.iterdir()))]
 
     usual = drawn()

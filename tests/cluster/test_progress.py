@@ -11,7 +11,7 @@ from rich.console import Console
 
 from cluster.commands import compare, progress
 from cluster.commands.progress import Progress
-from cluster.comparison.plan import ComparisonFolder, Plan
+from cluster.compare.plan import ComparisonFolder, Plan
 
 ROW = {"validation/success_rate": 0.37, "car_steps_per_s": 1_234_567.0, "car_steps": 12_300_000.0}
 WORDS = "240 generations  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"

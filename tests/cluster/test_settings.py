@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from cluster.runs.settings import DqnSettings, EvolveSettings, from_dict
+from cluster.settings import DqnSettings, EvolveSettings, from_dict
 from evolution.search.base import SearchConfig
 from gridsim.errors import GridSimError
 

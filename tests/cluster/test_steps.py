@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cluster.runs import checkpoint, steps, train
-from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError, load, save
-from cluster.runs.run import ELITES, is_finished, new_run, open_run
-from cluster.runs.settings import EvolveSettings
-from cluster.runs.steps import read_elites
+from cluster import run as train
+from cluster.learn.evolution import Evolution
+from cluster.learn.learning import Maps
+from cluster.settings import EvolveSettings
+from cluster.store import checkpoint, steps
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError, load, save
+from cluster.store.folder import ELITES, is_finished, new_run, open_run
+from cluster.store.steps import read_elites
 from cluster.tracking.address import check_uri
-from cluster.training.evolution import Evolution
-from cluster.training.trainer import Maps
 from cluster.workers.pool import SerialPool
 from gridsim.config import SimConfig
 

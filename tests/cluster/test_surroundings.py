@@ -15,7 +15,7 @@ import pytest
 import tracked
 from commands import BIN, finish, rows, running, same_run, start, wait_until
 
-from cluster.runs.settings import EvolveSettings
+from cluster.settings import EvolveSettings
 from cluster.workers import kernels
 from gridsim.jit import CACHE_FOLDER
 

@@ -15,10 +15,9 @@ from PIL import Image
 from rich.console import Console
 
 from cluster.commands.compare import Results
-from cluster.comparison import tables
-from cluster.comparison.page import page
-from cluster.comparison.plan import Plan
-from cluster.report import pictures
+from cluster.compare import picture, tables
+from cluster.compare.page import page
+from cluster.compare.plan import Plan
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
 
@@ -95,8 +94,8 @@ def test_picture_shows_who_was_compared(tmp_path):
         return (np.abs(pixels - wanted).max(axis=2) < 6).sum() > 500
 
     groups = tables.group([run(learner, "city", seed, 5.0) for learner in ("evolution", "dqn") for seed in range(2)])
-    pictures.comparison(groups, tmp_path / "two.png")
-    pictures.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
+    picture.comparison(groups, tmp_path / "two.png")
+    picture.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
     assert [has(tmp_path / "two.png", colour) for colour in (evolution, dqn)] == [True, True]
     assert [has(tmp_path / "one.png", colour) for colour in (evolution, dqn)] == [True, False]

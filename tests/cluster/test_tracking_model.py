@@ -10,8 +10,8 @@ import pytest
 from commands import finish
 from tracked import client, steps, tracker
 
-from cluster.runs.champion import Champion
-from cluster.runs.settings import EvolveSettings
+from cluster.settings import EvolveSettings
+from cluster.store.champion import Champion
 from cluster.tracking.description import torch_model
 from cluster.tracking.mlflow_run import write_model
 from evolution.networks.export import example

@@ -3,12 +3,12 @@
 import re
 from dataclasses import fields
 
-from cluster.runs.run import new_run
-from cluster.runs.settings import DqnSettings, EvolveSettings
-from cluster.runs.train import NOT_LOGGED
+from cluster.learn.dqn import Dqn
+from cluster.learn.evolution import Evolution
+from cluster.run import NOT_LOGGED
+from cluster.settings import DqnSettings, EvolveSettings
+from cluster.store.folder import new_run
 from cluster.tracking.description import describe, group, held_out_metrics, model_name, params, tags
-from cluster.training.dqn import Dqn
-from cluster.training.evolution import Evolution
 
 HELD_OUT = {"episodes": 64, "success_rate": 0.984, "distance_m": 2000.2, "speed_mps": 7.61, "collision_rate": 0.016}
 SUMMARY = {"generations": 48, "car_steps": 96_300_000, "wall_s": 57.2, "solved": True, "held_out": HELD_OUT}

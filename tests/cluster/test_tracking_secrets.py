@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tracked import client, free_port, mlflow_server, tracker
 
 from cluster.commands.cli import evolve_main
-from cluster.comparison.plan import ComparisonFolder, Plan
+from cluster.compare.plan import ComparisonFolder, Plan
 from cluster.redaction import one_line, redacted
 from cluster.tracking.address import TrackingError, check_uri
 

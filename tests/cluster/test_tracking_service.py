@@ -17,8 +17,8 @@ import pytest
 from commands import finish, rows, running, summary, wait_until
 from tracked import client, free_port, mlflow_server
 
-from cluster.runs.run import open_run
-from cluster.runs.train import send_missing
+from cluster.run import send_missing
+from cluster.store.folder import open_run
 
 pytestmark = pytest.mark.e2e
 

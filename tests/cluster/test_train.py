@@ -9,10 +9,10 @@ import pytest
 from commands import call, rows
 from tracked import client, free_port, steps
 
+from cluster import run as train
 from cluster.commands.cli import evolve_main
-from cluster.runs import train
-from cluster.runs.run import new_run, open_run, read_config
-from cluster.runs.settings import EvolveSettings
+from cluster.settings import EvolveSettings
+from cluster.store.folder import new_run, open_run, read_config
 
 SETTINGS = EvolveSettings("curved", policy="mlp:4", population=8, generations=2)
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from commands import rows
 
-from cluster.runs import checkpoint
-from cluster.runs.checkpoint import load, save
-from cluster.runs.run import new_run, open_run
-from cluster.runs.settings import EvolveSettings
-from cluster.runs.train import Session
-from cluster.training.evolution import Evolution
-from cluster.training.trainer import Champion, Maps
+from cluster.learn.evolution import Evolution
+from cluster.learn.learning import Champion, Maps
+from cluster.run import Session
+from cluster.settings import EvolveSettings
+from cluster.store import checkpoint
+from cluster.store.checkpoint import load, save
+from cluster.store.folder import new_run, open_run
 from cluster.workers.pool import Outcome, PoolError, SerialPool
 from evolution.episodes.curriculum import FINAL_SEEDS, HELD_OUT_SEEDS
 from evolution.episodes.starts import Episodes

@@ -20,11 +20,11 @@ from pictures import record_drive
 from cluster.commands import watch
 from cluster.commands.watch import checkpoint_time, elite, watch_main
 from cluster.report.film import VideoError, frames, picture, record, write_video
-from cluster.runs import checkpoint, steps
-from cluster.runs.champion import load_champion
-from cluster.runs.checkpoint import CheckpointError
-from cluster.runs.run import RunFolder
-from cluster.runs.settings import EvolveSettings
+from cluster.settings import EvolveSettings
+from cluster.store import checkpoint, steps
+from cluster.store.champion import load_champion
+from cluster.store.checkpoint import CheckpointError
+from cluster.store.folder import RunFolder
 from evolution.networks.policy import PolicySpec
 from gridsim.car.ego import End
 from gridsim.config import SimConfig

@@ -8,7 +8,7 @@ import pytest
 from driving import to_bytes
 from scipy import stats
 
-from cluster.runs.champion import load_champion
+from cluster.store.champion import load_champion
 from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.rollout import collect, evaluate
 from evolution.episodes.starts import lane_starts

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cluster.runs.champion import load_champion
+from cluster.store.champion import load_champion
 from cluster.workers.worker import Task, Worker
 from evolution.episodes.rollout import RESULT, evaluate, trajectory
 from evolution.episodes.starts import lane_starts

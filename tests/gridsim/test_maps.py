@@ -15,9 +15,9 @@ from pictures import PPM, H, W, crashes, distance, picture, read, save, strip, w
 from PIL import Image
 
 from cluster.commands.cli import EvolveFlags, _prepare
-from cluster.runs.champion import Champion, evaluate
-from cluster.runs.run import RunError, new_run, open_run, read_config
-from cluster.runs.settings import EvolveSettings
+from cluster.settings import EvolveSettings
+from cluster.store.champion import Champion, evaluate
+from cluster.store.folder import RunError, new_run, open_run, read_config
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import crashes, picture, save, strip
 
-from cluster.runs.settings import EvolveSettings, from_dict
+from cluster.settings import EvolveSettings, from_dict
 from gridsim.errors import GridSimError
 from gridsim.maps.files import MAX_PIXELS, load_map
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.comparison.plan import Plan
-from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
-from cluster.runs.champion import Champion
-from cluster.runs.run import RunFolder
+from cluster.compare.plan import Plan
+from cluster.compare.results import ERROR_FIGURES, RUN_FIGURES, Run
+from cluster.store.champion import Champion
+from cluster.store.folder import RunFolder
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 

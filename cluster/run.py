@@ -1,7 +1,7 @@
 """A training run, new or resumed, from its start to its end, for commands and comparisons alike.
 
 A step is a generation or an evaluation. Steps are saved while the workers are busy, generations once a second: first
-their elites and rows of the history (`runs/steps.py`), then the checkpoint that counts them, history.csv and the MLflow
+their elites and rows of the history (`store/steps.py`), then the checkpoint that counts them, history.csv and MLflow's
 rows. Whatever kills the process, the folder holds a whole step, the previous one or one of a second ago, and a resumed
 run gives the same champion.
 """
@@ -23,11 +23,14 @@ from typing import Any
 
 import numpy as np
 
+from cluster.learn.evolution import Evolution
+from cluster.learn.learning import Learning, Maps, State
 from cluster.redaction import redacted
-from cluster.runs import checkpoint, steps
-from cluster.runs.champion import Champion, load_champion
-from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError
-from cluster.runs.run import (
+from cluster.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.store import checkpoint, steps
+from cluster.store.champion import Champion, load_champion
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, STEPS, CheckpointError
+from cluster.store.folder import (
     CURVES,
     ELITES,
     FILES,
@@ -37,17 +40,14 @@ from cluster.runs.run import (
     TRAJECTORY,
     RunError,
     RunFolder,
-    as_argument,
     lock,
     write_summary,
 )
-from cluster.runs.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.text import as_argument, count
 from cluster.tracking import description
 from cluster.tracking.address import TrackingError, check_uri, with_password
 from cluster.tracking.mlflow_run import Identity, Status, quiet
-from cluster.tracking.tracker import Tracker, count
-from cluster.training.evolution import Evolution
-from cluster.training.trainer import Learning, Maps, State
+from cluster.tracking.tracker import Tracker
 from cluster.workers import kernels
 from cluster.workers.pool import SerialPool, WorkerPool
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
@@ -206,7 +206,7 @@ def new_learning(settings: RunSettings, pool: WorkerPool, maps: Maps, initial: n
     if isinstance(settings, EvolveSettings):
         return Evolution(settings, pool, maps, initial)
     assert isinstance(settings, DqnSettings)
-    from cluster.training.dqn import Dqn  # imports PyTorch, which evolution does not need
+    from cluster.learn.dqn import Dqn  # imports PyTorch, which evolution does not need
 
     return Dqn(settings, pool, maps, initial)
 

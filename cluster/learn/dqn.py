@@ -14,12 +14,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.runs.settings import DqnSettings
-from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
+from cluster.learn.learning import Learning, State, check_any_left, named
+from cluster.settings import DqnSettings
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, exploration, finite
 from evolution.dqn.replay import Replay
 from evolution.episodes.curriculum import success_rate
+from evolution.episodes.figures import mean_speed
 
 EPISODE_STEPS = 256  # time limit of training episodes, which are truncated there
 BATCH_STEPS = 32_768  # car-steps of a batch, about

@@ -12,10 +12,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.runs.settings import EvolveSettings
-from cluster.training.trainer import Learning, State, check_any_left, mean_speed, named
+from cluster.learn.learning import Learning, State, check_any_left, named
+from cluster.settings import EvolveSettings
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
+from evolution.episodes.figures import mean_speed
 from evolution.episodes.starts import Episodes
 from evolution.search import fitness
 from evolution.search.base import Generation, Search

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.runs.settings import RunSettings
+from cluster.settings import RunSettings
 from cluster.workers.pool import Call, Chunk, Meanwhile, Outcome, PoolError, WorkerPool
 from cluster.workers.worker import Task
 from evolution.episodes.curriculum import (
@@ -28,10 +28,10 @@ from evolution.episodes.curriculum import (
     spread_starts,
     success_rate,
 )
+from evolution.episodes.figures import summarise
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, recipes
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build, seed_of_map
@@ -279,20 +279,3 @@ def check_any_left(lost: np.ndarray, stage: str) -> None:
     """Raises: PoolError if all of lost, bool [n], are true: then there is nothing to continue with."""
     if lost.all():
         raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")
-
-
-def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
-    """Means over the episodes of one member: RESULT [e]."""
-    return {
-        "episodes": len(results),
-        "success_rate": float((results["end"] == End.SUCCESS).mean()),
-        "distance_m": float(results["distance"].mean()),
-        "speed_mps": mean_speed(results, period_s),
-        "collision_rate": float((results["end"] == End.COLLISION).mean()),
-    }
-
-
-def mean_speed(results: np.ndarray, period_s: float) -> float:
-    """Mean over episodes of new ground over time, in m/s."""
-    seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
-    return float((results["distance"] / seconds).mean())

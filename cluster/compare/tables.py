@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cluster.comparison.plan import Plan
-from cluster.comparison.results import ERROR_FIGURES, RUN_FIGURES, Run
-from cluster.runs.settings import RunSettings
-from cluster.tracking.tracker import count
+from cluster.compare.plan import Plan
+from cluster.compare.results import ERROR_FIGURES, RUN_FIGURES, Run
+from cluster.settings import RunSettings
+from cluster.text import count
 from gridsim.maps.scenarios import REGISTRY, label
 
 NAMES = {"evolution": "evolution", "two-parents": "two parents", "dqn": "DQN", "random": "random search"}

@@ -10,7 +10,6 @@ import hashlib
 import json
 import os
 import re
-import shlex
 import time
 import uuid
 from dataclasses import dataclass, field
@@ -20,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, CheckpointError
-from cluster.runs.settings import SETTINGS, RunSettings, from_dict
-from cluster.tracking.description import file_name
+from cluster.settings import SETTINGS, RunSettings, from_dict
+from cluster.store import checkpoint
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, CheckpointError
+from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.files import map_digest
@@ -34,11 +33,6 @@ CURVES, TRAJECTORY = "curves.png", "trajectory.png"
 FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, PAGE, ELITES, HISTORY, SUMMARY, TRAJECTORY)
 """Files of a finished run, which MLflow gets; what else is in its folder is the user's own."""
 CONFIG_FORMAT = 2
-
-
-def as_argument(path: Path) -> str:
-    """A path as an argument of a command that is pasted into a shell."""
-    return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))
 
 
 class RunError(GridSimError):

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
-from cluster.runs.run import as_argument, read_config
-from cluster.runs.settings import MAX_TRAFFIC, EvolveSettings
-from cluster.training.trainer import summarise
+from cluster.settings import MAX_TRAFFIC, EvolveSettings
+from cluster.store import checkpoint
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, CheckpointError
+from cluster.store.folder import read_config
+from cluster.text import as_argument
 from evolution.episodes import rollout
 from evolution.episodes.curriculum import HELD_OUT_SEEDS, spread_starts
+from evolution.episodes.figures import summarise
 from evolution.episodes.starts import Episodes
 from evolution.networks import convnet
 from evolution.networks.policy import CnnSpec, PolicySpec, act_on

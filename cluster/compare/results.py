@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from cluster.runs.champion import Champion, held_out, load_champion
-from cluster.runs.checkpoint import CHAMPION
-from cluster.runs.run import CONFIG, SUMMARY, as_argument, read_config
-from cluster.runs.settings import RunSettings
+from cluster.settings import RunSettings
+from cluster.store.champion import Champion, held_out, load_champion
+from cluster.store.checkpoint import CHAMPION
+from cluster.store.folder import CONFIG, SUMMARY, read_config
+from cluster.text import as_argument
 from evolution.episodes.curriculum import HELD_OUT_EPISODES
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import PolicySpec

@@ -18,12 +18,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-from cluster.comparison.results import LEARNERS, Learner, Run, read_run
+from cluster.compare.results import LEARNERS, Learner, Run, read_run
 from cluster.redaction import redacted
-from cluster.runs import checkpoint
-from cluster.runs.run import CHECKPOINT, CONFIG, SUMMARY, RunFolder, as_argument, lock, open_run, read_config
-from cluster.runs.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
-from cluster.tracking.description import file_name
+from cluster.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
+from cluster.store import checkpoint
+from cluster.store.folder import CHECKPOINT, CONFIG, SUMMARY, RunFolder, lock, open_run, read_config
+from cluster.text import as_argument, file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY, is_map_file, label

@@ -10,10 +10,10 @@ from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
-from cluster.comparison.plan import Plan
-from cluster.comparison.results import Run
-from cluster.comparison.tables import DRIVING, ERRORS, Group, introduction, notes, table
-from cluster.runs.run import PAGE
+from cluster.compare.plan import Plan
+from cluster.compare.results import Run
+from cluster.compare.tables import DRIVING, ERRORS, Group, introduction, notes, table
+from cluster.store.folder import PAGE
 
 STYLE = """\
 body { font: 16px system-ui, sans-serif; margin: 2em auto; max-width: 90em; padding: 0 1em; color: #222 }

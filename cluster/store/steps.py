@@ -16,9 +16,9 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from cluster.redaction import one_line
-from cluster.runs import checkpoint
-from cluster.runs.checkpoint import CHECKPOINT, STEPS, CheckpointError, WriteError
-from cluster.runs.run import ELITES
+from cluster.store import checkpoint
+from cluster.store.checkpoint import CHECKPOINT, STEPS, CheckpointError, WriteError
+from cluster.store.folder import ELITES
 from evolution.networks.policy import PolicySpec
 
 

@@ -1,0 +1,32 @@
+"""Tables of how a champion drives, for the terminal."""
+
+from collections.abc import Mapping
+
+from rich.table import Column, Table
+
+
+def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
+    """How well a champion drives on roads it never saw."""
+    table = Table("", Column(justify="right"), title=title, title_justify="left", show_header=False)
+    table.add_row("episodes", f"{figures['episodes']:.0f}")
+    table.add_row("success (2,000 m without a collision)", f"{figures['success_rate']:.1%}")
+    table.add_row("mean distance", f"{figures['distance_m']:,.0f} m")
+    table.add_row("mean speed", f"{figures['speed_mps']:.2f} m/s")
+    table.add_row("collisions", f"{figures['collision_rate']:.1%}")
+    table.add_row("stopped, or out of time", f"{1.0 - figures['success_rate'] - figures['collision_rate']:.1%}")
+    return table
+
+
+def errors_table(title: str, figures: Mapping[str, float]) -> Table:
+    """Velocity and steering errors, as from `gridsim.reference.errors.errors`."""
+    numbers = Column("mean", justify="right"), Column("max", justify="right")
+    table = Table("", *numbers, title=title, title_justify="left")
+    for head, mean, largest, digits in (
+        ("velocity error, m/s", "velocity_mean_mps", "velocity_max_mps", 2),
+        ("  % of the reference's mean speed", "velocity_mean_percent", "velocity_max_percent", 1),
+        ("steering error, degrees", "steering_mean_deg", "steering_max_deg", 1),
+        ("  % of the steering limit", "steering_mean_percent", "steering_max_percent", 1),
+    ):
+        table.add_row(head, f"{figures[mean]:.{digits}f}", f"{figures[largest]:.{digits}f}")
+    table.caption = f"over {figures['metres']:,.0f} m; the reference's mean speed is {figures['reference_mps']:.2f} m/s"
+    return table

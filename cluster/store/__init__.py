@@ -1,0 +1,1 @@
+"""A run's folder: its configuration, lock, checkpoint, steps and champion."""

@@ -1,0 +1,20 @@
+"""Words for people: numbers with nouns, names for folders, arguments for a shell."""
+
+import re
+import shlex
+from pathlib import Path
+
+
+def count(number: int, noun: str) -> str:
+    """As in `1 row` or `2 rows`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def file_name(words: str) -> str:
+    """A scenario's label and other words as a folder's name."""
+    return re.sub(r"[^\w.+=@-]", "_", words)
+
+
+def as_argument(path: Path) -> str:
+    """A path as an argument of a command that is pasted into a shell."""
+    return shlex.quote(f"./{path}" if str(path).startswith("-") else str(path))

@@ -1,0 +1,24 @@
+"""Figures of how well a network drives, from the results of its episodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridsim.car.ego import End
+
+
+def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:
+    """Means over the episodes of one member, RESULT [e]; `period_s` is the control period."""
+    return {
+        "episodes": len(results),
+        "success_rate": float((results["end"] == End.SUCCESS).mean()),
+        "distance_m": float(results["distance"].mean()),
+        "speed_mps": mean_speed(results, period_s),
+        "collision_rate": float((results["end"] == End.COLLISION).mean()),
+    }
+
+
+def mean_speed(results: np.ndarray, period_s: float) -> float:
+    """Mean over episodes of new ground over time, in m/s."""
+    seconds = np.maximum(results["steps"].astype(np.float64), 1.0) * period_s
+    return float((results["distance"] / seconds).mean())
