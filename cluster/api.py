@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 
 from cluster.learn.evolution import Evolution
-from cluster.learn.learning import Maps
-from cluster.run import Workers, new_learning
+from cluster.learn.learning import finish
+from cluster.learn.maps import Maps
+from cluster.run import new_learning
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.store.champion import Champion, evaluate, load_champion
+from cluster.workers.open import open_pool
+from cluster.workers.pool import WorkerPool
 from gridsim.config import SimConfig
 
 __all__ = ["Champion", "DqnSettings", "EvolveSettings", "compare", "evaluate", "evolve", "load_champion", "train_dqn"]
@@ -45,7 +48,7 @@ def evolve(
         fitness: returns scores float64 [n], higher is better, given the episodes' results (structured, [n, episodes],
             with fields distance (m), paced (m at a speed within the interval), steps and end (`gridsim.car.ego.End`))
             and targets (m). It runs in this process only. Default: `evolution.search.fitness.scalar`.
-        workers: Ray workers on this machine; 0 evaluates in this process.
+        workers: Ray workers on this machine; 0 evaluates in this process, on all its cores.
         on_generation: called with the number of generations done and the latest one's figures.
 
     Returns: the champion, and the history: a row of figures for each generation, named as in a run's history.csv.
@@ -89,19 +92,23 @@ def compare(*runs: str | os.PathLike[str]) -> list[dict[str, Any]]:
 def _train(settings: RunSettings, workers: int, on_step: OnStep | None, fitness: Fitness | None = None) -> Trained:
     settings.check()
     maps = Maps(settings.scenario, SimConfig())
-    team = Workers(workers, address=None, patience_s=0.0)
+    pool: WorkerPool | None = None
     try:
-        learning = new_learning(settings, team.open(maps), maps)
+        pool = open_pool(workers, None, 0.0, maps.build)
+        learning = new_learning(settings, pool, maps)
         if fitness is not None and isinstance(learning, Evolution):
             learning.score = fitness
         while not learning.done():
-            row = learning.step()
+            finish(learning.step())
             learning.elites.clear()  # needed only for a run's folder
             if on_step:
-                on_step(learning.steps, row)
-        genome = learning.choose_champion().genome
+                on_step(learning.steps, learning.history[-1])
+        finish(learning.choose_champion())
+        assert learning.champion is not None
+        genome = learning.champion.genome
         champion = Champion(genome, settings.policy, settings.scenario, learning.sim, settings.traffic)
         return champion, learning.history
     finally:
-        team.close()
+        if pool:
+            pool.close()
         maps.close()

@@ -36,10 +36,11 @@ S = TypeVar("S", bound="RunSettings")
 class RunSettings:
     """What any learner's run depends on: two runs with equal settings have the same champion."""
 
-    command: ClassVar[str]  # that starts such a run
+    command: ClassVar[str]  # console script of this learner
     default_policies: ClassVar[dict[Observation, str]]
-    unbound: ClassVar[tuple[str, ...]]  # limits that may be raised when a run is resumed: it only ends later
+    extendable: ClassVar[tuple[str, ...]]  # limits that --resume may raise
     step_name: ClassVar[str]  # what a step of learning is called
+    verb: ClassVar[str]  # what is done to a network
 
     scenario: str = "seamless"
     """Road to learn on: highway, curved, seamless, roundabout, city, or a map file (docs/maps.md)."""
@@ -98,7 +99,7 @@ class RunSettings:
         return self
 
     def ended(self, so_far: Mapping[str, Any]) -> bool:
-        """Whether a run that has come so far (`Learning.counts`, and `solved`) has nothing left to do."""
+        """Whether a run with these counters (`Learning.counts`, and `solved`) is finished."""
         return bool(so_far["solved"]) or 0 < self.car_steps <= int(so_far["car_steps"])
 
     def check(self) -> None:
@@ -146,8 +147,9 @@ class EvolveSettings(RunSettings):
 
     command: ClassVar[str] = "gridsim-evolve"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64+steering", "grid": "cnn:8,16,32@1"}
-    unbound: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
+    extendable: ClassVar[tuple[str, ...]] = ("generations", "car_steps")
     step_name: ClassVar[str] = "generation"
+    verb: ClassVar[str] = "evolving"
 
     policy: Annotated[str, IN_WORDS] = ""
     """Network: mlp: and the sizes of its hidden layers, +motion to see how fast the cars that rays hit approach,
@@ -235,11 +237,12 @@ class DqnSettings(RunSettings):
 
     command: ClassVar[str] = "gridsim-dqn"
     default_policies: ClassVar[dict[Observation, str]] = {"rays": "mlp:64,64+steering", "grid": "cnn:16,32,256@4"}
-    unbound: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
+    extendable: ClassVar[tuple[str, ...]] = ("car_steps", "episodes")
     step_name: ClassVar[str] = "evaluation"
-    #: What replaces 0 in these settings. An update on grids takes a hundred times as long as one on rays,
+    verb: ClassVar[str] = "training"
+    #: What 0 means in these settings. An update on grids takes a hundred times as long as one on rays,
     #: so that half an hour is enough for 2 million car-steps, not 400 million.
-    suited: ClassVar[dict[Observation, dict[str, Any]]] = {
+    defaults_by_observation: ClassVar[dict[Observation, dict[str, Any]]] = {
         "rays": {
             "replay": 1_000_000, "batch": 256, "updates": 4.0, "learning_rate": 1e-3, "anneal": 30_000_000,
             "target_period": 200, "evaluate_every": 1_000_000,
@@ -287,7 +290,7 @@ class DqnSettings(RunSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, value in self.suited.get(self.observation, {}).items():
+        for name, value in self.defaults_by_observation.get(self.observation, {}).items():
             if not getattr(self, name):
                 object.__setattr__(self, name, value)
 
@@ -316,12 +319,10 @@ class DqnSettings(RunSettings):
 SETTINGS: dict[str, type[RunSettings]] = {kind.command: kind for kind in (EvolveSettings, DqnSettings)}
 
 
-def check_workers(workers: int, address: str, patience_s: float) -> None:
+def check_workers(workers: int, patience_s: float) -> None:
     """Raises GridSimError if a run cannot be computed with these values; no result depends on them."""
     if not 0 <= workers <= MAX_WORKERS:
         raise GridSimError(f"--workers must be 0 to {MAX_WORKERS:,}, not {workers}")
-    if workers == 0 and address:
-        raise GridSimError("--workers 0 evaluates in this process; leave out --address, or give --workers 1 or more")
     if not 0.0 <= patience_s < math.inf:
         raise GridSimError(f"--patience must be 0 or more, not {patience_s:g}")
 

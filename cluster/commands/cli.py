@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +17,9 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from cluster import stopping
 from cluster.commands.common import (
     FAILED,
-    INTERRUPTED,
     RoadFlags,
     WorkFlags,
     as_flag,
@@ -36,13 +37,16 @@ from cluster.commands.entry import STARTED
 from cluster.commands.progress import Progress
 from cluster.commands.tables import errors_table, held_out_table
 from cluster.compare.results import series
-from cluster.run import Session, Workers, send_missing, train, undisturbed
+from cluster.run import Place, Session, train
 from cluster.settings import IN_WORDS, DqnSettings, EvolveSettings, check_workers
+from cluster.stopping import INTERRUPTED
 from cluster.store.champion import evaluate, load_champion
 from cluster.store.checkpoint import CHECKPOINT, CONFIG, STEPS, CheckpointError
 from cluster.store.folder import RunFolder, is_finished, lock, new_run, open_run, read_config
 from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
+from cluster.tracking.description import read_run
+from cluster.tracking.sync import saved_uri, sync
 from cluster.workers.ray_session import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
@@ -58,10 +62,14 @@ class RunFlags:
     """Name of the run; by default made from scenario, algorithm, seed and time."""
     resume: Annotated[str, IN_WORDS] = ""
     """Folder of a run to continue exactly from its checkpoint."""
+    resume_if_exists: bool = False
+    """Start the run of that --name, or continue it if it was begun: for clusters that start a job again."""
     config: Annotated[str, IN_WORDS] = ""
     """A run's config.json: repeat that run; other flags override it."""
     init: Annotated[str, IN_WORDS] = ""
     """A champion.npz, or a run's folder, to start from in place of random networks."""
+    wall_time: Annotated[float, IN_WORDS] = 0.0
+    """Seconds of learning at most, by default any number. What is learned in them depends on the machine's speed."""
 
 
 @dataclass(frozen=True)
@@ -127,43 +135,37 @@ class EvaluateFlags(RoadFlags):
 def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFolder]:
     """Flags and the run's folder, checked; nothing is written yet. Raises GridSimError."""
     prog = kind.command
-    base: Flags | None = None
     flags = parse(kind, prog, arguments)
-    resume, config = flags.resume, flags.config
-    if resume and config:
-        raise GridSimError("--resume and --config exclude each other: --resume continues a run, --config repeats it")
-    if resume or config:  # the settings of that run are the defaults
+    resume = _folder_to_resume(flags)
+    base: Flags | None = None
+    if resume or flags.config:  # the settings of that run are the defaults
         if resume:
             run = open_run(Path(resume))
             settings, init = run.settings, run.init
         else:
-            settings, init = read_config(Path(config))
+            settings, init = read_config(Path(flags.config))
         if settings.command != prog:
-            flag, path = ("--resume", resume) if resume else ("--config", config)
+            flag, path = ("--resume", resume) if resume else ("--config", flags.config)
             again = f"{settings.command} {flag} {as_argument(Path(path))}"
             raise GridSimError(f"{path} belongs to another learner; use {again}")
         base = kind(**dataclasses.asdict(settings), init=init)
         if resume:
-            base = dataclasses.replace(base, resume=resume, output=str(run.path.parent), name=run.name)
+            base = dataclasses.replace(base, resume=flags.resume, output=str(run.path.parent), name=run.name)
         flags = parse(kind, prog, arguments, base)
     if flags.traffic and is_map_file(flags.scenario):
         print(f"{prog}: {flags.scenario} has no lanes for traffic; running without", file=sys.stderr)
         return _prepare(kind, [*arguments, "--traffic", "0"])
-    check_workers(flags.workers, flags.address, flags.patience)
+    check_workers(flags.workers, flags.patience)
+    if not 0.0 <= flags.wall_time < math.inf:
+        raise GridSimError(f"--wall-time must be 0 or more, not {flags.wall_time:g}")
     if base and resume:
         flags = flags.extending(base)
-        free = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"}
-        check_unchanged(flags, base, free, kind.unbound, "run")
+        free = {f.name for f in dataclasses.fields(WorkFlags)} - {"output"} | {"resume_if_exists", "wall_time"}
+        check_unchanged(flags, base, free, kind.extendable, "run")
     settings = select(EvolveSettings if isinstance(flags, EvolveFlags) else DqnSettings, flags)
     settings.check()
     if isinstance(flags, DqnFlags) and flags.device == "cuda":
-        from evolution.dqn.learner import device_of  # imports PyTorch
-
-        try:
-            device_of(flags.device)
-        except ValueError as error:
-            there = f"{resume} was trained with --device cuda, and PyTorch finds no GPU; continue it where there is one"
-            raise GridSimError(there if resume else f"--device cuda: {error}") from error
+        _check_cuda(resume)
     if resume:
         run.settings = settings
         return flags, run
@@ -175,49 +177,70 @@ def _prepare(kind: type[Flags], arguments: Sequence[str]) -> tuple[Flags, RunFol
         if not np.isfinite(champion.genome).all():
             raise GridSimError(f"--init {flags.init}: some of its genes are not numbers; choose another champion")
         digest = champion.sha256
-    return flags, new_run(Path(flags.output), flags.name, settings, flags.init, digest)
+    output = Path(flags.output)
+    return flags, new_run(output, flags.name, settings, flags.init, digest, may_exist=flags.resume_if_exists)
+
+
+def _folder_to_resume(flags: Flags) -> str:
+    """The folder of the run that these flags continue, or "" for a new run. Raises GridSimError."""
+    if not flags.resume_if_exists:
+        if flags.resume and flags.config:
+            text = "--resume and --config exclude each other: --resume continues a run, --config repeats it"
+            raise GridSimError(text)
+        return flags.resume
+    if flags.resume or not flags.name:
+        raise GridSimError("--resume-if-exists starts or continues the run of a --name; give that, and no --resume")
+    path = Path(flags.output, flags.name)
+    return str(path) if (path / CHECKPOINT).is_file() else ""
+
+
+def _check_cuda(resume: str) -> None:
+    """Raises GridSimError if there is no GPU."""
+    from evolution.dqn.learner import device_of  # imports PyTorch
+
+    try:
+        device_of("cuda")
+    except ValueError as error:
+        there = f"{resume} was trained with --device cuda, and PyTorch finds no GPU; continue it where there is one"
+        raise GridSimError(there if resume else f"--device cuda: {error}") from error
 
 
 def _learn(kind: type[Flags]) -> int:
     prog, step = kind.command, kind.step_name
     console = new_console()
     flags, run = _prepare(kind, sys.argv[1:])
+    settings, folder = run.settings, short_path(run.path)
     if run.saved and is_finished(run):
-        sent, unsent = send_missing(run, flags.tracking_uri, flags.experiment)
-        sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
-        bounds = [as_flag(name) for name in run.settings.unbound if getattr(run.settings, name)]
-        more = f" To go on beyond its end, resume it with a greater {' or '.join(bounds)}." if bounds else ""
-        if run.saved[1]["solved"]:
-            more = f" It is solved; to go on from its champion, start a run with --init {short_path(run.path)}."
-        steps = count(run.saved[1][step], step)
-        console.print(f"{short_path(run.path)} is finished: {steps}; {sent}.{more}", soft_wrap=True)
-        if unsent:
-            print(f"{prog}: warning: {unsent}", file=sys.stderr)
-        return 0
-    saved = run.saved[1]["tracking"]["uri"] if run.saved else ""
-    uri = check_uri(flags.tracking_uri, saved)
-    address = cluster_address(flags.address) if flags.workers else None
-    warn_of_many_workers(prog, flags.workers, address)
+        return _send_missing(console, run, flags)
+    place = Place(
+        flags.workers,
+        cluster_address(flags.address),
+        flags.patience,
+        check_uri(flags.tracking_uri, saved_uri(run.path)),
+        flags.experiment,
+        flags.wall_time or math.inf,
+    )
+    warn_of_many_workers(prog, place.workers, place.address)
     new_folders = [path for path in (run.path, *run.path.parents) if not path.exists()]
     lock(run.path)
-    workers = Workers(flags.workers, address, flags.patience)
-    folder = short_path(run.path)
+    if run.saved is None and (run.path / CHECKPOINT).exists():
+        raise GridSimError(f"{folder}: another process has just begun this run; start the command again to continue it")
+    stopping.listen()
     resume = f"{command_path(prog)} --resume {folder}"
     hint = f"continue with: {resume}"
+    verb = "continuing" if run.saved else kind.verb
+    console.print(f"{verb} {settings.policy} on {settings.scenario}, seed {settings.seed} -> {folder}", soft_wrap=True)
     code, message = 0, ""
     try:
         initial = load_champion(flags.init).genome if flags.init and run.saved is None else None
-        progress = Progress(console, prog, folder, resume)
-        session = train(run, workers, uri, flags.experiment, progress, STARTED, initial=initial)
+        with Progress(console, settings) as shown:
+            session = train(run, place, shown.event, shown.row, initial=initial, started=STARTED)
     except (KeyboardInterrupt, SystemExit):  # the latter by rich, if what reads the output has ended
         code = INTERRUPTED
     except (GridSimError, FloatingPointError, MemoryError, OSError) as error:
         code, message = FAILED, str(error) or type(error).__name__
         if isinstance(error, FloatingPointError):  # if resumed, it would fail again
             hint = f"repeat it with: {command_path(prog)} --config {short_path(run.path / CONFIG)} --learning-rate ..."
-    finally:
-        with undisturbed():
-            workers.close()
     if code == 0:
         _print_end(console, session, resume)
         return code
@@ -234,6 +257,25 @@ def _learn(kind: type[Flags]) -> int:
     return code
 
 
+def _send_missing(console: Console, run: RunFolder, flags: Flags) -> int:
+    """Send to MLflow what it lacks of a finished run, and say how to go on."""
+    settings, saved = run.settings, run.saved
+    assert saved is not None
+    meta = saved[1]
+    uri = check_uri(flags.tracking_uri, saved_uri(run.path))
+    sent, unsent = sync(run.path, uri, flags.experiment, read_run)
+    sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
+    limits = [as_flag(name) for name in settings.extendable if getattr(settings, name)]
+    more = f" To go on beyond its end, resume it with a greater {' or '.join(limits)}." if limits else ""
+    if meta["solved"]:
+        more = f" It is solved; to go on from its champion, start a run with --init {short_path(run.path)}."
+    steps = count(meta[settings.step_name], settings.step_name)
+    console.print(f"{short_path(run.path)} is finished: {steps}; {sent}.{more}", soft_wrap=True)
+    if unsent:
+        print(f"{settings.command}: warning: {unsent}", file=sys.stderr)
+    return 0
+
+
 def _print_end(console: Console, session: Session, resume: str) -> None:
     """Print how a finished run did, and where to look next."""
     summary, name, path = session.summary, session.run.settings.step_name, session.run.path
@@ -241,7 +283,7 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
     where = "this map, from many starts" if is_map_file(settings.scenario) else "held-out drives"
     console.print(held_out_table(f"The champion on {where}", summary["held_out"]))
     steps, solved = count(summary[name + "s"], name), summary["solved"]
-    reached = [each for each in settings.unbound if 0 < getattr(settings, each) <= summary[each]]
+    reached = [each for each in settings.extendable if 0 < getattr(settings, each) <= summary[each]]
     longer = " ".join(f"{as_flag(each)} {2 * summary[each]}" for each in reached)
     more = "" if solved or not longer else f"\nto go on: {resume} {longer}"
     console.print(
@@ -253,7 +295,7 @@ def _print_end(console: Console, session: Session, resume: str) -> None:
         f"run: {short_path(path)}   champion: {short_path(path / 'champion.npz')}\n"
         f"watch it: open {short_path(path / 'drive.html')} in a browser, or "
         f"{command_path('gridsim-watch')} {short_path(path)}\n"
-        f"compare: {session.tracker.where(command_path('mlflow'))}",
+        f"compare: {session.tracking.where(command_path('mlflow'))}",
         soft_wrap=True,
     )
 

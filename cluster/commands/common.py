@@ -24,6 +24,7 @@ from docstring_parser import attrdoc
 from rich.console import Console
 
 from cluster.settings import IN_WORDS
+from cluster.stopping import INTERRUPTED
 from cluster.store.checkpoint import WriteError
 from cluster.text import as_argument
 from cluster.workers.cores import cores
@@ -31,7 +32,7 @@ from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED
 
 T = TypeVar("T")
-FAILED, WRONG_USE, INTERRUPTED = 1, 2, 130
+FAILED, WRONG_USE = 1, 2  # exit codes
 MANY_WORKERS = 4  # per core; more cause a warning
 # Patterns of tyro's messages about wrong flags, and what the user reads instead.
 PLAIN = {
@@ -77,13 +78,12 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
 class WorkFlags:
     """Where runs are computed, kept and logged."""
 
-    workers: int = field(default_factory=cores)
-    """Worker processes; 0 evaluates in this process."""
+    workers: int = 0
+    """Ray workers; 0 evaluates in this process, on all its cores, or with --address on all free CPUs of the cluster."""
     output: str = "runs"
     """Folder in which the run's folder is created."""
     address: Annotated[str, IN_WORDS] = ""
-    """An existing Ray cluster: auto, or host:port; local starts Ray on this machine. By default RAY_ADDRESS, else
-    local."""
+    """An existing Ray cluster: auto, or host:port; local stays on this machine. By default RAY_ADDRESS, else local."""
     patience: Annotated[float, IN_WORDS] = 0.0
     """Seconds without any worker after which a run stops; it can be resumed. A worker that does not answer for so long
     is replaced. By default 300, and 60 for an answer on this machine."""

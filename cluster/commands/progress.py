@@ -5,23 +5,21 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from contextlib import AbstractContextManager
-from typing import Self
+from collections.abc import Mapping
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from cluster.commands.common import new_console
-from cluster.learn.learning import Learning
-from cluster.run import Reporter, Session
+from cluster.learn.learning import Event
+from cluster.settings import RunSettings
 
 LINE_S = 5.0  # between lines without a terminal
 WINDOW_S = 10.0  # the ETA is computed from the steps of at least this time
 BAR = 10  # characters
 
 
-class Line(Live):
+class Display(Live):
     """On a terminal: `head`, `facts`, a bar and the elapsed time if `share` is known, and `rest` on a second line."""
 
     def __init__(self, console: Console):
@@ -40,86 +38,90 @@ class Line(Live):
         return line.append(f"\n{self.rest}")
 
 
-class Progress(Line, Reporter):
-    """Shows a run's progress, success and ETA, then distance, speed and car-steps per second.
+class Progress(Display):
+    """Shows a run's progress, success and ETA, then distance, speed and car-steps per second."""
 
-    Args: the console; the command's name; the run's folder and the command that resumes it, as the user would type
-    them.
-    """
-
-    def __init__(self, console: Console, prog: str, folder: str, resume: str):
+    def __init__(self, console: Console, settings: RunSettings):
         super().__init__(console)
-        self._prog, self._folder, self.resume = prog, folder, resume
+        self._settings = settings
         self._steps: deque[tuple[float, float, float]] = deque()  # of each: end time, progress, car-steps
-        self._printed = 0.0
-        self._text = ""
-        self.facts, self.rest = "success 0%  ETA -:--", "starting the workers"
+        self._printed, self._last = 0.0, ""
 
-    def warn(self, text: str) -> None:
-        print(f"{self._prog}: warning: {text}", file=sys.stderr, flush=True)
+    def event(self, event: Event) -> None:
+        """Show what the run is doing, or warn."""
+        if event.warning:
+            print(f"{self._settings.command}: warning: {event.text}", file=sys.stderr, flush=True)
+        elif event.total:
+            done = min(event.done, event.total)
+            self.rest = f"{event.text} {done:{len(str(event.total))}}/{event.total}  {self._last}"
+        else:
+            self.rest = event.text
+            if not self.console.is_terminal:
+                self.console.print(event.text)
 
-    def compiling(self) -> AbstractContextManager[object]:
-        text = "compiling the simulator for runs of this kind, once (some 20 s)"
-        if not self.console.is_terminal:
-            self.console.print(text)
-        return self.console.status(text)
-
-    def stopping(self) -> None:
-        new_console(stderr=True).print("stopping; a moment ...", style="dim")
-
-    def learning(self, session: Session) -> Self:
-        self._learning = session.learning
-        self._advance()
-        settings = session.run.settings
-        verb = "continuing" if self._learning.progress()[0] else self._learning.verb
-        what = f"{settings.policy} on {settings.scenario}, seed {settings.seed}"
-        self.console.print(f"{verb} {what} -> {self._folder}", soft_wrap=True)
-        return self
-
-    def _advance(self) -> None:
-        done, total, _ = self._learning.progress()
-        self.head = progress_of(self._learning)
+    def row(self, steps: int, row: Mapping[str, float]) -> None:
+        """Show a step that is done: the number of steps, and the row of the history."""
+        settings = self._settings
+        done, total, _ = progress(settings, steps, row)
+        self.head = progress_in_words(settings, steps, row)
         self.share = int(done) / total if total else None
-
-    def row(self, step: int, row: dict[str, float]) -> None:
-        self._advance()
         self.facts = f"success {row['validation/success_rate']:.0%}"
-        if not self._learning.done():  # the champion is measured after the last step
-            self.facts += f"  ETA {self._eta(row['car_steps'])}"
-        self.rest = self._text = f"{self._learning.describe(row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
+        ended = 0 < total <= done
+        if not ended:
+            self.facts += f"  ETA {self._eta(done, total, row['car_steps'])}"
+        self._last = f"{row_in_words(settings, steps, row)}  {row['car_steps_per_s'] / 1e6:.2f} M car-steps/s"
+        self.rest = self._last
         now = time.perf_counter()
-        if not self.console.is_terminal and (now - self._printed > LINE_S or self._learning.done()):
+        if not self.console.is_terminal and (now - self._printed > LINE_S or ended):
             self._printed = now
-            self.console.print(f"{self.head}  {self.facts}  {self._text}", soft_wrap=True)
+            self.console.print(f"{self.head}  {self.facts}  {self._last}", soft_wrap=True)
 
-    def _eta(self, car_steps: float) -> str:
+    def _eta(self, done: float, total: float, car_steps: float) -> str:
         """Time until the run reaches its first limit at the pace of the latest steps. It may be solved before."""
-        now, (done, total, _) = time.perf_counter(), self._learning.progress()
+        now = time.perf_counter()
         self._steps.append((now, done, car_steps))
         while len(self._steps) > 2 and now - self._steps[1][0] >= WINDOW_S:
             self._steps.popleft()
         begun, *before = self._steps[0]
-        bounds = zip((total, self._learning.settings.car_steps), (done, car_steps), before, strict=True)
-        ends = [(bound - new) / (new - old) for bound, new, old in bounds if bound and new > old]
+        limits = zip((total, self._settings.car_steps), (done, car_steps), before, strict=True)
+        ends = [(limit - new) / (new - old) for limit, new, old in limits if limit and new > old]
         if not ends or now - begun < WINDOW_S:
             return "-:--"
         return f"{clock(max(min(ends), 0.0) * (now - begun))} at most"
 
-    def members(self, stage: str, done: int, total: int) -> None:
-        self.rest = f"{stage} {done:{len(str(total))}}/{total}  {self._text}"
 
-    def note(self, text: str) -> None:
-        self.rest = text
-        if not self.console.is_terminal:
-            self.console.print(text)
+def progress(settings: RunSettings, steps: int, row: Mapping[str, float]) -> tuple[float, float, str]:
+    """How far a run is, how far it goes at most (0: unknown), and in what unit: that of its first limit.
+
+    Args: the number of its steps, and the latest one's row of the history.
+    """
+    limits = settings.extendable
+    name = next((name for name in limits if getattr(settings, name)), limits[0])
+    done, most = steps if name == "generations" else row[name], getattr(settings, name)
+    return (done / 1e6, most / 1e6, "M car-steps") if name == "car_steps" else (done, most, name)
 
 
-def progress_of(learning: Learning, bound: bool = True) -> str:
-    """A run's progress in words: what is done, not which step comes next."""
-    done, total, unit = learning.progress()
-    done = min(done, total or done)  # the last step may exceed the budget
-    of = f"/{total:g}" if total and bound else ""
+def progress_in_words(settings: RunSettings, steps: int, row: Mapping[str, float], bounded: bool = True) -> str:
+    """A run's progress in words: what is done, not which step comes next; `bounded`: also how far it goes at most."""
+    done, total, unit = progress(settings, steps, row)
+    done = min(done, total or done)  # the last step may exceed the limit
+    of = f"/{total:g}" if total and bounded else ""
     return f"{done:.1f}{of} {unit}" if unit.startswith("M") else f"{done:.0f}{of} {unit}"
+
+
+def row_in_words(settings: RunSettings, steps: int, row: Mapping[str, float]) -> str:
+    """A row of the history in words."""
+    if "loss" in row:
+        return (
+            f"distance {row['distance_m/best']:,.0f} m, {row['network/success_rate']:.0%} succeed  "
+            f"{row['speed_mps/best']:.1f} m/s  loss {row['loss']:.3f}  {row['updates'] / 1e3:.0f} k updates"
+        )
+    plural = "" if steps == 1 else "s"
+    done = "" if progress(settings, steps, row)[2] == "generations" else f"{steps} generation{plural}  "
+    return (
+        f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
+        f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"
+    )
 
 
 def clock(seconds: float) -> str:

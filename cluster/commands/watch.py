@@ -19,6 +19,7 @@ import numpy as np
 import tyro
 from rich.progress import track
 
+from cluster import stopping
 from cluster.commands.common import RoadFlags, command_path, main, new_console, parse, short_path
 from cluster.report.film import CODING, Recording, frames, other_cars, picture, record, write_video
 from cluster.report.page import Shown, write_page
@@ -97,6 +98,15 @@ class DriveFlags:
     """Width x height of the window, in pixels."""
 
 
+class _Window(Window):
+    """A window that a signal closes."""
+
+    def keys(self) -> tuple[set[str], set[str]]:
+        pressed = super().keys()
+        self.closed = self.closed or stopping.requested()
+        return pressed
+
+
 def _size_and_seconds(size: str, seconds: float, traffic: int) -> tuple[tuple[int, int], float]:
     """Width and height in pixels, and seconds, infinite for 0. Raises GridSimError if these or --traffic are wrong."""
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", size)
@@ -118,6 +128,7 @@ def _map(name: str, seed: int, config: SimConfig) -> tuple[Map, np.ndarray]:
 
 def _watch() -> int:
     flags = parse(WatchFlags, WATCH, sys.argv[1:])
+    stopping.listen()
     if not 0 <= flags.fps <= 120:
         raise GridSimError(f"--fps must be 1 to 120, not {flags.fps}")
     size, seconds = _size_and_seconds(
@@ -131,6 +142,7 @@ def _watch() -> int:
         raise GridSimError("several champions can only be shown on a page: --output drive.html")
     if not flags.output:
         _show(flags, size, seconds)
+        stopping.check()
         return 0
     if suffix not in (*CODING, ".html"):
         raise GridSimError(f"--output {output}: a film is written as .mp4 or .gif, a page as .html")
@@ -182,6 +194,7 @@ def _driver(flags: WatchFlags) -> tuple[Champion, str]:
     if flags.follow and not checkpoint_time(source):
         print(f"waiting for the first {read_config(source / CONFIG)[0].step_name} ...", flush=True)
         while not checkpoint_time(source):
+            stopping.check()
             time.sleep(0.1)
     return elite(source, flags.generation) if of_run else (load_champion(source), "champion")
 
@@ -261,7 +274,7 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
     seconds = min(limit, sum(drive.seconds for drive, _ in drives))
     total = max(1, round(seconds * fps))
     renderer = Renderer(drives[0][0].scenario, size)
-    pictures = itertools.chain.from_iterable(frames(renderer, drive, fps, title) for drive, title in drives)
+    pictures = _until_stopped(frames(renderer, drive, fps, title) for drive, title in drives)
     console = new_console()
     shown = track(
         itertools.islice(pictures, total), f"filming {seconds:.0f} s of driving", total, console=console, transient=True
@@ -273,6 +286,14 @@ def _film(flags: WatchFlags, output: Path, size: tuple[int, int], limit: float) 
     console.print(f"{output}: {seconds:.1f} s{how}, {count} pictures, {size_mb:.1f} MB", soft_wrap=True)
 
 
+def _until_stopped(drives: Iterator[Iterator[np.ndarray]]) -> Iterator[np.ndarray]:
+    """The pictures of drives, one after another. Raises Stopped."""
+    for pictures in drives:
+        for each in pictures:
+            stopping.check()
+            yield each
+
+
 def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     """Show drives in a window until it is closed."""
     fps = flags.fps or 30
@@ -280,7 +301,7 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
     drives = _drives(flags, SimConfig().episode.time_limit, most=None)  # without end
     first = next(drives)  # raises errors before the window opens
     shown = 0.0
-    with contextlib.closing(Window(size, f"GridSim: {flags.source}")) as window:
+    with contextlib.closing(_Window(size, f"GridSim: {flags.source}")) as window:
         for drive, title in itertools.chain([first], drives):
             before = checkpoint_time(run)
             renderer = Renderer(drive.scenario, size)
@@ -297,10 +318,11 @@ def _show(flags: WatchFlags, size: tuple[int, int], limit: float) -> None:
 
 def _drive() -> int:
     flags = parse(DriveFlags, DRIVE, sys.argv[1:])
+    stopping.listen()
     size, seconds = _size_and_seconds(flags.size, flags.seconds, flags.traffic)
     scenario, start = _map(flags.scenario, flags.seed, SimConfig())
     traffic = default_traffic(flags.scenario) if flags.traffic == -1 else flags.traffic
-    with contextlib.closing(Window(size, f"GridSim: {flags.scenario}")) as window:
+    with contextlib.closing(_Window(size, f"GridSim: {flags.scenario}")) as window:
         recorder = Recorder(flags.record, scenario, traffic) if flags.record else None
         try:
             done = drive(scenario, start, window, Renderer(scenario, size), recorder, seconds, traffic)
@@ -310,6 +332,7 @@ def _drive() -> int:
                 with contextlib.suppress(OSError):  # the error of a row that could not be written says more
                     recorder.close()
                 print(f"kept {recorder.rows} steps; watch them: {command_path(WATCH)} {short_path(recorder.path)}")
+    stopping.check()
     return 0
 
 

@@ -8,14 +8,15 @@ episodes, as evolution's candidates do.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learn.learning import Learning, State, check_any_left, named
+from cluster.learn.learning import Event, Learning, Progress, State, named
 from cluster.settings import DqnSettings
+from cluster.workers.pool import Collected
 from cluster.workers.worker import CollectTask
 from evolution.dqn.learner import DqnConfig, DqnLearner, exploration, finite
 from evolution.dqn.replay import Replay
@@ -28,7 +29,7 @@ EPISODES = (64, 2048)  # of a batch, at least and at most
 WARM_UP = 20_000  # rows of replay before the first update
 SLICE = 8  # updates between two looks at the workers
 PROBE = {"rays": 512, "grid": 32}  # observations whose Q values are compared between evaluations
-CALM = 3  # evaluations in a row with little change of these, after which the run has converged
+STABLE = 3  # evaluations in a row with little change of these, after which the run has converged
 
 
 @dataclass
@@ -41,14 +42,15 @@ class Dqn(Learning):
         "validation/success_rate", "reward/mean", "loss", "q/mean", "q/change", "exploration", "learning_rate",
         "episodes", "updates", "car_steps", "wall_s", "car_steps_per_s",
     )  # fmt: skip
-    verb: ClassVar[str] = "training"
-    kept: ClassVar[tuple[str, ...]] = (*Learning.kept, "batches", "episodes", "calm", "owed", "mean_steps")
+    checkpointed: ClassVar[tuple[str, ...]] = (
+        *Learning.checkpointed, "batches", "episodes", "stable_evaluations", "updates_due", "mean_steps",
+    )  # fmt: skip
 
     settings: DqnSettings
     batches: int = 0
     episodes: int = 0
-    calm: int = 0  # evaluations in a row with little change of the Q values
-    owed: float = 0.0  # updates that the last batch still requires
+    stable_evaluations: int = 0  # in a row, with little change of the Q values
+    updates_due: float = 0.0  # that the batches so far still require
     mean_steps: float = 32.0  # of the last batch's episodes
 
     def __post_init__(self) -> None:
@@ -65,18 +67,18 @@ class Dqn(Learning):
         self.probe = np.zeros((0, self.spec.inputs), dtype=np.float32)
         self.probe_q = np.zeros((0, self.spec.outputs), dtype=np.float32)
 
-    def step(self) -> dict[str, float]:
+    def step(self) -> Progress:
         """Train until the next evaluation is due, and evaluate."""
         self._losses: list[tuple[int, float, float]] = []  # updates, and their mean loss and Q
         steps, rewards = 0, 0.0
         results: list[np.ndarray] = []
         while steps < self.settings.evaluate_every and not (steps and (self.out_of_time() or self.done())):
-            batch, reward = self._collect()
+            batch, reward = yield from self._collect()
             results.append(batch)
             steps += int(batch["steps"].sum())
             rewards += reward
         driven = np.concatenate(results)
-        row = self._evaluate_network()
+        row = yield from self._evaluate_network()
         updates = sum(n for n, _, _ in self._losses)
         row |= {
             "distance_m/mean": float(driven["distance"].mean(dtype=np.float64)),
@@ -91,14 +93,13 @@ class Dqn(Learning):
             "updates": float(self.learner.updates),
             "car_steps": float(self.car_steps),
         }
-        self.history.append(row)
         row["validation/success_rate"] = self.champion.success_rate if self.champion else 0.0
-        return row
+        self.history.append(row)
 
-    def _collect(self) -> tuple[np.ndarray, float]:
+    def _collect(self) -> Generator[Event, None, tuple[np.ndarray, float]]:
         """Have one batch collected into the replay, and train meanwhile.
 
-        Returns: RESULT [episodes] and the sum of their rewards, without episodes that killed their workers.
+        Returns: RESULT [episodes] and the sum of their rewards.
         """
         s, k = self.settings, self.batches
         n = int(np.clip(BATCH_STEPS / self.mean_steps, *EPISODES))
@@ -108,13 +109,12 @@ class Dqn(Learning):
         keys = np.random.default_rng(np.random.SeedSequence([s.seed, k, 14])).integers(1 << 63, size=n, dtype=np.uint64)
         weights = finite(self.learner.weights, self.learner.updates)
         task = CollectTask(*self._base(episodes), weights, self._exploration(n), keys)
-        brought = self.pool.collect(task, partial(self.on_progress, "collect"), self._train)
-        self._report("collect", brought)
-        check_any_left(brought.lost, "collect")
+        brought = self.pool.start(Collected(task))
+        yield from self._wait("collect", brought, self._train)
         self.replay.add(brought.experience)
-        results = brought.results[~brought.lost, 0]
+        results = brought.results[:, 0]
         steps = int(results["steps"].sum())
-        self.owed += steps * s.updates / 1000.0
+        self.updates_due += steps * s.updates / 1000.0
         self.mean_steps = steps / len(results)
         self.car_steps += steps
         self.episodes += len(results)
@@ -126,24 +126,22 @@ class Dqn(Learning):
 
     def _train(self) -> bool:
         """Make some of the updates that the batches so far require. Returns whether any are left."""
-        self.meanwhile()
         if len(self.replay) < min(WARM_UP, self.replay.capacity):
-            self.owed = 0.0
-        n = min(int(self.owed), SLICE)
+            self.updates_due = 0.0
+        n = min(int(self.updates_due), SLICE)
         if n:
             self._losses.append((n, *self.learner.train(self.replay, n)))
-            self.owed -= n
-        return self.owed >= 1.0
+            self.updates_due -= n
+        return self.updates_due >= 1.0
 
     def candidate(self) -> np.ndarray | None:
         return self.tried  # each evaluation tries its network
 
-    def _evaluate_network(self) -> dict[str, float]:
+    def _evaluate_network(self) -> Generator[Event, None, dict[str, float]]:
         """Validate the averaged network. Returns its figures."""
         network = finite(self.learner.average, self.learner.updates)
         self.elites[self.steps] = network
-        driven = self.drive("validate", network[None], self.curriculum.validation(), self._train)
-        check_any_left(driven.lost, "validate")
+        driven = yield from self.drive("validate", network[None], self.curriculum.validation(), self._train)
         self._judge(network, driven.results, self.steps)
         results = driven.results[0]
         return {
@@ -168,13 +166,13 @@ class Dqn(Learning):
         if len(before):
             q = self.probe_q.astype(np.float64)  # squares of large values are beyond float32
             change = float(np.sqrt(np.mean((q - before) ** 2)) / max(float(q.std()), 1e-9))
-        self.calm = self.calm + 1 if updates and change < self.settings.converged else 0
+        self.stable_evaluations = self.stable_evaluations + 1 if updates and change < self.settings.converged else 0
         return change
 
     @property
     def converged(self) -> bool:
         """Whether the Q values have stopped changing."""
-        return self.settings.converged > 0.0 and self.calm >= CALM
+        return self.settings.converged > 0.0 and self.stable_evaluations >= STABLE
 
     def counts(self) -> dict[str, int]:
         return {
@@ -185,21 +183,15 @@ class Dqn(Learning):
             "converged": self.converged,
         }
 
-    def describe(self, row: dict[str, float]) -> str:
-        return (
-            f"distance {row['distance_m/best']:,.0f} m, {row['network/success_rate']:.0%} succeed  "
-            f"{row['speed_mps/best']:.1f} m/s  loss {row['loss']:.3f}  {row['updates'] / 1e3:.0f} k updates"
-        )
-
-    def state(self, first: int = 0) -> State:
-        arrays, meta = super().state(first)
+    def state(self) -> State:
+        arrays, meta = super().state()
         arrays |= {f"learner_{name}": array for name, array in self.learner.state().items()}
         arrays |= {f"replay_{name}": array for name, array in self.replay.state().items()}
         arrays |= {"probe": self.probe, "probe_q": self.probe_q}
         return arrays, meta
 
-    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        super().restore(arrays, meta)
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any], rows: np.ndarray) -> None:
+        super().restore(arrays, meta, rows)
         self.learner.restore(named(arrays, "learner_"))
         if "replay_added" in arrays:  # an ended run saves none; if it is extended, it fills a new one before it learns
             self.replay.restore(named(arrays, "replay_"))

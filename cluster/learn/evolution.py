@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cluster.learn.learning import Learning, State, check_any_left, named
+from cluster.learn.learning import Learning, Progress, State, named
 from cluster.settings import EvolveSettings
 from cluster.workers.pool import Chunk
 from evolution.episodes.curriculum import success_rate
@@ -36,7 +36,6 @@ class Evolution(Learning):
         "speed_mps/mean", "target_m", "leader/success_rate", "validation/success_rate", "car_steps", "wall_s",
         "car_steps_per_s",
     )  # fmt: skip
-    verb: ClassVar[str] = "evolving"
     save_every_s: ClassVar[float] = 1.0
 
     settings: EvolveSettings
@@ -62,14 +61,14 @@ class Evolution(Learning):
 
     # ------------------------------------------------------------------------------------------------ a generation
 
-    def step(self) -> dict[str, float]:
+    def step(self) -> Progress:
         """Evolve one generation."""
         curriculum, period = self.curriculum, self.sim.episode.control_period
         leader = self.search.leader()
         candidate = leader if self._promising() else None
         self.search.champion = self.champion.genome if self.champion else None
         asked, episodes = self.search.ask(), curriculum.episodes(self.steps)
-        n, e = len(asked.recipes), len(episodes.rows) // len(asked.groups)
+        e = len(episodes.rows) // len(asked.groups)
         goals = episodes.rows["target"][:e].astype(np.float64)  # the same in each group
         groups = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
         self.maps.ahead(curriculum.map_seeds[: curriculum.maps_in_use(self.steps + AHEAD)])
@@ -80,10 +79,9 @@ class Evolution(Learning):
             leading = call.add(leader, followed)
         if candidate is not None:
             trial = call.add(candidate, curriculum.validation())
-        driven = self._evaluate("evolve", call.members, call.episodes, call.asked, self._meanwhile)
-        check_any_left(driven.lost[:n], "evolve")
+        driven = yield from self._evaluate("evolve", call.members, call.episodes, call.asked)
         results = np.concatenate([driven.results[part] for part in groups])
-        score = np.where(driven.lost[:n], -np.inf, self._score(results, goals))
+        score = self._score(results, goals)
         curriculum.learn_from_members(self.steps, [driven.results[part] for part in groups])
 
         if leader is None:  # in the first generation, the best member takes its place
@@ -97,10 +95,10 @@ class Evolution(Learning):
             columns = leading.columns
             curriculum.learn_from_leader(followed, led, driven.rewound[columns], driven.worlds[columns])
         self.search.tell(score)
-        if candidate is not None and not driven.lost[trial.rows][0]:
+        if candidate is not None:
             self._judge(candidate, driven.results[trial], self.steps - 1)
         seconds, finite = results["steps"].sum(axis=1) * period, score[np.isfinite(score)]
-        row = {
+        self.history.append({
             "fitness/best": led_score if np.isfinite(led_score) else -1.0,
             "fitness/mean": float(finite.mean()) if finite.size else -1.0,
             "fitness/std": float(finite.std()) if finite.size else 0.0,
@@ -112,13 +110,7 @@ class Evolution(Learning):
             "leader/success_rate": float(success_rate(led[None])[0]),
             "validation/success_rate": self.champion.success_rate if self.champion else 0.0,
             "car_steps": float(self.car_steps),
-        }
-        self.history.append(row)
-        return row
-
-    def _meanwhile(self) -> None:
-        self.pool.expect(self._names(self.curriculum.map_seeds[: self.curriculum.maps_in_use(self.steps + 1)]))
-        self.meanwhile()
+        })  # fmt: skip
 
     def candidate(self) -> np.ndarray | None:
         return self.search.leader()
@@ -141,22 +133,14 @@ class Evolution(Learning):
     def counts(self) -> dict[str, int]:
         return {"generation": self.steps, "car_steps": self.car_steps}
 
-    def describe(self, row: dict[str, float]) -> str:
-        plural = "" if self.steps == 1 else "s"
-        done = f"{self.steps} generation{plural}  " if self.progress()[2] != "generations" else ""
-        return (
-            f"{done}distance {row['distance_m/best']:,.0f} m best, {row['distance_m/mean']:,.0f} mean of "
-            f"{row['target_m']:,.0f}  {row['speed_mps/best']:.1f} m/s"
-        )
-
-    def state(self, first: int = 0) -> State:
-        arrays, meta = super().state(first)
+    def state(self) -> State:
+        arrays, meta = super().state()
         arrays |= {f"search_{name}": array for name, array in self.search.state().items()}
         arrays |= {name: getattr(self.curriculum, name) for name in CRASHES}
         return arrays, meta | {"target": self.curriculum.target}
 
-    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        super().restore(arrays, meta)
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any], rows: np.ndarray) -> None:
+        super().restore(arrays, meta, rows)
         self.search.restore(named(arrays, "search_"))
         self.search.generation = meta["generation"]
         for name in CRASHES:

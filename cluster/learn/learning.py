@@ -1,23 +1,26 @@
-"""What the two learners share: maps, the champion and how it is found, its figures, the history, the state.
+"""What the two learners share: the champion and how it is found, its figures, the history, the state.
 
 All decisions follow from the seed and from what the workers return; none depends on the clock or on which worker
-returned what.
+returned what. (A limit of wall time ends a run earlier; what it has found by then is still the seed's.)
+
+A step is a generator: it yields an `Event` each time it has to wait for the workers, so that its caller can save, show
+progress and stop there.
 """
 
 from __future__ import annotations
 
-import warnings
+import math
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
+from cluster.learn.maps import Maps
 from cluster.settings import RunSettings
-from cluster.workers.pool import Call, Chunk, Meanwhile, Outcome, PoolError, WorkerPool
+from cluster.workers.pool import Call, Chunk, Outcome, WorkerPool
 from cluster.workers.worker import Task
 from evolution.episodes.curriculum import (
     FINAL_SEEDS,
@@ -28,52 +31,34 @@ from evolution.episodes.curriculum import (
     spread_starts,
     success_rate,
 )
-from evolution.episodes.figures import summarise
 from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.base import Generation, recipes
 from gridsim.config import SimConfig
-from gridsim.maps.map import Map
-from gridsim.maps.scenarios import build, seed_of_map
+from gridsim.maps.scenarios import seed_of_map
 
 State = tuple[dict[str, np.ndarray], dict[str, Any]]  # arrays and plain numbers
 Names = tuple[tuple[str, int], ...]  # of maps, as pools know them
 
+WAIT_S = 0.2  # at most between two looks at progress
 
-class Maps:
-    """A run's maps, each of which is built once, ahead of its use, in a thread."""
 
-    def __init__(self, scenario: str, config: SimConfig):
-        self._scenario, self._config = scenario, config
-        self._built: dict[int, Future[Map]] = {}
-        # Two threads for later ones: while the workers wait for validation's maps, both cores build them.
-        self._soon, self._later = (ThreadPoolExecutor(n, thread_name_prefix=f"maps-{n}") for n in (1, 2))
+@dataclass(frozen=True)
+class Event:
+    """Something that a run has to say while it goes on."""
 
-    def ahead(self, seeds: Sequence[int], later: bool = False) -> None:
-        """Begin to build maps that will be needed, in this order; `later` ones do not delay the others."""
-        thread = self._later if later else self._soon
-        for seed in seeds:
-            if seed not in self._built:
-                self._built[seed] = thread.submit(build, self._scenario, seed, self._config)
+    text: str = ""  # what is being done
+    done: int = 0  # of `total` members, or episodes where experience is collected
+    total: int = 0
+    warning: bool = False  # whether the text is a warning
 
-    def get(self, seed: int) -> Map:
-        """The map of a seed."""
-        self.ahead([seed])
-        return self._built[seed].result()
 
-    def build(self, scenario: str, seed: int) -> Map:
-        """The map of the run's scenario and a seed, which is how pools ask for it."""
-        return self.get(seed)
-
-    def close(self) -> None:
-        """Cancel what has not begun."""
-        for thread in (self._soon, self._later):
-            thread.shutdown(wait=False, cancel_futures=True)
+Progress = Generator[Event, None, None]
 
 
 @dataclass
 class Champion:
-    """The best member found so far, and its figures in the validation episodes."""
+    """The best network found so far, and its figures in the validation episodes."""
 
     genome: np.ndarray  # float32 [genes]
     score: float = 0.0  # `Curriculum.validation_score`
@@ -87,9 +72,8 @@ class Learning(ABC):
     """One run of a learner, between pool and files."""
 
     columns: ClassVar[tuple[str, ...]]  # of history.csv after the step's number, and their names in MLflow
-    verb: ClassVar[str]  # what is done to a network
-    kept: ClassVar[tuple[str, ...]] = ("solved", "car_steps", "validation_steps", "lost_chunks")  # in checkpoints
-    save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved as the next step begins, which changes it
+    checkpointed: ClassVar[tuple[str, ...]] = ("solved", "car_steps", "validation_steps")
+    save_every_s: ClassVar[float] = 0.0  # 0: a `state` must be saved before the next step changes its arrays
 
     settings: RunSettings
     pool: WorkerPool
@@ -102,78 +86,59 @@ class Learning(ABC):
     elites: dict[int, np.ndarray] = field(default_factory=dict)  # the network of each unsaved step, float32 [genes]
     car_steps: int = 0
     validation_steps: int = 0  # how many of these validation took
-    lost_chunks: int = 0  # members, and episodes of experience, that killed every worker that tried them
-    wall_before_s: float = 0.0
-    # Called with one line for each of the lost, and for each worker that is replaced because it is silent.
-    warn: Callable[[str], None] = warnings.warn
-    on_progress: Callable[[str, int, int], None] = lambda *_: None
-    meanwhile: Callable[[], None] = lambda: None  # called in each step while the workers are busy
-    out_of_time: Callable[[], bool] = lambda: False  # whether the wall-time budget is spent, so that a long step ends
+    deadline: float = math.inf  # of `time.perf_counter`, at which a long step ends early
 
     def __post_init__(self) -> None:
         s = self.settings
         self.sim = SimConfig()
         self.spec = PolicySpec.parse(s.policy)
         self.curriculum = Curriculum(s.curriculum(), s.seed, self.maps.get, s.traffic)
-        self._lines: list[str] = []  # of history.csv
 
     # ------------------------------------------------------------------------------------------------------ the loop
 
     @abstractmethod
-    def step(self) -> dict[str, float]:
-        """One step. Returns its row of the history, without the wall clock's columns."""
+    def step(self) -> Progress:
+        """Do one step and add its row to the history, without the wall clock's columns."""
 
     @abstractmethod
     def counts(self) -> dict[str, int]:
         """How far it has come: the number of its steps by their name, and what the settings' `ended` asks for."""
-
-    @abstractmethod
-    def describe(self, row: dict[str, float]) -> str:
-        """A row of the history in words."""
 
     @property
     def steps(self) -> int:
         """Steps that are done."""
         return len(self.history)
 
-    def progress(self) -> tuple[float, float, str]:
-        """How far the run is, how far it goes at most (0: unknown), and in what unit: that of its first limit."""
-        settings, limits = self.settings, self.settings.unbound
-        name = next((name for name in limits if getattr(settings, name)), limits[0])
-        done, most = self.steps if name == "generations" else self.counts()[name], getattr(settings, name)
-        return (done / 1e6, most / 1e6, "M car-steps") if name == "car_steps" else (done, most, name)
-
     def done(self) -> bool:
         """Whether there is nothing left to learn."""
         return self.settings.ended({"solved": self.solved, **self.counts()})
+
+    def out_of_time(self) -> bool:
+        """Whether the wall time that the run may take is spent."""
+        return time.perf_counter() >= self.deadline
 
     @abstractmethod
     def candidate(self) -> np.ndarray | None:
         """The network that may become champion after the last step, float32 [genes]; None before the first."""
 
-    def choose_champion(self) -> Champion:
-        """The champion of a run that ends: if it is unsolved, it or the last candidate, by drives on maps of their own.
+    def choose_champion(self) -> Progress:
+        """Choose the champion of a run that ends: if it is unsolved, it or the last candidate, on maps of their own.
 
         A champion is the best of many on the same maps, so later candidates that drive better may not reach its score.
         This is not in the checkpoint: a run that is extended goes on as if it had never ended. Its car-steps do not
         count.
         """
         candidate, before, car_steps = self.candidate(), self.champion, self.car_steps
-        if candidate is not None and not self.solved and not (before and np.array_equal(candidate, before.genome)):
-            finalists = [(before.genome, before.step)] if before else []
-            finalists.append((candidate, self.steps - 1))
-            episodes = self.curriculum.validation(FINAL_SEEDS if before else VALIDATION_SEEDS)
-            genomes = np.stack([genome for genome, _ in finalists])
-            driven = self.drive("validate", genomes, episodes)
-            self.champion = None
-            for k, (genome, step) in enumerate(finalists):
-                if not driven.lost[k]:
-                    self._judge(genome, driven.results[k : k + 1], step)
-            self.champion = self.champion or before
-            self.car_steps, self.solved = car_steps, False
-        if self.champion is None:
-            raise PoolError("there is no champion: each network that was to be validated killed its workers")
-        return self.champion
+        if candidate is None or self.solved or (before and np.array_equal(candidate, before.genome)):
+            return
+        finalists = [(before.genome, before.step)] if before else []
+        finalists.append((candidate, self.steps - 1))
+        episodes = self.curriculum.validation(FINAL_SEEDS if before else VALIDATION_SEEDS)
+        driven = yield from self.drive("choosing the champion", np.stack([genome for genome, _ in finalists]), episodes)
+        self.champion = None
+        for k, (genome, step) in enumerate(finalists):
+            self._judge(genome, driven.results[k : k + 1], step)
+        self.car_steps, self.solved = car_steps, False
 
     def _judge(self, candidate: np.ndarray, results: np.ndarray, step: int) -> None:
         """Make a step's candidate champion if its validation, RESULT [1, episodes], is better than the champion's."""
@@ -186,33 +151,39 @@ class Learning(ABC):
 
     # ------------------------------------------------------------------------------------------------- evaluating
 
+    def _wait(self, stage: str, call: Call, train: Callable[[], bool] = lambda: False) -> Progress:
+        """Wait for a call that the pool has begun, and meanwhile `train` until it returns False, and to its end."""
+        warned, busy = 0, True
+        yield Event(stage, *call.progress())  # first of all: what the caller saves must not have changed
+        while self.pool.wait(call, 0.0 if busy else WAIT_S) or busy:
+            busy = busy and train()
+            for text in call.warnings[warned:]:
+                yield Event(f"{self.settings.step_name} {self.steps}, {stage}: {text}", warning=True)
+            warned = len(call.warnings)
+            yield Event(stage, *call.progress())
+
     def _evaluate(
         self, stage: str, members: Generation, episodes: Episodes, asked: Sequence[Chunk] | None = None,
-        meanwhile: Meanwhile | None = None,
-    ) -> Outcome:  # fmt: skip
+        train: Callable[[], bool] = lambda: False,
+    ) -> Generator[Event, None, Outcome]:  # fmt: skip
         task = Task(*self._base(episodes), members.parents, members.key, members.mutation)
-        outcome = self.pool.evaluate(task, members.recipes, partial(self.on_progress, stage), asked, meanwhile)
+        outcome = self.pool.start(Outcome(task, members.recipes, asked))
+        yield from self._wait(stage, outcome, train)
         self.car_steps += int(outcome.results["steps"].sum())
-        self._report(stage, outcome)
         return outcome
 
     def _base(self, episodes: Episodes) -> tuple[str, np.ndarray, np.ndarray, Names, SimConfig]:
         """The first fields of a task, which both kinds have."""
-        return self.settings.policy, episodes.rows, episodes.worlds, self._names(episodes.maps), self.sim
-
-    def _names(self, seeds: Sequence[int]) -> Names:
         scenario = self.settings.scenario
-        return tuple((scenario, seed_of_map(scenario, seed)) for seed in seeds)
+        names = tuple((scenario, seed_of_map(scenario, seed)) for seed in episodes.maps)
+        return self.settings.policy, episodes.rows, episodes.worlds, names, self.sim
 
-    def _report(self, stage: str, call: Call) -> None:
-        self.lost_chunks += int(call.lost.sum())
-        for text in call.warnings:
-            self.warn(f"{self.settings.step_name} {self.steps}, {stage}: {text}")
-
-    def drive(self, stage: str, genomes: np.ndarray, episodes: Episodes, meanwhile: Meanwhile | None = None) -> Outcome:
+    def drive(
+        self, stage: str, genomes: np.ndarray, episodes: Episodes, train: Callable[[], bool] = lambda: False
+    ) -> Generator[Event, None, Outcome]:
         """Results [n, e] of given genomes [n, genes], sent as plain copies."""
         copies = Generation(genomes[:0], recipes(0)).and_copies(genomes)
-        return self._evaluate(stage, copies, episodes, meanwhile=meanwhile)
+        return (yield from self._evaluate(stage, copies, episodes, train=train))
 
     def add_wall_clock(self, wall_s: float) -> None:
         """Add the wall clock's columns to the last row."""
@@ -220,62 +191,51 @@ class Learning(ABC):
         steps, seconds = row["car_steps"] - before["car_steps"], wall_s - before["wall_s"]
         row |= {"wall_s": wall_s, "car_steps_per_s": steps / max(seconds, 1e-9)}
 
-    def held_out(self) -> tuple[Episodes, dict[str, float]]:
-        """The champion on roads never used in training or selection: the same 64 episodes in all runs of a scenario."""
-        assert self.champion is not None
-        before = self.car_steps
-        episodes = spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, self.settings.traffic)
-        driven = self.drive("held out", self.champion.genome[None], episodes)
-        check_any_left(driven.lost, "held out")
-        self.car_steps = before  # not part of learning
-        return episodes, summarise(driven.results[0], self.sim.episode.control_period)
+    def held_out_episodes(self) -> Episodes:
+        """Roads never used in training or selection: the same 64 episodes in all runs of a scenario."""
+        return spread_starts(self.maps.get, HELD_OUT_SEEDS, HELD_OUT_EPISODES, self.settings.traffic)
 
     # ------------------------------------------------------------------------------------------------------- state
 
-    def state(self, first: int = 0) -> State:
-        """All that an exact resume needs, arrays and plain numbers; of the history the rows from step `first` on."""
+    def state(self) -> State:
+        """All that an exact resume needs besides the history, arrays and plain numbers."""
         champion, none = self.champion, np.zeros(0, dtype=np.float32)
         arrays: dict[str, np.ndarray] = {
-            "history": self.table(first),
             "tried": none if self.tried is None else self.tried,
             "champion": champion.genome if champion else none,
         }
         meta: dict[str, Any] = {
-            **{name: getattr(self, name) for name in self.kept},
+            **{name: getattr(self, name) for name in self.checkpointed},
             **self.counts(),
             "columns": list(self.columns),  # of the history, which is also read without its learner
             "champion": champion and [champion.score, champion.success_rate, champion.distance_m, champion.step],
         }
         return arrays, meta
 
-    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
-        """Continue from a `state` of the same settings; its checksum and digest were verified."""
-        for name in self.kept:
+    def restore(self, arrays: dict[str, np.ndarray], meta: dict[str, Any], rows: np.ndarray) -> None:
+        """Continue from a `state` of the same settings and its history, float64 [steps, columns]."""
+        for name in self.checkpointed:
             setattr(self, name, meta[name])
-        self.history = [dict(zip(self.columns, row, strict=True)) for row in arrays["history"].tolist()]
+        self.history = [dict(zip(self.columns, row, strict=True)) for row in rows.tolist()]
         self.tried = arrays["tried"] if arrays["tried"].size else None
         if meta["champion"]:
             self.champion = Champion(arrays["champion"], *meta["champion"])
-        self.wall_before_s = self.history[-1]["wall_s"] if self.history else 0.0
 
     def table(self, first: int = 0) -> np.ndarray:
         """The history from step `first` on, float64 [steps, columns]."""
         rows = [[row[name] for name in self.columns] for row in self.history[first:]]
         return np.array(rows, dtype=np.float64).reshape(-1, len(self.columns))
 
-    def history_csv(self, steps: int) -> bytes:
-        """history.csv: a row for each of the first steps. Each is formatted only once: thousands take tens of ms."""
-        for k in range(len(self._lines), steps):
-            self._lines.append(",".join([str(k), *(repr(self.history[k][name]) for name in self.columns)]))
-        return "\n".join([",".join([self.settings.step_name, *self.columns]), *self._lines[:steps], ""]).encode()
+
+def finish(progress: Generator[Event, None, Any]) -> Any:
+    """Go through a step, or another part of a run, without showing its progress. Returns: what it returns."""
+    try:
+        while True:
+            next(progress)
+    except StopIteration as end:
+        return end.value
 
 
 def named(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
     """The arrays whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-
-
-def check_any_left(lost: np.ndarray, stage: str) -> None:
-    """Raises: PoolError if all of lost, bool [n], are true: then there is nothing to continue with."""
-    if lost.all():
-        raise PoolError(f"{stage}: nothing is left, all {len(lost)} that were tried killed their workers")

@@ -19,8 +19,12 @@ import numpy as np
 from cluster.redaction import one_line
 from gridsim.errors import GridSimError
 
-CONFIG, CHECKPOINT, STEPS, CHAMPION = "config.json", "checkpoint.npz", "steps.part", "champion.npz"
-"""Files of a run's folder."""
+CONFIG, CHECKPOINT, STEPS, HISTORY = "config.json", "checkpoint.npz", "steps.bin", "history.csv"
+"""Files of a run's folder from its beginning."""
+MLFLOW = "mlflow.json"
+"""Where MLflow has the run; only `cluster.tracking` reads and writes it."""
+CHAMPION, ELITES, SUMMARY = "champion.npz", "elites.npz", "summary.json"
+"""Files of a finished run."""
 
 VERSION = 1
 

@@ -11,8 +11,7 @@ import json
 import os
 import re
 import time
-import uuid
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,18 +20,29 @@ import numpy as np
 
 from cluster.settings import SETTINGS, RunSettings, from_dict
 from cluster.store import checkpoint
-from cluster.store.checkpoint import CHAMPION, CHECKPOINT, CONFIG, STEPS, CheckpointError
+from cluster.store.checkpoint import (
+    CHAMPION,
+    CHECKPOINT,
+    CONFIG,
+    ELITES,
+    HISTORY,
+    MLFLOW,
+    STEPS,
+    SUMMARY,
+    CheckpointError,
+)
 from cluster.text import as_argument, file_name
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.files import map_digest
 from gridsim.maps.scenarios import is_map_file, label
 
-HISTORY, ELITES, SUMMARY, PAGE = "history.csv", "elites.npz", "summary.json", "drive.html"
-CURVES, TRAJECTORY = "curves.png", "trajectory.png"
-FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, PAGE, ELITES, HISTORY, SUMMARY, TRAJECTORY)
+CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"
+FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, ELITES, HISTORY, ONNX, PAGE, SUMMARY, TRAJECTORY)
 """Files of a finished run, which MLflow gets; what else is in its folder is the user's own."""
-CONFIG_FORMAT = 2
+BEGUN = {CONFIG, STEPS, MLFLOW}
+"""Files of a run that was stopped before its first step was saved."""
+CONFIG_FORMAT = 3
 
 
 class RunError(GridSimError):
@@ -48,7 +58,6 @@ class RunFolder:
     init: str = ""  # path of the champion it started from
     init_sha256: str = ""  # digest of that genome
     saved: tuple[dict[str, np.ndarray], dict[str, Any]] | None = None  # its checkpoint, if it is resumed
-    tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)  # by which its MLflow run is found again
 
     @property
     def name(self) -> str:
@@ -72,7 +81,7 @@ class RunFolder:
     def digest(self) -> str:
         """Digest of what must not differ between a run and its resumption."""
         parts = self.config()
-        for name in self.settings.unbound:
+        for name in self.settings.extendable:
             parts["settings"].pop(name)
         for name in ("gridsim", "init"):
             parts.pop(name)
@@ -87,10 +96,9 @@ def read_config(path: Path) -> tuple[RunSettings, str]:
     """Settings of either learner and the initial champion's path from a run's config.json. Raises RunError."""
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
-        form = config.get("format")
-        if form == 1:
-            raise RunError(f"{path} is of a run of GridSim 0.1, which this version cannot continue; start a new run")
-        if form != CONFIG_FORMAT:
+        if config.get("format") in (1, 2):
+            raise RunError(f"{path} is of an earlier GridSim, whose runs this one cannot continue; start a new run")
+        if config.get("format") != CONFIG_FORMAT:
             raise RunError(f"{path}: not a {CONFIG} of this GridSim; start a new run")
         settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))
         if config.get("map_sha256", "") != _map_sha256(settings):
@@ -153,17 +161,21 @@ def open_run(folder: Path) -> RunFolder:
             f"{folder}: {CONFIG} and {CHECKPOINT} do not belong together: one of them was edited, or another "
             "version of GridSim wrote them; start a new run"
         )
-    run.tracking_key = str(meta["tracking"]["key"])
     return run
 
 
-def new_run(output: Path, name: str, settings: RunSettings, init: str = "", init_sha256: str = "") -> RunFolder:
-    """A new run's folder, checked but not yet made. Raises RunError."""
+def new_run(
+    output: Path, name: str, settings: RunSettings, init: str = "", init_sha256: str = "", may_exist: bool = False
+) -> RunFolder:
+    """A new run's folder, checked but not yet made. Raises RunError.
+
+    Args: `may_exist`: whether the folder may be that of a run which was stopped before its first step was saved.
+    """
     kind = file_name(f"{label(settings.scenario)}-{settings.algorithm}-s{settings.seed}")
-    return RunFolder(new_folder(output, name, kind), settings, init, init_sha256)
+    return RunFolder(new_folder(output, name, kind, may_exist), settings, init, init_sha256)
 
 
-def new_folder(output: Path, name: str, kind: str) -> Path:
+def new_folder(output: Path, name: str, kind: str, may_exist: bool = False) -> Path:
     """The folder of a new run or comparison, checked but not yet made; by default named by `kind` and time.
 
     Raises: RunError.
@@ -175,7 +187,7 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
     if not re.fullmatch(r"[\w][\w.+=@-]{0,199}", name):
         raise RunError(f"--name {name!r}: use letters, digits, '.', '_' and '-' only")
     path = output / name
-    if path.exists():
+    if path.exists() and not (may_exist and path.is_dir() and {p.name for p in path.glob("[!.]*")} <= BEGUN):
         again = f"continue it with --resume {as_argument(path)}"
         raise RunError(f"{path} exists already; choose another --name, or {again}")
     parent = output
@@ -187,9 +199,8 @@ def new_folder(output: Path, name: str, kind: str) -> Path:
 
 
 def is_finished(run: RunFolder) -> bool:
-    """Whether nothing is left to do: learning has ended and all files are there. An extended run has steps.part."""
-    concluded = all((run.path / name).is_file() for name in (SUMMARY, CHAMPION)) and not (run.path / STEPS).exists()
-    return run.saved is not None and concluded and run.settings.ended(run.saved[1])
+    """Whether nothing is left to do: learning has ended by these settings, and all files are there."""
+    return run.saved is not None and (run.path / SUMMARY).is_file() and run.settings.ended(run.saved[1])
 
 
 def write_summary(folder: Path, summary: dict[str, Any]) -> None:

@@ -1,8 +1,8 @@
-"""The row of the history and the elite of each step of a run, in a file that grows with the run.
+"""The row of the history and the network of each step of a run, in one file that only grows.
 
-The checkpoint holds only the number of these records and their digest. Records are on the disk before the checkpoint
-that counts them: any that a kill leaves uncounted are cut off when the run is resumed, and made again. When a run ends,
-its history moves into the checkpoint and its elites into elites.npz, and the file is deleted.
+The checkpoint counts its records and holds their digest. Records are on the disk before the checkpoint that counts
+them; those that a kill leaves uncounted are overwritten when the run goes on. history.csv and elites.npz are written
+from them.
 """
 
 from __future__ import annotations
@@ -11,77 +11,89 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from cluster.redaction import one_line
 from cluster.store import checkpoint
-from cluster.store.checkpoint import CHECKPOINT, STEPS, CheckpointError, WriteError
-from cluster.store.folder import ELITES
+from cluster.store.checkpoint import CHECKPOINT, ELITES, HISTORY, STEPS, CheckpointError, WriteError
 from evolution.networks.policy import PolicySpec
 
 
-def records(rows: np.ndarray, elites: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-    """Records [n] of the file: rows float64 [n, columns] and elites float32 [n, genes]."""
-    made = np.zeros(len(rows), _record(rows.shape[1], len(elites[0])))
-    made["row"], made["elite"] = rows, elites
-    return made
+class Steps:
+    """The steps of a run that this process adds to.
 
-
-def append(path: Path, first: int, new: np.ndarray) -> None:
-    """Write records from number `first` on and cut off what follows them; they are on the disk when this returns.
-
-    Raises: WriteError; the records before are kept.
+    Args: the run's folder; what a step is called; the history's columns; the size of a genome.
     """
-    try:
-        path.touch()
-        with open(path, "r+b") as file:
-            file.seek(first * new.itemsize)
-            file.write(new.tobytes())
-            file.truncate()
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
 
+    def __init__(self, folder: Path, step_name: str, columns: Sequence[str], genes: int):
+        self.number = 0  # steps that are on the disk
+        self._folder, self._head, self._record = folder, [step_name, *columns], _record(len(columns), genes)
+        self._sha256 = hashlib.sha256()
 
-def resume(folder: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], genes: int) -> np.ndarray:
-    """The records that a run's checkpoint counts; if the run had ended, their file is written again.
+    def meta(self) -> dict[str, Any]:
+        """What a checkpoint that counts these steps holds about them."""
+        return {"steps": self.number, "steps_sha256": self._sha256.hexdigest()}
 
-    Raises: CheckpointError, and KeyError or ValueError if another version wrote the checkpoint.
-    """
-    path = folder / STEPS
-    if "history" not in arrays:
+    def resume(self, meta: Mapping[str, Any]) -> np.ndarray:
+        """Go on from the steps that a checkpoint with this `meta` counts. Returns: their rows, float64 [n, columns].
+
+        Raises: CheckpointError.
+        """
+        records = _read(self._folder, meta, self._record)
+        self.number = len(records)
+        self._sha256.update(records.tobytes())
+        return records["row"]
+
+    def append(self, rows: np.ndarray, elites: Sequence[np.ndarray]) -> None:
+        """Add steps: rows float64 [n, columns] and elites [n] float32 [genes]. They are on the disk when this returns.
+
+        Raises: WriteError; the steps before are kept.
+        """
+        new = np.zeros(len(rows), self._record)
+        new["row"], new["elite"] = rows, elites
+        path = self._folder / STEPS
         try:
-            with open(path, "rb") as file:
-                return _read(file, meta, genes)
+            path.touch()
+            with open(path, "r+b") as file:
+                file.seek(self.number * new.itemsize)
+                file.write(new.tobytes())
+                file.truncate()
+                file.flush()
+                os.fsync(file.fileno())
         except OSError as error:
-            raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
-    digest = meta["steps_sha256"]
-    made = records(arrays["history"], checkpoint.load(folder / ELITES)[0]["genomes"])
-    if hashlib.sha256(made.tobytes()).hexdigest() != digest:
-        raise CheckpointError(f"{folder}: {ELITES} and {CHECKPOINT} do not belong together: one of them was edited")
-    checkpoint.write_atomic(path, made.tobytes())
-    return made
+            raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
+        self.number += len(new)
+        self._sha256.update(new.tobytes())
+
+    def write_history(self, rows: Sequence[Sequence[float]], first: int) -> None:
+        """Write rows of history.csv from step number `first` on; with 0 the file is begun anew. Raises: WriteError."""
+        lines = [",".join([str(k), *map(repr, row)]) for k, row in enumerate(rows, first)]
+        path = self._folder / HISTORY
+        if not first:
+            checkpoint.write_atomic(path, "\n".join([",".join(self._head), *lines, ""]).encode(), durable=False)
+            return
+        try:
+            with open(path, "a", encoding="utf-8") as file:
+                file.write("".join(f"{line}\n" for line in lines))
+        except OSError as error:
+            raise WriteError(f"{path}: cannot be written: {one_line(error)}") from error
 
 
 def read_elites(folder: Path, policy: str) -> np.ndarray:
-    """The elites float32 [steps, genes], of that policy, of a run that is going on, was stopped or has ended.
+    """The network of each step of a run, going on or ended, float32 [steps, genes] of that policy.
 
     Raises: CheckpointError.
     """
-    genes, path = PolicySpec.parse(policy).size, folder / STEPS
-    try:
-        with open(path, "rb") as file:  # opened before the checkpoint is read: a run that ends deletes it
-            return np.array(_read(file, checkpoint.load(folder / CHECKPOINT)[1], genes)["elite"])
-    except FileNotFoundError:
-        path = folder / ELITES
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
-    genomes = checkpoint.load(path)[0].get("genomes")
-    if genomes is None or genomes.dtype != np.float32 or genomes.shape[1:] != (genes,) or not len(genomes):
-        raise CheckpointError(f"{path}: its elites do not fit {policy}")
+    meta = checkpoint.load(folder / CHECKPOINT)[1]
+    return _read(folder, meta, _record(len(meta.get("columns", ())), PolicySpec.parse(policy).size))["elite"]
+
+
+def write_elites(folder: Path, policy: str) -> np.ndarray:
+    """Write elites.npz, float32 [steps, genes] `genomes`. Returns them. Raises: CheckpointError."""
+    genomes = np.ascontiguousarray(read_elites(folder, policy))
+    checkpoint.save(folder / ELITES, {"genomes": genomes}, {"policy": policy})
     return genomes
 
 
@@ -89,10 +101,14 @@ def _record(columns: int, genes: int) -> np.dtype:
     return np.dtype([("row", "<f8", (columns,)), ("elite", "<f4", (genes,))])
 
 
-def _read(file: BinaryIO, meta: Mapping[str, Any], genes: int) -> np.ndarray:
-    """The records that a checkpoint with this `meta` counts. Raises: CheckpointError if they are not in the file."""
-    kind = _record(len(meta.get("columns", ())), genes)
-    content = file.read(kind.itemsize * meta.get("steps", 0))
+def _read(folder: Path, meta: Mapping[str, Any], record: np.dtype) -> np.ndarray:
+    """The records that a checkpoint with this `meta` counts. Raises: CheckpointError if the file lacks them."""
+    path = folder / STEPS
+    try:
+        with open(path, "rb") as file:
+            content = file.read(record.itemsize * meta.get("steps", 0))
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {one_line(error)}") from error
     if hashlib.sha256(content).hexdigest() != meta.get("steps_sha256"):
-        raise CheckpointError(f"{file.name}: damaged or edited: it lacks steps that {CHECKPOINT} counts")
-    return np.frombuffer(content, kind)
+        raise CheckpointError(f"{path}: damaged or edited: it lacks steps that {CHECKPOINT} counts")
+    return np.frombuffer(content, record)

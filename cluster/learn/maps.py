@@ -1,0 +1,41 @@
+"""A run's maps, each built once, most of them ahead of their use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+from gridsim.config import SimConfig
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import build
+
+
+class Maps:
+    """The maps of one scenario, by their seeds, built by a thread until they are asked for."""
+
+    def __init__(self, scenario: str, config: SimConfig):
+        self._scenario, self._config = scenario, config
+        self._built: dict[int, Future[Map]] = {}
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="maps")
+
+    def ahead(self, seeds: Sequence[int]) -> None:
+        """Begin to build maps that will be needed, in this order, after those that were named before."""
+        for seed in seeds:
+            if seed not in self._built:
+                self._built[seed] = self._thread.submit(build, self._scenario, seed, self._config)
+
+    def get(self, seed: int) -> Map:
+        """The map of a seed. One that is still in the queue is built by the caller."""
+        future = self._built.get(seed)
+        if future is None or future.cancel():
+            future = self._built[seed] = Future()
+            future.set_result(build(self._scenario, seed, self._config))
+        return future.result()
+
+    def build(self, scenario: str, seed: int) -> Map:
+        """The map of the run's scenario and a seed, which is how pools ask for it."""
+        return self.get(seed)
+
+    def close(self) -> None:
+        """Cancel what has not begun."""
+        self._thread.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,47 @@
+"""The pictures and the page that a finished run leaves in its folder."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from cluster import stopping
+from cluster.report import film, page, pictures
+from cluster.store.champion import Champion
+from cluster.store.folder import CURVES, PAGE, TRAJECTORY, RunFolder
+from evolution.episodes.starts import Episodes
+from gridsim.car.ego import DISTANCE
+from gridsim.maps.map import Map
+from gridsim.maps.scenarios import is_map_file, label
+
+ELITES_SHOWN = 24  # on the page beside the champion, at most; most of them early ones, which show the learning
+
+
+def write_report(
+    run: RunFolder,
+    champion: Champion,
+    history: Sequence[Mapping[str, float]],
+    elites: np.ndarray,
+    get_map: Callable[[int], Map],
+    episodes: Episodes,
+) -> None:
+    """Write curves.png, trajectory.png and drive.html: drives of the champion and of elites in the first episode.
+
+    Args: the history's rows; the network of each step, float32 [steps, genes]; a map by its seed.
+    """
+    path, settings, limit = run.path, run.settings, champion.sim.episode.time_limit
+    road_map, start = get_map(episodes.maps[int(episodes.rows[0]["map"])]), episodes.rows[0]["start"]
+    pictures.curves(history, path / CURVES, settings.step_name)
+    drive = film.record(champion, road_map, start, limit, episodes.worlds[0])
+    where = "" if is_map_file(settings.scenario) else f", held-out map {road_map.seed:,}"
+    title = f"{label(settings.scenario)}{where}: {drive.cars[-1, DISTANCE]:,.0f} m"
+    pictures.trajectory(road_map, drive.cars, path / TRAJECTORY, title)
+    shown = [page.Shown("champion", "champion", drive)]
+    for k in (np.unique(np.geomspace(1, len(elites), ELITES_SHOWN).round().astype(int))[::-1] - 1).tolist():
+        stopping.check()
+        elite = dataclasses.replace(champion, genome=elites[k])
+        drive = film.record(elite, road_map, start, limit, episodes.worlds[0])
+        shown.insert(0, page.Shown(f"elite of {settings.step_name} {k}", str(k), drive, stride=2))
+    page.write_page(path / PAGE, f"GridSim: {run.name}, {title}", shown, champion.sim)
