@@ -24,7 +24,7 @@ from cluster.redaction import redacted
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
 from cluster.store import checkpoint
 from cluster.store.champion import Champion
-from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY, WriteError
+from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY
 from cluster.store.folder import ONNX, RunError, RunFolder, lock, write_summary
 from cluster.store.steps import Steps, write_elites
 from cluster.tracking.description import read_run
@@ -163,24 +163,21 @@ class Session:
                 self.on_row(learning.steps, learning.history[-1])
                 self._report_outage()
                 stopping.check()
-        except WriteError:
-            raise
-        except BaseException:
+        finally:
             self.save()
-            raise
-        self.save()
 
     def save(self) -> None:
-        """Save what is not yet saved of the steps that are done. Raises: CheckpointError; the files before are kept."""
+        """Save the steps that are done, once. Raises: CheckpointError; the files before are kept."""
         if self._state is None:
             return
-        (arrays, meta), learning, first = self._state, self.learning, self._steps.number
+        (arrays, meta), self._state = self._state, None
+        learning, first = self.learning, self._steps.number
         table = learning.table(first)
         self._steps.append(table, [learning.elites.pop(k) for k in range(first, learning.steps)])
         meta |= {"digest": self._digest, "init_sha256": self.run.init_sha256, **self._steps.meta()}
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
         self._steps.write_history(table.tolist(), first)
-        self._state, self._saved_at = None, perf_counter()
+        self._saved_at = perf_counter()
         self.tracking.start()
 
     def _report_outage(self) -> None:

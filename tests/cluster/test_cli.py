@@ -5,14 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tracked
-from commands import all_in_mlflow, descendants, finish, refused, rows, same_run, start, summary, wait_until
+from commands import BIN, all_in_mlflow, descendants, finish, refused, rows, same_run, start, summary, wait_until
 
 from cluster.commands.cli import dqn_main, evolve_main
 from cluster.commands.compare import compare_main
@@ -34,24 +33,82 @@ def evolve(*arguments, cwd):
     return finish("gridsim-evolve", *arguments, cwd=cwd)
 
 
+PHASES = {  # what a run says, or leaves, as the phase begins
+    "starting Ray": lambda out, run: "starting the workers" in out,
+    "learning": lambda out, run: len(rows(run)) >= 2,
+    "finishing": lambda out, run: (run / "champion.npz").exists(),
+}
+
+
 @pytest.mark.e2e
 @pytest.mark.usefixtures("database")  # a run waits for MLflow no more than 15 s then
-def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path):
-    run = tmp_path / "runs/c"
-    process = start("gridsim-evolve", "--workers", "2", "--name", "c", *SMALL, cwd=tmp_path)
-    wait_until(lambda: len(rows(run)) >= 2)
-    children = descendants(process.pid)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
-    assert "Traceback" not in out + err
-    assert "--resume runs/c" in err
+@pytest.mark.parametrize(
+    ("workers", "phase"), [("0", "learning"), ("0", "finishing"), *(("2", phase) for phase in PHASES)]
+)
+def test_ctrl_c_saves_and_leaves_nothing_behind(reference, tmp_path, workers, phase):
+    run, log = tmp_path / "runs/c", tmp_path / "log"
+    with log.open("w") as output, subprocess.Popen(
+        [BIN / "gridsim-evolve", "--workers", workers, "--name", "c", *SMALL],
+        cwd=tmp_path, stdout=output, stderr=output, start_new_session=True,
+    ) as process:  # fmt: skip
+        wait_until(lambda: PHASES[phase](log.read_text(), run))
+        children, began = descendants(process.pid), time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to every process
+        code = process.wait(60)
+    out = log.read_text()
+    if code != 0:  # else it was done before
+        assert code == 130, out
+        assert time.monotonic() - began < 15
+        assert "Traceback" not in out
+        last = "no generation was done yet" if phase == "starting Ray" else "gridsim-evolve --resume runs/c"
+        assert out.splitlines()[-1].endswith(last)
     wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 30)
-    (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "c")
-    assert logged.status == "KILLED"
-    assert (logged.end_time - logged.start_time) / 1000.0 == pytest.approx(float(rows(run)[-1]["wall_s"]), abs=0.01)
-    evolve("--workers", "2", "--resume", "runs/c", cwd=tmp_path)
+    if phase == "starting Ray":
+        assert not (tmp_path / "runs").exists()
+        return
+    if code != 0:
+        (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "c")
+        assert logged.status == "KILLED"
+        evolve("--resume", "runs/c", cwd=tmp_path)
     assert same_run(run, reference)
+
+
+@pytest.mark.e2e
+@pytest.mark.usefixtures("database")
+def test_a_run_goes_on_in_any_mode_after_a_kill_in_another(reference, cluster, tmp_path):
+    run, (address, _) = tmp_path / "runs/k", cluster(1)
+    for done, place in enumerate((["--workers", "1"], [], ["--address", address], ["--workers", "2"]), 1):
+        with start("gridsim-evolve", *SMALL, "--name", "k", "--resume-if-exists", *place, cwd=tmp_path) as process:
+            wait_until(lambda done=done: len(rows(run)) >= done)
+            process.kill()
+    evolve("--resume", "runs/k", cwd=tmp_path)
+    assert same_run(run, reference)
+
+
+@pytest.mark.e2e
+@pytest.mark.usefixtures("database")
+def test_start_or_continue_in_one_flag(reference, tmp_path):
+    """A job that a cluster starts again goes on; of two at once one is refused; a finished one says so."""
+    command = ("gridsim-evolve", *SMALL, "--name", "r", "--resume-if-exists")
+    with start(*command, cwd=tmp_path) as first, start(*command, cwd=tmp_path) as second:
+        out, codes = [], []
+        for process in (first, second):
+            out.append(process.communicate(timeout=120))
+            codes.append(process.returncode)
+    assert sorted(codes) == [0, 2]
+    refusal = out[codes.index(2)][1]
+    assert "another process is at work on it" in refusal or "another process has just begun this run" in refusal
+    assert same_run(tmp_path / "runs/r", reference)
+    assert "runs/r is finished" in evolve(*command[1:], cwd=tmp_path).stdout
+    for name in ("checkpoint.npz", "steps.bin", "history.csv", *(p.name for p in reference.glob("*.png"))):
+        (tmp_path / "runs/r" / name).unlink()
+    others = [path.name for path in (tmp_path / "runs/r").iterdir() if path.name not in ("config.json", "mlflow.json")]
+    done = finish(*command, cwd=tmp_path, code=2)
+    assert "exists already" in done.stderr, "it has files of a run, but no checkpoint"
+    for name in others:
+        (tmp_path / "runs/r" / name).unlink()
+    evolve(*command[1:], cwd=tmp_path)
+    assert same_run(tmp_path / "runs/r", reference)
 
 
 def test_tests_take_nothing_from_the_machines_home_and_shell(root, tmp_path, monkeypatch):
@@ -73,7 +130,6 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
     for name in ("config.json", "champion.npz", "elites.npz", "curves.png", "trajectory.png", "drive.html"):
         assert stored[name] == (reference / name).read_bytes() > b""
     assert (reference / "checkpoint.npz").is_file()
-    assert not (reference / "steps.part").exists()
     figures = summary(reference)
     assert len(rows(reference)) == figures["generations"] == 6
     assert all_in_mlflow(reference)
@@ -92,9 +148,9 @@ def test_run_folder_and_mlflow_keep_their_contracts(reference):
 def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_path):
     """The same run again, a part of it first: flags beside `--config` change it."""
     config, run = str(reference / "config.json"), tmp_path / "runs/s"
-    evolve("--workers", "0", "--config", config, "--generations", "3", "--name", "s", cwd=tmp_path)
-    assert "finished" in evolve("--workers", "0", "--resume", "runs/s", cwd=tmp_path).stdout
-    done = evolve("--workers", "0", "--resume", "runs/s", "--generations", "6", cwd=tmp_path)
+    evolve("--config", config, "--generations", "3", "--name", "s", cwd=tmp_path)
+    assert "finished" in evolve("--resume", "runs/s", cwd=tmp_path).stdout
+    done = evolve("--resume", "runs/s", "--generations", "6", cwd=tmp_path)
     assert same_run(run, reference)
     assert "compare: make ui, or" in done.stdout
     assert "at the end: 0.0% (in MLflow validation/success_rate; the table's is held_out/success_rate)" in done.stdout
@@ -105,32 +161,9 @@ def test_config_repeats_a_run_and_a_finished_one_can_be_extended(reference, tmp_
 @pytest.mark.usefixtures("database")
 def test_init_begins_with_a_champion(reference, tmp_path):
     small = ["--population", "24", "--generations", "1", "--recombination", "two", "--mutation-rate", "0"]
-    evolve("--workers", "0", *ROAD, *small, "--init", str(reference), "--name", "warm", cwd=tmp_path)
+    evolve(*ROAD, *small, "--init", str(reference), "--name", "warm", cwd=tmp_path)
     # Without mutation every member is the one it started from.
     assert summary(tmp_path / "runs/warm")["champion_sha256"] == summary(reference)["champion_sha256"]
-
-
-@pytest.mark.e2e
-@pytest.mark.parametrize(
-    ("send", "sign", "after_s"),  # killpg as timeout, Slurm and terminals do
-    [(os.kill, signal.SIGTERM, 0.0), (os.killpg, signal.SIGTERM, 1.5), (os.killpg, signal.SIGINT, 0.5)],
-)
-def test_stopped_while_ray_starts_it_ends_soon_and_leaves_nothing(tmp_path, send, sign, after_s):
-    with tempfile.TemporaryDirectory(prefix="gs-") as short:  # Ray's sockets lie in it, and their paths must be short
-        many = [*ROAD, "--population", "30000"]  # of which a generation takes longer
-        process = start("gridsim-evolve", "--workers", "2", *many, cwd=tmp_path, RAY_TMPDIR=short)
-        wait_until(lambda: list(Path(short).glob("gs-*/r/session_2*")))
-        time.sleep(after_s)
-        children = descendants(process.pid)
-        began = time.monotonic()
-        send(process.pid, sign)
-        _, err = process.communicate(timeout=60)
-        assert time.monotonic() - began < 15  # 0.2 s where nothing else is going on
-        assert process.returncode == 130, err
-        assert err.splitlines()[-1] == "gridsim-evolve: stopped; no generation was done yet"
-        wait_until(lambda: not [c for c in children if Path(f"/proc/{c}").exists()], 10)
-        assert list(Path(short).iterdir()) == []
-    assert not (tmp_path / "runs").exists()
 
 
 WRONG = [
@@ -142,7 +175,9 @@ WRONG = [
     ("--resume nowhere", "nowhere: no such folder"),
     ("--config /etc/hostname", "config.json"),
     ("--init nothing.npz", "nothing.npz: no such file"),
-    ("--workers 1 --address 127.0.0.1:1", "127.0.0.1:1"),
+    ("--wall-time -1", "--wall-time must be 0 or more"),
+    ("--resume-if-exists", "give that, and no --resume"),
+    ("--address 127.0.0.1:1", "127.0.0.1:1"),
     ("--tracking-uri http://127.0.0.1:1", "127.0.0.1:1: Connection refused; start one"),
 ]
 
@@ -150,7 +185,7 @@ WRONG = [
 @pytest.mark.parametrize(("arguments", "expected"), WRONG)
 def test_wrong_use_is_one_clear_line(arguments, expected, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert expected in refused(evolve_main, monkeypatch, capsys, "--workers", "0", *arguments.split())[0]
+    assert expected in refused(evolve_main, monkeypatch, capsys, *arguments.split())[0]
     assert list(tmp_path.iterdir()) == []  # nothing half-written
 
 
@@ -159,11 +194,12 @@ def test_a_run_of_the_version_before_is_refused_in_one_line(flag, path, monkeypa
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "old"
     folder.mkdir()
-    config = {"format": 1, "command": "gridsim-evolve", "settings": {"scenario": "curved", "islands": 4}}
-    (folder / "config.json").write_text(json.dumps(config))
-    (line,) = refused(evolve_main, monkeypatch, capsys, flag, path)
-    assert "old/config.json is of a run of GridSim 0.1, which this version cannot continue; start a new run" in line
-    assert (os.listdir(tmp_path), os.listdir(folder)) == (["old"], ["config.json"])
+    for form in (1, 2):
+        config = {"format": form, "command": "gridsim-evolve", "settings": {"scenario": "curved"}}
+        (folder / "config.json").write_text(json.dumps(config))
+        (line,) = refused(evolve_main, monkeypatch, capsys, flag, path)
+        assert "old/config.json is of an earlier GridSim, whose runs this one cannot continue; start a new run" in line
+        assert (os.listdir(tmp_path), os.listdir(folder)) == (["old"], ["config.json"])
 
 
 @pytest.fixture
@@ -172,9 +208,8 @@ def stopped(tmp_path):
     run = RunFolder(tmp_path / "r", EvolveSettings("curved", population=48, generations=6, seed=5))
     run.path.mkdir()
     run.write_config()
-    tracking = {"uri": "", "key": "", "run_id": None}
-    save(run.path / "checkpoint.npz", {}, {"generation": 3, "car_steps": 9, "solved": False, "tracking": tracking,
-                                           "digest": run.digest()})  # fmt: skip
+    meta = {"generation": 3, "car_steps": 9, "solved": False, "digest": run.digest()}
+    save(run.path / "checkpoint.npz", {}, meta)
     return run.path
 
 
@@ -191,7 +226,7 @@ def stopped(tmp_path):
 )
 def test_resume_refuses_contradictions(stopped, change, said, monkeypatch, capsys):
     monkeypatch.chdir(stopped.parent)
-    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", "r", "--workers", "0", *change.split())
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--resume", "r", *change.split())
     assert said in line
 
 
@@ -218,7 +253,7 @@ def test_resume_refuses_damaged_checkpoints(stopped, monkeypatch, capsys):
 def test_a_device_that_is_not_there_is_said(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    (line,) = refused(dqn_main, monkeypatch, capsys, "--workers", "0", "--device", "cuda")
+    (line,) = refused(dqn_main, monkeypatch, capsys, "--device", "cuda")
     assert "--device cuda: PyTorch finds no device" in line
 
 
@@ -230,13 +265,13 @@ def test_a_champion_that_does_not_fit_is_refused(monkeypatch, capsys, tmp_path):
     ):
         genes = np.full(PolicySpec.parse(policy).size, gene, dtype=np.float32)
         Champion(genes, policy, "curved", SimConfig()).save("c.npz")
-        (line,) = refused(evolve_main, monkeypatch, capsys, "--workers", "0", "--init", "c.npz")
+        (line,) = refused(evolve_main, monkeypatch, capsys, "--init", "c.npz")
         assert said in line
 
 
 def test_config_of_a_run_that_began_with_a_champion_begins_with_it_again(monkeypatch, capsys, tmp_path):
     RunFolder(tmp_path, EvolveSettings("curved"), init=str(tmp_path / "gone.npz")).write_config()
-    (line,) = refused(evolve_main, monkeypatch, capsys, "--workers", "0", "--config", str(tmp_path / "config.json"))
+    (line,) = refused(evolve_main, monkeypatch, capsys, "--config", str(tmp_path / "config.json"))
     assert "gone.npz" in line
 
 

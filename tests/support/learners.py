@@ -1,0 +1,45 @@
+"""Runs of the learners in this process, without commands and without MLflow."""
+
+import dataclasses
+
+from cluster import run as module
+from cluster.learn.learning import finish
+from cluster.workers.open import open_pool
+
+
+class Untracked:
+    """A run that MLflow knows nothing of."""
+
+    uri, error, run_id = "http://me:secret@host", None, ""
+
+    def start(self):
+        pass
+
+    def wait_id(self, timeout_s):
+        return ""
+
+    def close(self, status):
+        return None
+
+
+def pool_of(maps):
+    return open_pool(0, None, 0.0, maps.build)
+
+
+def session(run, maps, on_event=lambda event: None, on_row=lambda steps, row: None, **curriculum):
+    """A run in its folder, with a short validation, and changes of its curriculum."""
+    run.path.mkdir(parents=True, exist_ok=True)
+    run.write_config()
+    made = module.Session(
+        run, pool_of(maps), maps, Untracked(), on_event, on_row, module.perf_counter(), float("inf"), None
+    )
+    config = made.learning.curriculum.config
+    made.learning.curriculum.config = dataclasses.replace(config, validation=8, **curriculum)
+    return made
+
+
+def step(learning):
+    """One step, at a second each. Returns: its row."""
+    finish(learning.step())
+    learning.add_wall_clock(float(learning.steps))
+    return learning.history[-1]
