@@ -38,7 +38,7 @@ from gridsim.maps.files import map_digest
 from gridsim.maps.scenarios import is_map_file, label
 
 CURVES, TRAJECTORY, PAGE, ONNX = "curves.png", "trajectory.png", "drive.html", "champion.onnx"
-FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, ELITES, HISTORY, ONNX, PAGE, SUMMARY, TRAJECTORY)
+FILES = (CHAMPION, CHECKPOINT, CONFIG, CURVES, ELITES, HISTORY, ONNX, PAGE, STEPS, SUMMARY, TRAJECTORY)
 """Files of a finished run, which MLflow gets; what else is in its folder is the user's own."""
 BEGUN = {CONFIG, STEPS, MLFLOW}
 """Files of a run that was stopped before its first step was saved."""
