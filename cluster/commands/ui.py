@@ -10,7 +10,7 @@ import time
 
 from cluster.redaction import one_line
 from cluster.tracking.address import DEFAULT_URI, TrackingError, check_uri, reach_loopback_directly, server_problem
-from cluster.tracking.mlflow_run import run_tables
+from cluster.tracking.database import run_tables
 
 STOP_S = 10.0  # that the server may take to end
 

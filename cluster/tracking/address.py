@@ -56,24 +56,34 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
         return uri
     if scheme in ("http", "https"):
         uri = uri.rstrip("/")
-        if problem := server_problem(uri):
+        if problem := unreachable(uri):
             raise TrackingError(f"no MLflow server at {redacted(uri)}: {problem}; start one, or use {DEFAULT_URI}")
         return uri
     if scheme in _DATABASES:
         if redacted(uri).endswith(UNCLEAR):
             raise TrackingError(f"{redacted(uri)}: in a password, write ? as %3F, @ as %40 and / as %2F")
-        parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
-        if not parts.hostname:  # it is reached by a Unix socket
-            return uri
-        try:
-            socket.create_connection((parts.hostname, parts.port or _DATABASES[scheme]), PROBE_S).close()
-        except (OSError, ValueError) as error:
-            raise TrackingError(f"no database server at {redacted(uri)}: {one_line(error, uri)}") from error
+        if problem := unreachable(uri):
+            raise TrackingError(f"no database server at {redacted(uri)}: {problem}")
         return uri
     if scheme in ("", "file"):
         use = f"use {DEFAULT_URI} or http://host:port"
         raise TrackingError(f"{redacted(uri)}: MLflow 3 keeps no runs in folders; {use}")
     raise TrackingError(f"{redacted(uri)}: not a tracking address; use sqlite:///mlflow.db or http://host:port")
+
+
+def unreachable(uri: str) -> str:
+    """Why the server of an address, MLflow's or a database's, does not answer now; "" for all other addresses."""
+    scheme = address_scheme(uri)
+    if scheme in ("http", "https"):
+        return server_problem(uri.rstrip("/"))
+    if scheme in _DATABASES:
+        parts = urllib.parse.urlsplit(redacted(uri))  # unlike `uri`, its port is never part of a password
+        try:
+            if parts.hostname:  # else it is reached by a Unix socket
+                socket.create_connection((parts.hostname, parts.port or _DATABASES[scheme]), PROBE_S).close()
+        except (OSError, ValueError) as error:
+            return one_line(error, uri)
+    return ""
 
 
 def address_scheme(uri: str) -> str:

@@ -1,24 +1,84 @@
-"""How MLflow describes a training run: its name, parameters, tags, description, and its champion."""
+"""What MLflow gets of a training run's folder: rows, files, champion, and the words that describe them."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from cluster.settings import RunSettings
-from cluster.tracking.mlflow_run import MODEL, RUN_ID, Model
+from cluster.settings import SETTINGS, RunSettings, from_dict
+from cluster.store.champion import load_champion
+from cluster.tracking.address import TrackingError
+from cluster.tracking.content import Content, Model
+from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
+from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import label
 
-if TYPE_CHECKING:
-    import numpy as np
-    import torch
+NOT_LOGGED = ("target_m",)  # columns of history.csv that are not metrics
+UPLOADED = (
+    "champion.npz", "champion.onnx", "checkpoint.npz", "config.json", "curves.png", "drive.html", "elites.npz",
+    "history.csv", "summary.json", "trajectory.png",
+)  # fmt: skip
+"""A finished run's files, which MLflow gets; what else is in its folder is the user's own."""
 
-    from cluster.store.champion import Champion
-    from cluster.store.folder import RunFolder
+
+def read_run(folder: Path) -> Content | None:
+    """What MLflow is to have of a run by now; None before its first row.
+
+    Raises: GridSimError with one line if a file is damaged.
+    """
+    path = folder / "history.csv"
+    try:
+        rows = read_rows(path) if path.is_file() else []
+        path = folder / "config.json"
+        config = json.loads(path.read_bytes())
+        settings = from_dict(SETTINGS[config["command"]], dict(config["settings"]))
+        path = folder / "summary.json"
+        summary = json.loads(path.read_bytes()) if path.is_file() else None
+        model = None
+        if summary:
+            held_out, step, wall_s = held_out_metrics(summary["held_out"]), len(rows), float(summary["wall_s"])
+            # The last candidate is validated after the last step.
+            last = {"validation/success_rate": float(summary["validation_success_rate"])}
+            rows += [(step - 1, held_out, wall_s), (step, last, wall_s)]
+            path = folder / "champion.npz"
+            model = onnx_model(folder, settings, held_out)
+    except (OSError, LookupError, TypeError, ValueError) as error:  # edited by hand, or cut off
+        if isinstance(error, GridSimError):
+            raise
+        what = f"{path} is damaged ({type(error).__name__}: {error})"
+        raise TrackingError(f"{what}; delete it, and make it again with --resume {shlex.quote(str(folder))}") from error
+    if not rows:
+        return None
+    return Content(
+        name=folder.name,
+        params={name: str(value) for name, value in asdict(settings).items()},
+        tags=tags(settings),
+        note=describe(folder, settings, summary),
+        rows=rows,
+        files=[folder / name for name in UPLOADED if (folder / name).is_file()] if summary else [],
+        model=model,
+        finished=summary is not None,
+        wall_s=rows[-1][2],
+    )
+
+
+def read_rows(path: Path) -> list[tuple[int, Mapping[str, float], float]]:
+    """Step, metrics and wall_s of each complete line of a history.csv."""
+    text = path.read_text(encoding="utf-8")
+    columns, *lines = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
+    rows = [dict(zip(columns, map(float, line), strict=True)) for line in lines]
+    return [
+        (int(row[columns[0]]), {name: row[name] for name in columns[1:] if name not in NOT_LOGGED}, row["wall_s"])
+        for row in rows
+    ]
 
 
 def group(settings: RunSettings) -> str:
@@ -30,11 +90,6 @@ def group(settings: RunSettings) -> str:
     left_out = {"seed", "policy", "search", *settings.unbound}  # varied, named above, or only limits
     more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
     return ", ".join([" ".join(words), *more])
-
-
-def params(settings: RunSettings) -> dict[str, str]:
-    """All that decides the champion; what follows from this, and the simulator's constants, are in config.json."""
-    return {name: str(value) for name, value in asdict(settings).items()}
 
 
 def tags(settings: RunSettings) -> dict[str, str]:
@@ -64,14 +119,13 @@ def headline(settings: RunSettings) -> str:
     return f"{verb} of a `{settings.policy}` driver on **{label(settings.scenario)}**, {cars}, seed {settings.seed}."
 
 
-def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
+def describe(folder: Path, settings: RunSettings, summary: Mapping[str, Any] | None = None) -> str:
     """A run's description, Markdown: what it does, and once it is finished its results and how to watch it."""
-    settings, folder = run.settings, run.path
     if summary is None:
         return f"{headline(settings)}\n\nIts folder: `{folder}`"
     held_out, inputs = summary["held_out"], PolicySpec.parse(settings.policy).inputs
     found = "Solved" if summary["solved"] else "The best so far"
-    step = next(name for name in ("generations", "evaluations") if name in summary)
+    step = f"{settings.step_name}s"
     return "\n\n".join([
         headline(settings),
         f"{found} after {summary[step]:,} {step}, {summary['car_steps'] / 1e6:,.1f} million car-steps and "
@@ -80,35 +134,34 @@ def describe(run: RunFolder, summary: Mapping[str, Any] | None = None) -> str:
         f"m/s, and collides in {held_out['collision_rate']:.1%}.",
         "Watch it: `drive.html` among the artifacts, or",
         f"    gridsim-watch {shlex.quote(str(folder))}",
-        f"Load it, a torch model of the environment's observations, float32 [n, {inputs}], which is registered as "
+        f"Load it, an ONNX model of the environment's observations, float32 [n, {inputs}], which is registered as "
         f"`{model_name(settings)}`:",
-        f'    mlflow.pytorch.load_model("runs:/{RUN_ID}/{MODEL}")',
+        '    mlflow.pyfunc.load_model("runs:/{run_id}/model").predict(observations)["outputs"]',
         f"Repeat the run: `{settings.command} --config config.json`.",
     ])  # fmt: skip
 
 
-def torch_model(champion: Champion, settings: RunSettings, held_out: Mapping[str, float]) -> Model:
-    """The champion as a torch model, with the description of its registered version."""
-
-    def build() -> tuple[torch.nn.Module, np.ndarray]:
-        from evolution.networks.export import example, to_torch
-
-        spec = PolicySpec.parse(champion.policy)
-        return to_torch(spec, champion.genome, champion.sim), example(spec, champion.sim)
-
+def onnx_model(folder: Path, settings: RunSettings, held_out: Mapping[str, float]) -> Model | None:
+    """A finished run's champion and the words for its registered version; None without a champion.onnx."""
+    if not (folder / "champion.onnx").is_file():
+        return None
+    champion = load_champion(folder / "champion.npz")
+    spec = PolicySpec.parse(champion.policy)
     return Model(
         model_name(settings),
         champion.sha256,
         about=f"Champions of {settings.command} on {label(settings.scenario)}. They take the environment's "
         "observations and return a number for each of the eight actions; the action with the greatest is taken.",
-        note=f"{headline(settings)} {held_out['success_rate']:.1%} of the held-out drives succeed.",
+        note=f"{headline(settings)} {held_out['held_out/success_rate']:.1%} of the held-out drives succeed.",
         tags={
             "policy": champion.policy,
             "scenario": label(settings.scenario),
             "algorithm": settings.algorithm,
             "traffic": str(champion.traffic),
             "seed": str(settings.seed),
-            **{name: f"{value:.6g}" for name, value in held_out_metrics(held_out).items()},
+            **{name: f"{value:.6g}" for name, value in held_out.items()},
         },
-        build=build,
+        onnx=folder / "champion.onnx",
+        example=example(spec, champion.sim),
+        outputs=spec.outputs,
     )

@@ -1,33 +1,78 @@
-"""Rows that the tests of tracking log, what MLflow then has, asked through its own client, and its own server."""
+"""Folders of runs as they are written, what MLflow then has, asked through its own client, and its own server."""
 
 import contextlib
+import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 from commands import wait_until
 
-from cluster.tracking import mlflow_run
+from cluster.settings import EvolveSettings
+from cluster.store.champion import Champion
+from cluster.tracking import sync
 from cluster.tracking.address import server_problem
-from cluster.tracking.mlflow_run import Identity
-from cluster.tracking.tracker import Tracker
+from cluster.tracking.database import silence_mlflow
+from cluster.tracking.description import read_run
+from cluster.tracking.sync import Tracking
+from evolution.networks.export import to_onnx
+from evolution.networks.policy import PolicySpec
+from gridsim.config import SimConfig
 
 NAMES = ["fitness/best", "distance_m/mean", "car_steps", "wall_s"]
-PARAMS = {"scenario": "seamless", "population": "512", "generations": "60"}
-TAGS = {"algorithm": "evolution", "scenario": "seamless"}
+HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mps": 7.5, "collision_rate": 0.5}
+MODEL = "gridsim-curved-evolution"
 # With it scripts find the packages and this file, whatever the working directory.
-PYTHONPATH = os.pathsep.join([str(Path(mlflow_run.__file__).resolve().parents[2]), str(Path(__file__).parent)])
+PYTHONPATH = os.pathsep.join([str(Path(sync.__file__).resolve().parents[2]), str(Path(__file__).parent)])
 
 
 def row(step):
     return {name: step * 10.0 + place for place, name in enumerate(NAMES)}
 
 
+def write_run(folder, count=3, success_rate=None, **settings):
+    """A run's folder after so many generations; with a success rate it is finished, and has a champion of that seed."""
+    settings = EvolveSettings("curved", **settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.json").write_text(json.dumps({"command": "gridsim-evolve", "settings": asdict(settings)}))
+    lines = [",".join(map(repr, [step, *row(step).values(), 375.0])) for step in range(count)]
+    (folder / "history.csv").write_text("\n".join([",".join(["generation", *NAMES, "target_m"]), *lines, ""]))
+    (folder / "summary.json").unlink(missing_ok=True)
+    if success_rate is not None:
+        spec = PolicySpec.parse(settings.policy)
+        genome = np.random.default_rng(settings.seed).standard_normal(spec.size).astype(np.float32)
+        Champion(genome, settings.policy, "curved", SimConfig()).save(folder / "champion.npz")
+        (folder / "champion.onnx").write_bytes(to_onnx(spec, genome, SimConfig()))
+        (folder / "curves.png").write_bytes(b"png")
+        summary = {
+            "generations": count, "car_steps": 1_000_000, "wall_s": 10.0 * count, "solved": True,
+            "validation_success_rate": 0.75, "held_out": HELD_OUT | {"success_rate": success_rate},
+        }  # fmt: skip
+        (folder / "summary.json").write_text(json.dumps(summary))
+    return folder
+
+
+def tracking(folder, uri, experiment="driving", read=read_run):
+    """A run's tracking, started."""
+    started = Tracking(folder, uri, experiment, read)
+    started.start()
+    return started
+
+
+def send(folder, uri, experiment="driving"):
+    """Send a folder, of which nothing may be left; returns what was sent, and MLflow's id of the run."""
+    sent, lacking = sync.sync(folder, uri, experiment, read_run)
+    assert lacking is None
+    return sent, json.loads((folder / "mlflow.json").read_text())["run_id"]
+
+
 def client(uri):
-    mlflow_run.quiet()
+    silence_mlflow()
     from mlflow.tracking import MlflowClient
 
     return MlflowClient(tracking_uri=uri)
@@ -47,22 +92,6 @@ def runs(uri):
     return [run for each in client(uri).search_experiments() for run in client(uri).search_runs([each.experiment_id])]
 
 
-def tracker(uri, count=0, **options):
-    """A tracker that was given so many rows."""
-    given = {"experiment": "driving", "name": "a run", "params": PARAMS, "tags": TAGS, "key": "the-key", **options}
-    made = Tracker(Identity(uri, **given))
-    for step in range(count):
-        made.log_row(step, row(step))
-    return made
-
-
-def begin(uri, count, **options):
-    """A run of `count` rows that was stopped; returns its id."""
-    begun = tracker(uri, count, **options)
-    assert begun.close("KILLED", 60) is None
-    return begun.run_id
-
-
 def free_port():
     with socket.create_server(("127.0.0.1", 0)) as free:
         return free.getsockname()[1]
@@ -72,17 +101,12 @@ def free_port():
 def mlflow_server(folder, port, *flags):
     """MLflow's own, with a database and artifacts in `folder`, until it is killed at the end."""
     command = [sys.executable, "-m", "mlflow", "server", "--workers", "1", "--host", "127.0.0.1", "--port", str(port)]
-    command += [
-        "--backend-store-uri",
-        f"sqlite:///{folder}/served.db",
-        "--artifacts-destination",
-        f"{folder}/served",
-        *flags,
-    ]
-    command += flags
+    command += ["--backend-store-uri", f"sqlite:///{folder}/served.db", "--artifacts-destination", f"{folder}/served"]
     with open(folder / "server.log", "a") as log:
         quick = {**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}
-        server = subprocess.Popen(command, cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True)
+        server = subprocess.Popen(
+            [*command, *flags], cwd=folder, env=quick, stdout=log, stderr=log, start_new_session=True
+        )
     try:
         wait_until(lambda: not server_problem(f"http://127.0.0.1:{port}"), pause=0.2)
         yield

@@ -1,0 +1,36 @@
+"""What MLflow is to have of a folder, as it was read from the folder's files."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Model:
+    """A champion as an ONNX file, and the registered version that it becomes."""
+
+    name: str  # of the registered model
+    champion_sha256: str  # digest of the champion's genome; a run registers a champion once
+    about: str  # what all versions of the registered model have in common, Markdown
+    note: str  # what this version is, Markdown
+    tags: Mapping[str, str]  # the version's, and the saved model's metadata
+    onnx: Path
+    example: np.ndarray  # observations float32 [n, inputs]
+    outputs: int  # numbers that the network returns for an observation
+
+
+@dataclass(frozen=True)
+class Content:
+    """All that MLflow is to have of a run or a comparison."""
+
+    name: str
+    params: Mapping[str, str]
+    tags: Mapping[str, str]
+    note: str  # description, Markdown; `{run_id}` stands for MLflow's id of the run
+    rows: list[tuple[int, Mapping[str, float], float]] = field(default_factory=list)  # step, metrics, wall_s
+    files: list[Path] = field(default_factory=list)
+    model: Model | None = None
+    finished: bool = False  # a finished run's status, end and files in MLflow stay as they are
+    wall_s: float = 0.0  # seconds from the start to the last row or the end, without pauses
