@@ -139,7 +139,7 @@ class Session:
             self._steps.write_history(learning.table().tolist(), 0)
         self._state: State | None = None  # after the last step, if it is not saved yet
         self._saved_at = -math.inf
-        self._away = False  # whether an outage of MLflow was reported
+        self._away = self._tracked = False  # whether an outage of MLflow was reported; whether it is sent anything
         learning.deadline = self.started + self.wall_limit_s
         self.maps.ahead([*learning.curriculum.map_seeds[:3], *VALIDATION_SEEDS])
 
@@ -178,7 +178,13 @@ class Session:
         checkpoint.save(self.run.path / CHECKPOINT, arrays, meta)
         self._steps.write_history(table.tolist(), first)
         self._saved_at = perf_counter()
-        self.tracking.start()
+        self._track()
+
+    def _track(self) -> None:
+        """Begin to send the run to MLflow, once there is something to send."""
+        if not self._tracked:
+            self._tracked = True
+            self.tracking.start()
 
     def _report_outage(self) -> None:
         """Warn once when MLflow cannot be reached, and once when it is back."""
@@ -196,6 +202,7 @@ class Session:
         from evolution.networks.export import to_onnx
 
         learning, path, settings = self.learning, self.run.path, self.run.settings
+        self._track()
         self.maps.ahead(HELD_OUT_SEEDS)
         self._through(learning.choose_champion())
         best, car_steps, sim = learning.champion, learning.car_steps, learning.sim

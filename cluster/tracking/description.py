@@ -87,7 +87,7 @@ def group(settings: RunSettings) -> str:
     words += [f"{settings.traffic} cars"] if settings.traffic else []
     given = asdict(settings)
     usual = asdict(type(settings)(settings.scenario, settings.traffic, observation=settings.observation))
-    left_out = {"seed", "policy", "search", *settings.unbound}  # varied, named above, or only limits
+    left_out = {"seed", "policy", "search", *settings.extendable}  # varied, named above, or only limits
     more = [f"{name} {value}" for name, value in given.items() if name not in left_out and value != usual[name]]
     return ", ".join([" ".join(words), *more])
 
