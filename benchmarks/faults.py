@@ -1,11 +1,11 @@
-"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--jobs N] [--cluster] [--json]
+"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--jobs N] [--workers N] [--cluster] [--json]
 
-A small evolution with two workers runs again and again, several of them at once, beside an MLflow server of their own.
-At random moments one of FAULTS happens; a run that ended before its time is resumed. A run that came to its end must
-have the champion, the elites and the history of the undisturbed run, and MLflow each of its rows once. When all runs
-are over, and one more without faults, which removes the folders of Rays that were killed, no process of theirs may be
-left, and no file but results and logs that a message names. 20 faults take about three minutes, one run after another.
-The same seed draws the same faults, but not at the same steps of a run.
+A small evolution runs again and again, with two Ray workers or with --workers 0 in one process, several of them at
+once, beside an MLflow server of their own. At random moments one of FAULTS happens; a run that ended before its time is
+started again. A run that came to its end must have the champion, the elites and the history of the undisturbed run, and
+MLflow each of its rows once. When all runs are over, no process of theirs may be left, and no shared memory. 20 faults
+take about three minutes, one run after another. The same seed draws the same faults, but not at the same steps of a
+run.
 
 A disk, and the shared memory in which Ray keeps its objects, are mounted for the campaign alone, so that they can be
 filled; where that is not allowed, these two faults are left out. A clock that is set back is what `time.time` says in
@@ -128,13 +128,16 @@ class Gate:
 class Campaign:
     """The runs, their server, and what happens to them. `folder` is a new one, of a short path."""
 
-    def __init__(self, folder: Path, seed: int, clustered: bool):
+    def __init__(self, folder: Path, seed: int, workers: int, clustered: bool):
+        self.workers = str(workers)
         self.seed, self.counts, self.finished, self.champions = seed, Counter[str](), 0, set[str]()
         self.shared = threading.Lock()  # held while the server or the disk, which all runs share, is disturbed
         self._numbers, self._stopped = count(), False
         self.disk = folder / "disk"
         self.disk.mkdir()
         missing = {"shared memory full"} if clustered else {"host gone", "link down"}
+        if not workers:
+            missing |= {"shared memory full", "worker killed", "worker stopped"}
         if MOUNTS in os.environ:
             for place, mib in (self.disk, DISK_MIB), (SHARED_MEMORY, SHARED_MIB):
                 subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", str(place)], check=True)
@@ -182,17 +185,12 @@ class Campaign:
 
     # --------------------------------------------------------------------------------------------------------- runs
 
-    def undisturbed(self, name: str = "undisturbed") -> None:
-        """A run without faults. All others are compared with the first one."""
-        run = Run(self, name)
-        if run.start("--workers", "2", "--name", run.name, "--tracking-uri", self.uri, *SMALL).wait(LONG_S):
-            raise Wrong(f"the {name} run fails: {run.last_words()}")
+    def undisturbed(self) -> None:
+        """A run without faults, with which all others are compared."""
+        run = Run(self, "undisturbed")
+        if run.start("--workers", self.workers, "--name", run.name, "--tracking-uri", self.uri, *SMALL).wait(LONG_S):
+            raise Wrong(f"the undisturbed run fails: {run.last_words()}")
         self.check(run.name)
-
-    def last(self) -> None:
-        """A run without faults when all others are over; the next one would do what this does besides."""
-        self._wait_for_processes()
-        self.undisturbed("last")
 
     @property
     def happened(self) -> int:
@@ -216,7 +214,7 @@ class Campaign:
         run, wanted = self.disk / "runs" / name, self.disk / "runs" / "undisturbed"
         summary, reference = (json.loads((folder / "summary.json").read_text()) for folder in (run, wanted))
         self.champions.add(summary["champion_sha256"])
-        for figure in ("champion_sha256", "car_steps", "lost_chunks"):
+        for figure in ("champion_sha256", "car_steps"):
             if summary[figure] != reference[figure]:
                 raise Wrong(f"{name}: {figure} is {summary[figure]}, undisturbed {reference[figure]}")
         if (run / "elites.npz").read_bytes() != (wanted / "elites.npz").read_bytes():
@@ -286,7 +284,7 @@ class Run:
     """One run, from its start to its end, resumed as often as that takes."""
 
     def __init__(self, campaign: Campaign, name: str):
-        self.campaign, self.name, self._first = campaign, name, name
+        self.campaign, self.name = campaign, name
         self.rng = random.Random(f"{campaign.seed} {name}")
         self._said = campaign.folder / f"said-{name}.log"
         self._heard = 0  # bytes of it that are settled
@@ -311,17 +309,15 @@ class Run:
 
     def drive(self, faults: int) -> None:
         """To its end, with faults until there were so many in all."""
-        campaign, begun = self.campaign, 0
+        campaign = self.campaign
+        flags = ["--name", self.name, "--resume-if-exists", "--tracking-uri", campaign.uri, *SMALL]
+        flags += ["--workers", campaign.workers, "--patience", str(PATIENCE_S)]
+        if campaign.cluster:
+            flags += ["--address", campaign.cluster.address]
         while True:
-            flags: tuple[str, ...] = ("--resume", f"runs/{self.name}")
-            if not (campaign.disk / "runs" / self.name / "checkpoint.npz").exists():
-                begun += 1
-                self.name = f"{self._first}-{begun}"  # a run killed before its first checkpoint keeps the name
-                flags = ("--name", self.name, "--tracking-uri", campaign.uri, *SMALL)
             if campaign.cluster:
                 campaign.cluster.mend()
-                flags += ("--address", campaign.cluster.address)
-            process = self.start("--workers", "2", "--patience", str(PATIENCE_S), *flags)
+            process = self.start(*flags)
             ends, fault = time.monotonic() + LONG_S, self.rng.choice(campaign.faults)
             while process.poll() is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
@@ -338,15 +334,15 @@ class Run:
                 break
             refused = process.returncode == 2 and "no MLflow server" in self.said()  # a new run looks for it first
             outside = process.returncode in (-signal.SIGINT, -signal.SIGTERM) and "in _enter" not in self.said()
-            if outside:  # Python itself was interrupted, before the command began or after its end
+            if outside:  # Python itself was interrupted, before the command began
                 self._heard = self._said.stat().st_size
                 continue
             known = process.returncode in (-signal.SIGKILL, -signal.SIGBUS, 130, 1)  # SIGBUS: shared memory was full
             if "Traceback" in self.said() or not (refused or known):
                 raise Wrong(f"{self.name} ends with {process.returncode}: {self.last_words()}")
         with campaign.shared:
-            unsent = re.search("not logged to MLflow|what MLflow lacks is not sent", self.said())
-            if unsent and self.start("--resume", f"runs/{self.name}").wait(LONG_S):
+            unsent = re.search("not logged to MLflow|could not upload to MLflow", self.said())
+            if unsent and self.start(*flags).wait(LONG_S):
                 raise Wrong(f"{self.name} cannot be sent later: {self.last_words()}")
             campaign.check(self.name)
 
@@ -436,11 +432,12 @@ def main() -> int:
     parser.add_argument("--faults", type=int, default=20, help="how many (20)")
     parser.add_argument("--seed", type=int, default=0, help="of the faults and their moments (0)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once (1)")
+    parser.add_argument("--workers", type=int, default=2, help="Ray workers of a run; 0: in one process (2)")
     parser.add_argument("--cluster", action="store_true", help="on two hosts; one run at a time")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
-    if options.cluster and options.jobs > 1:
-        parser.error("--cluster has one run at a time: leave --jobs out")
+    if options.cluster and (options.jobs > 1 or not options.workers):
+        parser.error("--cluster has one run at a time, with workers: leave --jobs and --workers out")
     own = ["unshare", "--mount", *(["--net"] if options.cluster else [])]
     can = shutil.which(own[0]) and not subprocess.run([*own, "true"], stderr=subprocess.DEVNULL).returncode
     if options.cluster and not (can and shutil.which("ip")):
@@ -451,7 +448,7 @@ def main() -> int:
         subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # runs inherit it; jobs in a shell's background ignore it
     folder = Path(tempfile.mkdtemp(prefix="gsf", dir="/tmp"))  # Ray's sockets need a short path
-    campaign, wrong = Campaign(folder, options.seed, options.cluster), ""
+    campaign, wrong = Campaign(folder, options.seed, options.workers, options.cluster), ""
     begun = time.monotonic()
     try:
         campaign.undisturbed()
@@ -463,7 +460,6 @@ def main() -> int:
 
         with ThreadPoolExecutor(options.jobs) as jobs:
             list(jobs.map(lambda _: campaign.disturb(options.faults, tell), range(options.jobs)))
-        campaign.last()
     except Wrong as error:
         wrong = str(error)
     finally:

@@ -1,20 +1,18 @@
-"""Whether memory or saving grows over generations: soak.py [--generations 2000] [--workers 2] [--policy P]
+"""Whether memory or a checkpoint grows over generations: soak.py [--generations 2000] [--workers 0] [--policy P]
 
 Evolves a small population from a trained driver, so that everything a long run does happens from the start: crashes,
-validation, a checkpoint and an MLflow row in each generation; with --policy, from random networks of that kind, whose
-leader is validated however it drives. After each generation, the memory of the command and of all that it started
-(Ray's processes and the workers) is added up as PSS, in which shared memory counts once.
+validation, checkpoints and MLflow rows; with --policy, from random networks of that kind. After each generation, the
+memory of the command and of all that it started (with --workers Ray's processes) is added up as PSS, in which shared
+memory counts once.
 
 The memory after the first 100 generations (or half of a shorter run) is compared with that at the end, as medians of
-20. Exits with 1 if it grew by over 5 %, of the command alone or of all. Every generation is saved; what that took, and
-the checkpoint's size, are those of the first 20 and of the last 20. Linux only.
+20. Exits with 1 if it grew by over 5 %, of the command alone or of all. Linux only.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import json
 import os
 import statistics
@@ -23,14 +21,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from coordinator import learn, session  # beside this file
-
-from cluster.learn.learning import Maps
+from cluster.run import Place, train
 from cluster.settings import EvolveSettings
 from cluster.store.champion import load_champion
-from cluster.workers.kernels import compile_kernels
-from cluster.workers.ray_pool import RayPool
-from gridsim.config import SimConfig
+from cluster.store.folder import new_run
+from cluster.tracking.address import check_uri
 
 FIRST = 100  # generations, after which nothing may grow
 WINDOW = 20  # generations that a figure is the median of
@@ -62,50 +57,27 @@ def memory(pid: int) -> int:
 
 
 def soak(generations: int, workers: int, policy: str = "") -> dict[str, list[float]]:
-    """After each generation: bytes of the command (`own`), and of all that it started (`started`).
-
-    Also of each time that it saved: the seconds (`save`), and the checkpoint's bytes (`checkpoint`).
-    """
+    """After each generation: bytes of the command (`own`), of all that it started, and of the checkpoint."""
     champion = load_champion(Path(__file__).with_name("champion.npz"))
     # Small steps, so that the drivers keep driving well.
     settings = EvolveSettings(
         policy=policy or champion.policy, population=32, sigma=0.01, generations=generations, until=2.0
     )
-    seen: dict[str, list[float]] = {"own": [], "started": [], "save": [], "checkpoint": []}
+    seen: dict[str, list[float]] = {"own": [], "started": [], "checkpoint": []}
     with tempfile.TemporaryDirectory() as folder:
-        maps = Maps(settings.scenario, SimConfig())
-        pool = RayPool(workers, maps.build)
-        this = session(Path(folder), "soak", settings, pool, maps, None if policy else champion.genome)
-        # A short validation: all maps are in use at once, and a generation takes a tenth of a second.
-        curriculum = this.learning.curriculum
-        curriculum.config = dataclasses.replace(
-            curriculum.config, leader_episodes=4, validation=48, validation_share=1.0, promising=0.0
-        )
-        curriculum.target = curriculum.config.last_target
-        compile_kernels(settings.policy, settings.traffic, settings.command)
+        run = new_run(Path(folder), "soak", settings)
 
         def look(generation: int, row: dict[str, float]) -> None:
             own, *started = tree(os.getpid())
             seen["own"].append(memory(own))
             seen["started"].append(sum(map(memory, started)))
+            path = run.path / "checkpoint.npz"
+            seen["checkpoint"].append(path.stat().st_size if path.exists() else 0)
             if sys.stderr.isatty():
                 print(f"\rgeneration {generation} ", end="", file=sys.stderr, flush=True)
 
-        save = this.save
-
-        def timed() -> None:
-            begun = time.perf_counter()
-            save()
-            seconds, checkpoint = time.perf_counter() - begun, this.run.path / "checkpoint.npz"
-            if checkpoint.exists():  # before the first generation there is nothing to save
-                seen["save"].append(seconds)
-                seen["checkpoint"].append(checkpoint.stat().st_size)
-
-        this.learning.save_every_s = 0.0  # type: ignore[misc]
-        this.save = timed  # type: ignore[method-assign]
-        this.reporter.row = look
-        learn(this)
-        maps.close()
+        place = Place(workers, uri=check_uri(f"sqlite:///{folder}/mlflow.db"))
+        train(run, place, on_row=look, initial=None if policy else champion.genome)
     return seen
 
 
@@ -113,16 +85,15 @@ def main() -> int:
     """Run it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--generations", type=int, default=2_000, help="how many (2000)")
-    parser.add_argument("--workers", type=int, default=2, help="how many (2)")
+    parser.add_argument("--workers", type=int, default=0, help="Ray workers; 0: in this process (0)")
     parser.add_argument("--policy", default="", help="start from random networks of this kind (champion.npz)")
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     options = parser.parse_args()
-    if options.generations < 2 or options.workers < 1:
-        parser.error("--generations must be 2 or more, --workers 1 or more")
+    if options.generations < 2 or options.workers < 0:
+        parser.error("--generations must be 2 or more, --workers 0 or more")
     begun = time.perf_counter()
     seen = soak(options.generations, options.workers, options.policy)
-    seconds = time.perf_counter() - begun
-    save, checkpoint = seen.pop("save"), seen.pop("checkpoint")
+    checkpoint = seen.pop("checkpoint")
     seen["all"] = [sum(both) for both in zip(*seen.values(), strict=True)]
     first = min(FIRST, len(seen["all"]) // 2)
     window = min(WINDOW, len(seen["all"]) - first)
@@ -133,17 +104,15 @@ def main() -> int:
     growth = {name: after[name] / before[name] - 1.0 for name in ("own", "all")}
     figures = {
         "generations": len(seen["all"]),
-        "seconds": round(seconds, 1),
+        "seconds": round(time.perf_counter() - begun, 1),
         "mib_before": round(before["all"] / MIB, 1),
         "mib_after": round(after["all"] / MIB, 1),
         "own_mib_before": round(before["own"] / MIB, 1),
         "own_mib_after": round(after["own"] / MIB, 1),
         "growth": round(growth["all"], 4),
         "own_growth": round(growth["own"], 4),
-        "save_ms_before": round(1e3 * statistics.median(save[:WINDOW]), 2),
-        "save_ms_after": round(1e3 * statistics.median(save[-WINDOW:]), 2),
-        "checkpoint_kib_before": round(statistics.median(checkpoint[:WINDOW]) / 1024, 1),
-        "checkpoint_kib_after": round(statistics.median(checkpoint[-WINDOW:]) / 1024, 1),
+        "checkpoint_kib_before": round(statistics.median(checkpoint[first : first + window]) / 1024, 1),
+        "checkpoint_kib_after": round(statistics.median(checkpoint[-window:]) / 1024, 1),
     }
     if options.json:
         print(json.dumps(figures))

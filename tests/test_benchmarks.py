@@ -16,6 +16,7 @@ RUNS = {
         ["--faults", "20", "--jobs", "2", "--json"],
         {"faults", "runs", "champions", "processes_left", "shared_memory_left", "worker_killed", "MLflow_full"},
     ),
+    "faults.py --workers 0": (["--faults", "10", "--json"], {"faults", "champions", "processes_left", "disk_full"}),
     "faults.py --cluster": (["--faults", "6", "--json"], {"faults", "runs", "champions", "host_gone", "link_down"}),
     "learners.py": (
         ["--quick", "--json"],
@@ -31,7 +32,7 @@ RUNS = {
         },
     ),
     "soak.py": (
-        ["--generations", "12", "--workers", "1", "--policy", "mlp:64,64", "--json"],
+        ["--generations", "12", "--policy", "mlp:64,64", "--json"],
         {"growth", "own_growth", "mib_before", "mib_after"},
     ),
     "throughput.py": (["--runs", "1", "--json"], {"rollout_rays", "vector_env_grid", "breed_512x1000_ms"}),
