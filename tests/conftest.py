@@ -49,16 +49,16 @@ def root() -> Path:
 @pytest.fixture(scope="session")
 def empty_database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An MLflow database that has been created once, for tests to copy: creating one takes seconds."""
-    from cluster.tracking.address import check_uri
-    from cluster.tracking.mlflow_run import Identity
-    from cluster.tracking.tracker import Tracker
+    from tracked import client
 
-    folder = tmp_path_factory.mktemp("mlflow")
-    begun = Tracker(Identity(check_uri(f"sqlite:///{folder}/mlflow.db"), "other", "other", {}, {}))
-    begun.wait_ready(300)
-    assert begun.close("FINISHED") is None
-    assert os.listdir(folder) == ["mlflow.db"]
-    return folder / "mlflow.db"
+    from cluster.tracking.database import create_database, silence_mlflow
+
+    silence_mlflow()
+    path = tmp_path_factory.mktemp("mlflow") / "mlflow.db"
+    create_database(path)
+    client(f"sqlite:///{path}").create_experiment("other", artifact_location=(path.parent / "mlartifacts").as_uri())
+    assert os.listdir(path.parent) == ["mlflow.db"]
+    return path
 
 
 @pytest.fixture
@@ -89,14 +89,13 @@ def uri(empty_database: Path, tmp_path: Path) -> str:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Short pauses of a tracker."""
-    from cluster.tracking import address as tracking_address
-    from cluster.tracking import tracker
+    """Short pauses of tracking."""
+    from cluster.tracking import address, sync
 
-    monkeypatch.setattr(tracker, "FLUSH_S", 0.05)
-    monkeypatch.setattr(tracker, "RETRY_S", 0.1)
-    monkeypatch.setattr(tracker, "CHANCE_S", 0.1)
-    monkeypatch.setattr(tracking_address, "PROBE_S", 0.3)
+    monkeypatch.setattr(sync, "SYNC_S", 0.05)
+    monkeypatch.setattr(sync, "RETRY_S", 0.1)
+    monkeypatch.setattr(sync, "LAST_RETRY_S", 0.1)
+    monkeypatch.setattr(address, "PROBE_S", 0.3)
 
 
 @pytest.fixture(scope="session")

@@ -113,7 +113,8 @@ class LoggedRun:
         if run is None:  # a run that was killed early may not have saved its id
             found = client.search_runs([experiment], f"tags.`{KEY_TAG}` = '{link['key']}'", max_results=1)
             run = found[0] if found else self._create(experiment, content.name, tags, link["started"])
-        _write_link(self._folder, link | {"run_id": run.info.run_id, "experiment": name})
+            link["experiment"] = name
+        _write_link(self._folder, link | {"run_id": run.info.run_id})
         self._artifacts: str = run.info.artifact_uri
         self._started_ms: int = run.info.start_time
         self._complete(run, content, tags)
@@ -262,18 +263,20 @@ class LoggedRun:
         """
         client, source = self._client, f"{self._artifacts.rstrip('/')}/{MODEL}"
         own = client.search_model_versions(f"name = '{model.name}' and run_id = '{self.run_id}'")
-        if any(each.tags.get(CHAMPION_TAG) == model.champion_sha256 for each in own):
-            return False
-        with _may_exist():
-            client.create_registered_model(model.name, description=model.about)
-        tags = {CHAMPION_TAG: model.champion_sha256, **model.tags}
-        client.create_model_version(model.name, source, self.run_id, tags, description=model.note, await_creation_for=0)
+        new = all(each.tags.get(CHAMPION_TAG) != model.champion_sha256 for each in own)
+        if new:
+            with _may_exist():
+                client.create_registered_model(model.name, description=model.about)
+            tags = {CHAMPION_TAG: model.champion_sha256, **model.tags}
+            client.create_model_version(
+                model.name, source, self.run_id, tags, description=model.note, await_creation_for=0
+            )
         best = max(
             client.search_model_versions(f"name = '{model.name}'"),
             key=lambda each: (float(each.tags.get("held_out/success_rate", -1.0)), -int(each.version)),
         )
         client.set_registered_model_alias(model.name, BEST, str(best.version))
-        return True
+        return new
 
     @contextlib.contextmanager
     def _registry_named(self) -> Iterator[None]:

@@ -117,8 +117,8 @@ class Tracking:
         status = self._status  # before the folder is read, so that a run ends with its last row
         try:
             content = self._read(self._folder)
-            lacking = content and self._run.lacking(content, status)
-            self.error = self._run.send(content, status) if content and lacking else None
+            new = content and (not self.run_id or self._run.lacking(content, status))
+            self.error = self._run.send(content, status) if content and new else None
         except Exception as failure:  # of a damaged folder; the run goes on
             self.error = one_line(failure)
         return self.error is None

@@ -1,157 +1,239 @@
-"""Everything reaches MLflow once, read back through its own client; nothing that MLflow does stops or litters a run."""
+"""A run's folder reaches MLflow whole and once, whatever fails in between; read back through MLflow's own client."""
 
-import contextlib
+import json
 import os
 import re
 import shutil
-import sqlite3
 import subprocess
 import time
 
 import pytest
-from commands import finish, start
-from tracked import PARAMS, PYTHONPATH, TAGS, begin, client, row, runs, steps, tracker
+from commands import finish, start, wait_until
+from tracked import MODEL, NAMES, PYTHONPATH, QUIET, client, read_run, row, runs, send, steps, tracking, write_run
 
 import cluster.tracking.commit
-from cluster.tracking import mlflow_run
-from cluster.tracking.address import TrackingError, check_uri
+from cluster.tracking import logged, sync
+from cluster.tracking.address import check_uri
+from cluster.tracking.content import Content
+from cluster.tracking.sync import Tracking, saved_uri
 
 
-def test_a_run_read_back(uri, tmp_path, monkeypatch):
-    monkeypatch.setattr(mlflow_run, "git_commit", lambda: "c0ffee-dirty")
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for number in range(8):
-        (folder / f"{number}.bin").write_bytes(os.urandom(1000))
-    started = time.perf_counter()
-    logged = tracker(uri, 2000)
-    assert time.perf_counter() - started < 3.0, "rows are never waited for; one by one they would take ten"
-    logged.log_row(1999, row(1999) | {"held_out/success_rate": 0.95, "held_out/nothing": float("nan")})
-    logged.log_files(folder.iterdir())
-    run_id = logged.wait_ready()
-    assert logged.close("FINISHED") is None
-    assert logged.close("FAILED") is None
+def test_a_run_read_back(uri, tmp_path, monkeypatch, impatient):
+    monkeypatch.setattr(logged, "git_commit", lambda: "c0ffee-dirty")
+    monkeypatch.setenv("MLFLOW_RUN_CONTEXT", '{"mlflow.parentRunId": "of a comparison"}')
+    folder = write_run(tmp_path / "a run", 3)
+    run = tracking(folder, uri)
+    run_id = run.wait_id(30)
+    assert client(uri).get_run(run_id).info.status == "RUNNING"
+    write_run(folder, 2000)
+    wait_until(lambda: run.sent["row"] == 2000)
+    (folder / "notes.txt").write_text("of the user's own")
+    write_run(folder, 2000, success_rate=0.95)
+    assert run.close("FINISHED") is None
+    assert (run.run_id, run.error) == (run_id, None)
 
     assert steps(uri, run_id) == list(range(2000))
-    run = client(uri).get_run(run_id)
-    assert run.info.status == "FINISHED"
-    assert run.info.run_name == "a run"
-    assert run.data.params == PARAMS
+    found = client(uri).get_run(run_id)
+    assert found.info.status == "FINISHED"
+    assert found.info.run_name == "a run"
+    assert found.data.params["population"] == "256"
     commit = {"git_commit": "c0ffee-dirty", "mlflow.source.git.commit": "c0ffee"}  # MLflow's own tag links to it
-    assert run.data.tags.items() >= {**TAGS, **commit}.items()
-    assert {"mlflow.user", "mlflow.source.name", "mlflow.source.type"} <= run.data.tags.keys()
-    assert not [name for name in run.data.tags if name.startswith("resumed/")]
-    assert client(uri).get_metric_history(run_id, "held_out/success_rate")[0].step == 1999
-    assert client(uri).get_experiment(run.info.experiment_id).name == "driving"
+    tags = {"algorithm": "evolution", "scenario": "curved", "mlflow.parentRunId": "of a comparison", **commit}
+    assert found.data.tags.items() >= tags.items()
+    assert {"mlflow.user", "mlflow.source.name", "mlflow.source.type"} <= found.data.tags.keys()
+    assert not [name for name in found.data.tags if name.startswith("resumed/")]
+    assert found.data.metrics["held_out/success_rate"] == 0.95
+    assert "target_m" not in found.data.metrics
+    # The last candidate is validated after the last step.
+    assert [each.step for each in client(uri).get_metric_history(run_id, "validation/success_rate")] == [2000]
+    first, last = (each.timestamp for each in client(uri).get_metric_history(run_id, "wall_s")[::1999])
+    assert last - first == 1000.0 * (row(1999)["wall_s"] - row(0)["wall_s"])
+    assert found.info.end_time - found.info.start_time == 20_000_000  # summary.json's wall_s in ms
 
-    artifacts = tmp_path / "store" / "mlartifacts" / run_id / "artifacts"
-    assert run.info.artifact_uri == artifacts.as_uri()
-    assert {each.path for each in client(uri).list_artifacts(run_id)} == {f"{number}.bin" for number in range(8)}
-    assert (artifacts / "3.bin").read_bytes() == (folder / "3.bin").read_bytes()
+    artifacts = tmp_path / "store/mlartifacts" / run_id / "artifacts"
+    assert found.info.artifact_uri == artifacts.as_uri()
+    stored = {each.path for each in client(uri).list_artifacts(run_id) if not each.is_dir}
+    own = {"mlflow.json", "notes.txt"}
+    assert stored == {path.name for path in folder.iterdir()} - own
+    assert (artifacts / "curves.png").read_bytes() == b"png"
+    assert send(folder, uri) == ("", run_id)
+    assert sorted(os.listdir(tmp_path)) == ["a run", "store"]
 
 
-def test_a_lost_answer_does_not_double_a_row(uri, impatient, monkeypatch):
+def test_lost_answers_double_nothing(uri, tmp_path, impatient, monkeypatch):
     from mlflow.tracking import MlflowClient
 
-    real = MlflowClient.log_batch
-    lost: list[int] = []
+    lost = set()
 
-    def log_batch(self, run_id, metrics=(), **more):
-        real(self, run_id, metrics=metrics, **more)
-        if metrics and len(lost) < 3:
-            lost.append(len(metrics))
-            raise ConnectionError("the answer never came")
+    def losing(name):
+        real = getattr(MlflowClient, name)
 
-    monkeypatch.setattr(MlflowClient, "log_batch", log_batch)
-    logged = tracker(uri, 5)
-    while len(lost) < 3:
-        time.sleep(0.05)
-    assert logged.close("FINISHED") is None
-    assert steps(uri, logged.run_id) == list(range(5))
+        def call(*arguments, **options):
+            answer = real(*arguments, **options)
+            if name not in lost:
+                lost.add(name)
+                raise ConnectionError("the answer never came")
+            return answer
 
+        monkeypatch.setattr(MlflowClient, name, call)
 
-def test_a_run_without_a_row_is_never_created(tmp_path):
-    assert tracker(check_uri(f"sqlite:///{tmp_path}/mlflow.db")).close("KILLED") is None
-    assert not os.listdir(tmp_path)
-
-
-def test_resume_logs_only_what_is_missing(uri, tmp_path, monkeypatch):
-    begun = tracker(uri, 9)
-    begun.log_row(9, {"car_steps": row(9)["car_steps"]})
-    assert begun.close("KILLED") is None
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    resumed = tracker(uri, 15, experiment="other", run_id=begun.run_id)
-    resumed.wait_ready()
-    assert client(uri).get_run(begun.run_id).info.status == "RUNNING"
-    assert resumed.close("FINISHED") is None
-    assert resumed.sent["row"] == 6
-    assert resumed.run_id == begun.run_id
-    assert steps(uri, begun.run_id) == list(range(15))
-    assert client(uri).get_run(begun.run_id).info.status == "FINISHED"
-    assert len([run for run in runs(uri) if run.info.run_name == "a run"]) == 1
-    assert not os.listdir(tmp_path / "elsewhere")
+    names = {"create_run", "log_batch", "log_artifact", "create_model_version", "set_terminated"}
+    for name in names:
+        losing(name)
+    run = tracking(write_run(tmp_path / "a", 5, success_rate=0.5), uri)
+    wait_until(lambda: lost == names - {"set_terminated"} and run.error is None, 60)
+    assert run.close("FINISHED") is None
+    assert lost == names
+    assert steps(uri, run.run_id) == list(range(5))
+    assert [each.info.run_id for each in runs(uri)] == [run.run_id]
+    assert len(client(uri).search_model_versions()) == 1
+    assert client(uri).get_model_version_by_alias(MODEL, "best").run_id == run.run_id
 
 
-def test_resume_notes_what_is_different(uri):
-    run_id = begin(uri, 2)
-    for generations in ("90", "120"):
-        begin(uri, 2, params={**PARAMS, "generations": generations, "new": "1"})
-    data = client(uri).get_run(run_id).data
-    assert data.params == {**PARAMS, "new": "1"}
-    resumed = {name: tag for name, tag in data.tags.items() if name.startswith("resumed/")}
-    assert resumed == {"resumed/generations": "120"}
+def test_a_run_that_is_killed_at_any_moment_is_found_again(uri, tmp_path, monkeypatch):
+    from mlflow.tracking import MlflowClient
+
+    folder = write_run(tmp_path / "a", 2)
+    with monkeypatch.context() as patch:
+        real = MlflowClient.create_run
+
+        def create_run(*arguments):
+            real(*arguments)
+            raise SystemExit  # before its id is saved
+
+        patch.setattr(MlflowClient, "create_run", create_run)
+        patch.setattr(sync.threading, "excepthook", lambda _: None)
+        tracking(folder, uri)._thread.join()
+    link = json.loads((folder / "mlflow.json").read_text())
+    assert link["run_id"] == ""
+    (found,) = runs(uri)
+    shutil.copytree(folder, tmp_path / "copy")
+    shutil.rmtree(folder)
+    run = tracking(tmp_path / "copy", uri)
+    assert run.close("KILLED") is None
+    assert run.run_id == found.info.run_id
+    assert json.loads((tmp_path / "copy/mlflow.json").read_text()) == link | {"run_id": run.run_id}
+    assert client(uri).get_run(run.run_id).info.status == "KILLED"
+
+
+def test_resume_logs_what_is_missing_and_notes_what_is_different(uri, tmp_path):
+    folder = write_run(tmp_path / "a", 9)
+    first = tracking(folder, uri)
+    assert first.close("KILLED") is None
+    for generations in (90, 120):
+        resumed = tracking(write_run(folder, 15, generations=generations), uri, experiment="other")
+        assert resumed.wait_id(30) == first.run_id
+        assert client(uri).get_run(first.run_id).info.status == "RUNNING"
+        assert resumed.close("FINISHED") is None
+        assert resumed.sent["row"] == (6 if generations == 90 else 0)
+    data = client(uri).get_run(first.run_id).data
+    assert data.params["generations"] == "0"
+    resumed_tags = {name: tag for name, tag in data.tags.items() if name.startswith("resumed/")}
+    assert resumed_tags == {"resumed/generations": "120", "resumed/car_steps": "0"}
+    assert steps(uri, first.run_id) == list(range(15))
+    assert len(runs(uri)) == 1
+
+
+def test_files_of_an_extended_run_are_sent_again_though_they_have_the_same_size(uri, tmp_path):
+    folder = write_run(tmp_path / "a", 2, success_rate=0.5, seed=1)
+    _, run_id = send(folder, uri)
+    longer = tracking(write_run(folder, 2, seed=2), uri)
+    assert longer.wait_id(30) == run_id
+    write_run(folder, 2, success_rate=0.5, seed=2)
+    assert longer.close("FINISHED") is None
+    assert longer.sent["file"] == 6
+    stored = tmp_path / "store/mlartifacts" / run_id / "artifacts/champion.npz"
+    assert stored.read_bytes() == (folder / "champion.npz").read_bytes()
+
+
+def test_what_mlflow_has_of_a_finished_run_stays_as_it_is(uri, tmp_path):
+    folder = write_run(tmp_path / "a", 2, success_rate=0.5)
+    sent, run_id = send(folder, uri)
+    assert sent == "3 rows, 6 files, 1 model"
+    ended = client(uri).get_run(run_id).info.end_time
+    client(uri).set_tag(run_id, "mlflow.note.content", "my own words")
+    (folder / "trajectory.png").write_bytes(b"a picture that was missing")
+    assert send(folder, uri) == ("1 file", run_id)
+    run = client(uri).get_run(run_id)
+    assert run.data.tags["mlflow.note.content"] == "my own words"
+    assert (run.info.end_time, run.info.status) == (ended, "FINISHED")
 
 
 def test_a_run_that_mlflow_does_not_know_gets_every_row(uri, tmp_path):
-    """It was thrown away; and in another store."""
-    run_id = begin(uri, 4)
+    """It was thrown away; it is in another store; mlflow.json is lost, or damaged."""
+    folder = write_run(tmp_path / "a", 4, success_rate=0.5)
+    _, run_id = send(folder, uri)
     client(uri).delete_run(run_id)
-    for there in (uri, check_uri(f"sqlite:///{tmp_path}/mlflow.db")):
-        again = begin(there, 6)
+    other = check_uri(f"sqlite:///{tmp_path}/mlflow.db")
+    for there in (uri, other):
+        _, again = send(folder, there, "")
         assert again != run_id
-        assert steps(there, again) == list(range(6))
+        assert steps(there, again) == list(range(4))
+        assert saved_uri(folder) == there
+    for text in ("", "{}", '{"uri": 1}', "[]"):
+        (folder / "mlflow.json").write_text(text)
+        assert send(folder, other)[0] == "5 rows, 6 files, 1 model"
 
 
-QUIET = """
-import sys, time
-from cluster.tracking.address import check_uri
-from tracked import tracker
-assert not [name for name in ("mlflow", "sqlalchemy", "requests") if name in sys.modules]
-started = time.perf_counter()
-logged = tracker(check_uri(sys.argv[1]), 20, key=str(started))
-assert time.perf_counter() - started < 0.3
-report = logged.close("FINISHED", 300)
-assert (report is None) == (len(sys.argv) > 2), report
-"""
+def test_a_run_is_looked_for_by_its_id_then_in_its_experiment_alone(uri, tmp_path, monkeypatch):
+    from mlflow.tracking import MlflowClient
+
+    folder, asked = write_run(tmp_path / "a", 2, success_rate=0.5), []
+    _, run_id = send(folder, uri, "mine")
+    real = MlflowClient.search_runs
+    monkeypatch.setattr(MlflowClient, "search_runs", lambda self, *a, **k: asked.append(a[0]) or real(self, *a, **k))
+    monkeypatch.setattr(MlflowClient, "search_experiments", lambda *_, **__: pytest.fail("scans all experiments"))
+    assert send(folder, uri, "other") == ("", run_id)
+    assert asked == []
+    link = json.loads((folder / "mlflow.json").read_text())
+    for wrong in ("", "0" * 32):
+        (folder / "mlflow.json").write_text(json.dumps(link | {"run_id": wrong}))
+        assert send(folder, uri, "") == ("", run_id)  # in the experiment that the file names
+    assert [len(each) for each in asked] == [1, 1]
 
 
-def test_two_at_once_create_one_database_and_print_nothing(tmp_path):
-    command = ["python", "-W", "default", "-c", QUIET, f"sqlite:///{tmp_path}/mlflow.db", "good"]
-    for process in [start(*command, cwd="/", PYTHONPATH=PYTHONPATH) for _ in range(2)]:
+def test_a_line_that_is_being_written_waits(uri, tmp_path):
+    folder = write_run(tmp_path / "a", 3)
+    with (folder / "history.csv").open("a") as file:
+        file.write("3,30.0,31")
+    run = tracking(folder, uri)
+    assert run.close("KILLED") is None
+    assert steps(uri, run.run_id) == [0, 1, 2]
+
+
+def test_before_its_first_row_a_run_leaves_nothing(tmp_path):
+    folder = write_run(tmp_path / "a", 0)
+    before = sorted(os.listdir(folder))
+    run = tracking(folder, check_uri(f"sqlite:///{tmp_path}/mlflow.db"))
+    started = time.perf_counter()
+    assert run.close("KILLED") is None
+    assert time.perf_counter() - started < 1.0, "it waits for MLflow's import"
+    assert Tracking(folder, "never started", "", read_run).close("FINISHED") is None
+    assert sorted(os.listdir(folder)) == before
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_any_content_can_be_tracked(uri, tmp_path):
+    """As a comparison's, which is the parent of its runs, and has no rows at first."""
+    content = Content("many runs", {"runs": "2"}, {"kind": "comparison"}, "what it is")
+    parent = tracking(tmp_path, uri, read=lambda _: content)
+    assert parent.wait_id(30)
+    assert parent.close("FINISHED") is None
+    run = client(uri).get_run(parent.run_id)
+    assert (run.info.run_name, run.info.status, run.data.tags["kind"]) == ("many runs", "FINISHED", "comparison")
+
+
+def test_two_at_once_create_one_database_print_nothing_and_import_no_torch(tmp_path):
+    command = ["python", "-W", "default", "-c", QUIET, f"sqlite:///{tmp_path}/mlflow.db"]
+    started = [start(*command, tmp_path / "runs" / name, "good", cwd="/", PYTHONPATH=PYTHONPATH) for name in "ab"]
+    for process in started:
         output = "".join(process.communicate(timeout=600))
         # -W default shows what a user never sees; of that nothing may be ours.
         assert process.returncode == 0, output
         assert "cluster" not in output
     uri = check_uri(f"sqlite:///{tmp_path}/mlflow.db")
     assert [steps(uri, run.info.run_id) for run in runs(uri)] == [list(range(20))] * 2
-    assert os.listdir(tmp_path) == ["mlflow.db"]
-
-
-def test_a_database_that_is_no_longer_mlflows_prints_nothing(tmp_path, empty_database):
-    foreign, broken = tmp_path / "foreign.db", shutil.copy(empty_database, tmp_path / "broken.db")
-    with contextlib.closing(sqlite3.connect(foreign)) as database:
-        database.execute("CREATE TABLE alembic_version (version_num VARCHAR(32))")
-        database.execute("INSERT INTO alembic_version VALUES ('unheard of')")
-        database.commit()
-    with contextlib.closing(sqlite3.connect(broken)) as database:
-        database.execute("ALTER TABLE metrics RENAME COLUMN is_nan TO is_gone")  # MLflow logs a traceback
-    with pytest.raises(TrackingError, match="or of another program; use another --tracking-uri"):
-        check_uri(f"sqlite:///{foreign}")
-    with contextlib.closing(sqlite3.connect(foreign)) as database:  # and nothing was made in it
-        assert database.execute("SELECT name FROM sqlite_master").fetchall() == [("alembic_version",)]
-    done = finish("python", "-c", QUIET, f"sqlite:///{broken}", cwd="/", timeout=600, PYTHONPATH=PYTHONPATH)
-    assert (done.stdout, done.stderr) == ("", "")
+    assert sorted(os.listdir(tmp_path)) == ["mlartifacts", "mlflow.db", "runs"]
 
 
 def test_git_commit(tmp_path):
@@ -183,3 +265,8 @@ def test_git_commit(tmp_path):
     assert told(PATH="/nowhere") == told("repository/.venv/site-packages") == "unknown"
     (tmp_path / "repository/cluster/__init__.py").write_text("changed = True\n")
     assert told() == f"{commit}-dirty"
+
+
+def test_rows_are_named_as_in_the_history(tmp_path):
+    content = read_run(write_run(tmp_path / "a", 2))
+    assert content.rows == [(step, {name: row(step)[name] for name in NAMES}, row(step)["wall_s"]) for step in (0, 1)]

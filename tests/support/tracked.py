@@ -30,6 +30,21 @@ MODEL = "gridsim-curved-evolution"
 # With it scripts find the packages and this file, whatever the working directory.
 PYTHONPATH = os.pathsep.join([str(Path(sync.__file__).resolve().parents[2]), str(Path(__file__).parent)])
 
+# A process that tracks a run: arguments are the address, the folder, and one more if all of it has to arrive.
+QUIET = """
+import sys, time
+from pathlib import Path
+from cluster.tracking.address import check_uri
+from tracked import tracking, write_run
+assert not [name for name in ("mlflow", "sqlalchemy", "requests") if name in sys.modules]
+started = time.perf_counter()
+run = tracking(write_run(Path(sys.argv[2]), 20, 0.5), check_uri(sys.argv[1]))
+assert time.perf_counter() - started < 0.5
+report = run.close("FINISHED")
+assert (report is None) == (len(sys.argv) > 3), report
+assert not [name for name in ("torch", "onnxruntime", "matplotlib") if name in sys.modules]
+"""
+
 
 def row(step):
     return {name: step * 10.0 + place for place, name in enumerate(NAMES)}
