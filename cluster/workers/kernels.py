@@ -1,28 +1,25 @@
-"""Compiling the kernels before they are needed: once for all processes, and on more than one core.
+"""Compiling the kernels that a run needs, before it needs them: once for all processes, and on more than one core.
 
-Numba compiles one function at a time in a process. So separate processes compile what a run needs, and all others then
-load it from the cache on disk (`gridsim.jit`).
-
-Run as `python -m cluster.workers.kernels kernels|roads SCENARIO POLICY TRAFFIC COMMAND`, it is such a process: it
-prints a line when what a run needs first is compiled, and goes on with what is needed at the run's end. `python -m
-cluster.workers.kernels everything` compiles what the learners need by default on all roads, for an image that is to be
-started often.
+Numba compiles one function at a time in a process. So separate processes compile what is missing in the cache on disk
+(`gridsim.jit`), from which all others then load it: `python -m cluster.workers.kernels PART SCENARIO POLICY TRAFFIC
+COMMAND`, with a part of `PARTS`. `python -m cluster.workers.kernels everything` compiles what the learners need by
+default on all roads, for an image that is to be started often.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
-import subprocess
 import sys
-import threading
+import time
 from pathlib import Path
 from typing import get_args
 
 import llvmlite.binding
 import numpy as np
 
+from cluster import stopping
 from cluster.settings import DqnSettings, EvolveSettings, RunSettings
+from cluster.workers.child import Child
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.episodes.rollout import EPISODE, trajectory
 from evolution.networks.policy import Observation, PolicySpec
@@ -36,43 +33,7 @@ from gridsim.maps.roads import clearances, freeze
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.traffic.world import spawn
 
-
-class Warming:
-    """Processes that compile what a run needs, if it is not in the cache."""
-
-    def __init__(self, settings: RunSettings):
-        self._done = _marker(settings)
-        self._what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
-        self.processes: list[subprocess.Popen[bytes]] = []
-
-    def start(self) -> None:
-        """Start the processes. Whether or not all of them could be started, `stop` ends them."""
-        for part in () if self._done.exists() else ("kernels", "roads"):
-            process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "cluster.workers.kernels", part, *self._what],  # -P: not from this folder
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C does not reach it: `stop` ends it
-            )
-            self.processes.append(process)
-
-    def wait(self) -> None:
-        """Wait for what the run needs first. If a process fails, this one compiles its part when it is needed."""
-        if all(process.stdout is not None and process.stdout.readline() for process in self.processes):
-            with contextlib.suppress(OSError):  # a full disk: the next run starts these processes again
-                self._done.touch()
-
-    def reap(self) -> None:
-        """Have threads wait for the processes, which would else stay as zombies until the run ends."""
-        for process in self.processes:
-            threading.Thread(target=process.wait, name="reaper", daemon=True).start()
-
-    def stop(self) -> None:
-        """End what still runs."""
-        for process in self.processes:
-            process.kill()
-            process.communicate()
+LOOK_S = 0.1
 
 
 def _marker(settings: RunSettings) -> Path:
@@ -83,6 +44,31 @@ def _marker(settings: RunSettings) -> Path:
     # The cache may come from another machine (an image, a shared home): Numba compiles anew for another CPU.
     cpu = CONFIG.CPU_NAME or llvmlite.binding.get_host_cpu_name()
     return CACHE_FOLDER / f"ready-{road}-{kind}-{traffic}-{settings.command}-{cpu}"
+
+
+def is_compiled(settings: RunSettings) -> bool:
+    """Whether the cache has all kernels that a run needs; else `compile_ahead` takes half a minute."""
+    return _marker(settings).exists()
+
+
+def compile_ahead(settings: RunSettings) -> None:
+    """Have the kernels that a run needs compiled. If that fails, they are compiled when they are needed."""
+    if is_compiled(settings):
+        return
+    what = [settings.scenario, settings.policy, str(settings.traffic), settings.command]
+    compilers = list[Child]()
+    try:
+        for part in PARTS:  # -P: not from this folder
+            compilers.append(Child([sys.executable, "-P", "-m", "cluster.workers.kernels", part, *what]))
+        while any(compiler.exit_code() is None for compiler in compilers):
+            stopping.check()
+            time.sleep(LOOK_S)
+        if all(compiler.exit_code() == 0 for compiler in compilers):
+            with contextlib.suppress(OSError):  # a full disk: the next run starts these processes again
+                _marker(settings).touch()
+    finally:
+        for compiler in compilers:
+            compiler.close(0.0)
 
 
 def _smallest(policy: str, traffic: int) -> tuple[SimConfig, Map, np.ndarray, np.ndarray, np.ndarray]:
@@ -107,6 +93,13 @@ def compile_kernels(policy: str, traffic: int, command: str) -> None:
         Worker().answer(collecting, [road], made, 0, 1)
 
 
+def compile_roads(scenario: str, traffic: int) -> None:
+    """Compile, or load from the cache, what builds a scenario's maps."""
+    road = build(scenario, 0)
+    starts = sample_starts(road, 1, np.random.default_rng(0))
+    spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig())
+
+
 def compile_drive(policy: str, traffic: int) -> None:
     """Compile, or load from the cache, what records and draws a drive."""
     config, road, genome, episodes, worlds = _smallest(policy, traffic)
@@ -116,11 +109,13 @@ def compile_drive(policy: str, traffic: int) -> None:
     clearances(road.road, freeze(cars[:, :2]))
 
 
-def compile_roads(scenario: str, traffic: int) -> None:
-    """Compile, or load from the cache, what builds a scenario's maps."""
-    road = build(scenario, 0)
-    starts = sample_starts(road, 1, np.random.default_rng(0))
-    spawn(road.network, starts, traffic, np.zeros(1, dtype=np.uint64), SimConfig())
+PARTS = {
+    "kernels": lambda scenario, policy, traffic, command: compile_kernels(policy, traffic, command),
+    "roads": lambda scenario, policy, traffic, command: (
+        compile_roads(scenario, traffic),
+        compile_drive(policy, traffic),
+    ),
+}
 
 
 def everything_by_default() -> list[RunSettings]:
@@ -135,23 +130,15 @@ def everything_by_default() -> list[RunSettings]:
 
 
 def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", command: str = "") -> None:
-    """Compile one part, in a process of its own."""
-    traffic = int(cars)
-    if part == "everything":
-        for settings in everything_by_default():
-            compile_kernels(settings.policy, settings.traffic, settings.command)
-            compile_roads(settings.scenario, settings.traffic)
-            compile_drive(settings.policy, settings.traffic)
-            _marker(settings).touch()
-            print(_marker(settings).name, flush=True)
-    elif part == "kernels":
-        compile_kernels(policy, traffic, command)
-        print("ready", flush=True)
-    else:
-        compile_roads(scenario, traffic)
-        print("ready", flush=True)
-        os.nice(10)
-        compile_drive(policy, traffic)
+    """Compile one part, or everything, in this process."""
+    if part != "everything":
+        PARTS[part](scenario, policy, int(cars), command)
+        return
+    for settings in everything_by_default():
+        for compile_part in PARTS.values():
+            compile_part(settings.scenario, settings.policy, settings.traffic, settings.command)
+        _marker(settings).touch()
+        print(_marker(settings).name, flush=True)
 
 
 if __name__ == "__main__":

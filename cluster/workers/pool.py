@@ -1,4 +1,4 @@
-"""Pools of workers: what the learners call, how work is cut into chunks, and the pool within this process."""
+"""Pools of workers: what the learners call, how their work is cut into pieces, and how a pool is opened."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from itertools import pairwise
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from cluster.workers.worker import AnyTask, CollectTask, Task, Worker
+from cluster import stopping
+from cluster.workers.worker import AnyTask, CollectTask, Task
 from evolution.dqn.experience import Experience, join
 from evolution.episodes.rollout import RESULT
 from evolution.search.breeding import RECIPE, Kind
@@ -19,16 +21,8 @@ from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 
 BuildMap = Callable[[str, int], Map]  # (scenario, seed) -> map; remembers the latest
-Progress = Callable[[int, int], None]  # (members done, members in all), or episodes where experience is collected
-Meanwhile = Callable[[], bool | None]  # called while workers are busy, again and again until it returns a false value
 
-SERIAL_PARTS = 4  # in this process a task is cut as for so many workers, only to show progress
-METRE_S = 3e-5  # assumed seconds for a metre of an episode, until they are measured; small networks take a thirtieth
-WORTH_SENDING_S = 0.005  # of evaluation: several times what it costs to send a parcel and to receive its results
-PARCEL_S = 0.0004  # of the coordinator's time, for a parcel and its results: many workers get larger parcels
-LARGEST_S = 0.5  # of evaluation in one parcel, so that progress is seen and little is lost with a worker
-LARGER = 4  # times what is worth sending is the largest parcel, if that is more
-SHARE = 0.9  # of a worker's share of the rest, in one parcel
+LOOK_S = 0.1  # between two looks at whether the run is to be stopped
 
 
 class PoolError(GridSimError):
@@ -42,63 +36,50 @@ class Chunk(NamedTuple):
     columns: slice
 
 
-Parcel = tuple[Chunk, ...]
-"""The chunks that are sent to a worker at once."""
-
-
 def size(chunk: Chunk) -> int:
     """How many episodes the members of a chunk drive, in all."""
     return (chunk.rows.stop - chunk.rows.start) * (chunk.columns.stop - chunk.columns.start)
 
 
 class Call(ABC):
-    """One call of a pool: what is asked for, as in `WorkerPool.evaluate`, what it returned, and what it took."""
+    """What is asked of a pool; after that, what came back, and what it took."""
 
     noun: ClassVar[str]  # what its rows are
 
     def __init__(self, task: AnyTask, recipes: np.ndarray, asked: Sequence[Chunk], rows: int, columns: int):
         self.task, self.recipes, self.asked = task, recipes, asked
-        self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for and where it was lost
-        self.lost = np.zeros(rows, bool)  # those that killed every worker that tried them
-        self.wall_s = 0.0  # from call to return
+        self.results = np.zeros((rows, columns), RESULT)  # zero where nothing was asked for
+        self.warnings: list[str] = []  # a line for each silent worker that was replaced, and for memory that is full
+        self.total, self.done = sum(map(size, asked)), 0  # episodes to be driven, and those that are
+        self.started = time.perf_counter()
+        self.wall_s = 0.0  # from the start until the last result was taken in
         self.busy_s: dict[int, float] = {}  # seconds of work, by the worker's number, which a replacement keeps
-        self.episode_s = np.zeros(columns)  # seconds of these that each column took, for all rows together
-        self.retries = 0  # parcels that were sent again because their worker died or failed
-        self.bytes_down = self.bytes_up = 0  # payload sent to workers, recipes mostly, and back
-        self.broadcast_bytes = 0  # put into the object store: the task and the maps that were new to it
-        self.warnings: list[str] = []  # a line for each row that was lost, and for each silent worker that was replaced
-        self.total, self.done = sum(map(size, asked)), 0  # episodes to be driven, and those that are, or are lost
-
-    def work(self, chunk: Chunk) -> tuple[np.ndarray, int, int]:
-        """Arguments of `Worker.answer` for a chunk: its recipes, its first episode and the one after its last."""
-        episodes = chunk.rows if isinstance(self.task, CollectTask) else chunk.columns
-        return self.recipes[chunk.rows], episodes.start, episodes.stop
-
-    @abstractmethod
-    def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
-        """Take in what `Worker.answer` returned for a chunk."""
-
-    def _count(self, worker: int, chunk: Chunk, results: np.ndarray, seconds: float) -> None:
-        self.results[chunk.rows, chunk.columns] = results
-        self.done += size(chunk)
-        self.episode_s[chunk.columns] += seconds / (chunk.columns.stop - chunk.columns.start)
-        self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
-
-    def lose(self, chunk: Chunk) -> None:
-        """Do without a chunk's rows: results that they already have do not count either."""
-        self.lost[chunk.rows] = True
-        self.results[chunk.rows] = np.zeros((), self.results.dtype)
-        self.done += size(chunk)
+        self.retries = 0  # pieces that were sent again because their worker died
+        self.bytes_down = self.bytes_up = 0  # sent to workers, recipes mostly, and back; none by threads
+        self.broadcast_bytes = 0  # put into Ray's object store: the task and the maps that were new to it
 
     def progress(self) -> tuple[int, int]:
-        """Arguments of `Progress`; a member that is done in part counts in part."""
+        """Members (or episodes of experience) that are done, partly evaluated ones in part, and how many there are."""
         rows = len(self.results)
         return (rows * self.done // self.total if self.total else 0), rows
 
-    def failure(self, index: int, parcel: Parcel, error: BaseException) -> PoolError:
-        """What to raise where a worker raised an error on a parcel."""
-        spans = ", ".join(f"{chunk.rows.start} to {chunk.rows.stop - 1}" for chunk in parcel)
-        return PoolError(f"a worker failed on parcel {index} ({self.noun} {spans}): {last_line(error)}")
+    def work(self, piece: Chunk) -> tuple[np.ndarray, int, int]:
+        """Arguments of `Worker.answer` for a piece: its recipes, its first episode and the one after its last."""
+        episodes = piece.rows if isinstance(self.task, CollectTask) else piece.columns
+        return self.recipes[piece.rows], episodes.start, episodes.stop
+
+    @abstractmethod
+    def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
+        """Take in what `Worker.answer` returned for a piece."""
+
+    def _count(self, worker: int, piece: Chunk, results: np.ndarray, seconds: float) -> None:
+        self.results[piece.rows, piece.columns] = results
+        self.done += size(piece)
+        self.busy_s[worker] = self.busy_s.get(worker, 0.0) + seconds
+
+    def rows_of(self, piece: Chunk) -> str:
+        """A piece in words."""
+        return f"{self.noun} {piece.rows.start} to {piece.rows.stop - 1}"
 
     @abstractmethod
     def identify(self, row: int) -> str:
@@ -106,21 +87,27 @@ class Call(ABC):
 
 
 class Outcome(Call):
-    """What `evaluate` returned: rows are members, in the order of the recipes, columns episodes."""
+    """A generation: rows are members, in the order of the recipes, columns the task's episodes.
+
+    Args:
+        recipes: RECIPE [n], of the members that are bred and driven.
+        asked: which members drive which episodes, the longest first; None is all members on all episodes.
+    """
 
     noun = "members"
     task: Task
 
-    def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk]):
-        super().__init__(task, recipes, asked, len(recipes), len(task.episodes))
-        self.rewound = np.zeros((len(task.episodes), 5), np.float32)  # states so many steps before the end as `rewind`
+    def __init__(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None):
+        n, e = len(recipes), len(task.episodes)
+        super().__init__(task, recipes, rectangle(n, e) if asked is None else asked, n, e)
+        self.rewound = np.zeros((e, 5), np.float32)  # states so many steps before the end as `rewind`
         self.worlds = np.zeros_like(task.worlds)  # the traffic at that time, float32 [episodes, cars, world.FIELDS]
 
-    def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
+    def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
         results, rewound, worlds, seconds = answer
         if rewound.size:  # only one member drives such an episode
-            self.rewound[chunk.columns], self.worlds[chunk.columns] = rewound[0], worlds[0]
-        self._count(worker, chunk, results, seconds)
+            self.rewound[piece.columns], self.worlds[piece.columns] = rewound[0], worlds[0]
+        self._count(worker, piece, results, seconds)
 
     def identify(self, row: int) -> str:
         recipe = self.recipes[row]
@@ -130,7 +117,7 @@ class Outcome(Call):
 
 
 class Collected(Call):
-    """What `collect` returned: rows are episodes, in one column."""
+    """A batch of experience: the task's policy drives its episodes. Rows are episodes, in one column."""
 
     noun = "episodes"
     task: CollectTask
@@ -142,16 +129,19 @@ class Collected(Call):
 
     @cached_property
     def experience(self) -> Experience:
-        """Of all episodes that are not lost, in their order."""
+        """All transitions, in the order of the episodes."""
         return join([self._parts.pop(first) for first in sorted(self._parts)])
 
-    def add(self, worker: int, chunk: Chunk, *answer: Any) -> None:
+    def add(self, worker: int, piece: Chunk, *answer: Any) -> None:
         experience, results, seconds = answer
-        self._parts[chunk.rows.start] = experience
-        self._count(worker, chunk, results[:, None], seconds)
+        self._parts[piece.rows.start] = experience
+        self._count(worker, piece, results[:, None], seconds)
 
     def identify(self, row: int) -> str:
         return f"episode {row} (key {self.task.keys[row]:#x}, exploration {self.task.epsilons[row]:.3g})"
+
+
+AnyCall = TypeVar("AnyCall", bound=Call)
 
 
 def rectangle(rows: int, columns: int) -> list[Chunk]:
@@ -160,90 +150,98 @@ def rectangle(rows: int, columns: int) -> list[Chunk]:
 
 
 class WorkerPool(ABC):
-    """Evaluates generations and collects experience. What it returns depends on the arguments, never on the workers.
+    """Evaluates generations and collects experience, one call at a time.
 
-    A call returns only when `meanwhile` is done to its end. What it raises ends the call.
-    Raises: PoolError if what is asked for cannot be done.
+    A call is started and waited for; its owner may do other work between two waits, for some tens of milliseconds. What
+    a call returns depends on its arguments alone, never on the workers. A call that is started while another one is
+    under way takes its place.
+    Raises: PoolError if what is asked for cannot be done; the pool can be used again.
     """
 
-    def evaluate(
-        self,
-        task: Task,
-        recipes: np.ndarray,
-        on_progress: Progress | None = None,
-        asked: Sequence[Chunk] | None = None,
-        meanwhile: Meanwhile | None = None,
-    ) -> Outcome:
-        """Breed recipes RECIPE [n] and drive them through the task's episodes.
+    workers: int  # how many Ray workers were asked for; 0 for threads of this process
+    _call: Call | None = None  # the latest one, unless it failed; others are left undone
 
-        Args:
-            asked: which members drive which episodes, the longest first; None is all members on all episodes.
-            meanwhile: what to do here while workers are busy.
-        """
-        outcome = Outcome(task, recipes, rectangle(len(recipes), len(task.episodes)) if asked is None else asked)
-        self._work(outcome, on_progress, meanwhile)
-        return outcome
+    def start(self, call: AnyCall) -> AnyCall:
+        """Have a call done. Returns it at once."""
+        call.started, self._call = time.perf_counter(), call
+        self._start(call)
+        return call
 
-    def collect(
-        self, task: CollectTask, on_progress: Progress | None = None, meanwhile: Meanwhile | None = None
-    ) -> Collected:
-        """Drive the task's policy through its episodes and return all transitions."""
-        collected = Collected(task)
-        self._work(collected, on_progress, meanwhile)
-        return collected
+    def wait(self, call: Call, timeout_s: float) -> bool:
+        """Wait until something comes in, at most `timeout_s`. Returns whether anything is left to be done."""
+        ends = time.monotonic() + timeout_s
+        while call.done < call.total:
+            stopping.check()
+            if call is not self._call:
+                raise PoolError("another call has taken this one's place, or the pool of workers is closed")
+            left_s = ends - time.monotonic()
+            try:
+                came = self._take_in(call, max(min(left_s, LOOK_S), 0.0))
+            except Exception:
+                self._call = None
+                raise
+            call.wall_s = time.perf_counter() - call.started
+            if came or left_s <= 0.0:
+                break
+        return call.done < call.total
 
-    def expect(self, maps: Sequence[tuple[str, int]]) -> None:  # noqa: B027 - there may be nothing to do
-        """Prepare for maps (scenario, seed) that the next calls may need; to be called while the workers are busy."""
+    def run(self, call: AnyCall) -> AnyCall:
+        """Start a call and wait for all of it."""
+        self.start(call)
+        while self.wait(call, 1.0):
+            pass
+        return call
+
+    def evaluate(self, task: Task, recipes: np.ndarray, asked: Sequence[Chunk] | None = None) -> Outcome:
+        """Run an `Outcome`."""
+        return self.run(Outcome(task, recipes, asked))
+
+    def collect(self, task: CollectTask) -> Collected:
+        """Run a `Collected`."""
+        return self.run(Collected(task))
 
     @abstractmethod
-    def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
-        """Have all that is asked for done, and fill `call`."""
+    def _start(self, call: Call) -> None:
+        """Have a call done in place of the one before."""
 
-    def close(self) -> None:  # noqa: B027 - there may be nothing to do
+    @abstractmethod
+    def _take_in(self, call: Call, timeout_s: float) -> bool:
+        """Take in what has come; if there is nothing, wait for it, at most `timeout_s`. Returns whether any came."""
+
+    @abstractmethod
+    def close(self) -> None:
         """Stop all that the pool started. May be called again, and at any moment."""
 
 
-class SerialPool(WorkerPool):
-    """Starts no other process: the worker is in this one."""
+def open_pool(workers: int, address: str | None, patience_s: float, build_map: BuildMap) -> WorkerPool:
+    """Open a pool; returns when it can work. To be called before threads are started: it sets Ray's variables.
 
-    def __init__(self, build_map: BuildMap, worker_factory: Callable[[], Worker] = Worker):
-        self._build_map = build_map
-        self._worker = worker_factory()
+    Args:
+        workers: how many Ray workers. With 0 and without an address: threads of this process, on all its cores.
+        address: of an existing Ray cluster (`host:port` or `auto`), with 0 workers as many as it has CPUs free; None is
+            a Ray of our own.
+        patience_s: how long to do without any Ray worker, and to wait for a silent one; 0 for the default.
 
-    def _work(self, call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None) -> None:
-        started = time.perf_counter()
-        self.work_until(lambda: False, call, on_progress, meanwhile)
-        call.wall_s = time.perf_counter() - started
+    Raises: PoolError, in one line.
+    """
+    if workers == 0 and address is None:
+        from cluster.workers.threads import ThreadPool
 
-    def work_until(
-        self, stop: Callable[[], bool], call: Call, on_progress: Progress | None, meanwhile: Meanwhile | None
-    ) -> list[Chunk]:
-        """Do what a call asks for, until `stop` returns true before a parcel. Returns what is still to be done."""
-        maps = [self._build_map(*name) for name in call.task.maps]
-        finish(meanwhile)
-        parcels = cut(call.task, call.asked, SERIAL_PARTS)
-        for index, parcel in enumerate(parcels):
-            if stop():
-                return [chunk for parcel in parcels[index:] for chunk in parcel]
-            try:
-                for chunk in parcel:
-                    call.add(0, chunk, *self._worker.answer(call.task, maps, *call.work(chunk)))
-            except Exception as error:
-                raise call.failure(index, parcel, error) from error
-            if on_progress:
-                on_progress(*call.progress())
-        return []
+        return ThreadPool(build_map)
+    from cluster.workers.ray_pool import RayPool  # here, because it imports Ray
 
-
-def finish(meanwhile: Meanwhile | None) -> None:
-    """Call `meanwhile` until it is done."""
-    while meanwhile and meanwhile():
-        pass
+    pool = RayPool(workers, build_map, address, patience_s)
+    try:
+        pool.open()
+    except BaseException:
+        pool.close()
+        raise
+    return pool
 
 
 def _goals(task: AnyTask) -> np.ndarray:
-    """Target (m) of each column: float64 [columns]. All episodes of a batch of experience have the same."""
-    goals = task.episodes["target"].astype(np.float64)
+    """How far each episode may go (m), with a step for a metre: float64 [columns]. A batch of experience has one."""
+    goals = np.maximum(np.minimum(task.episodes["target"], task.episodes["steps"]), 1).astype(np.float64)
     return goals[:1] if isinstance(task, CollectTask) else goals
 
 
@@ -252,55 +250,34 @@ def metres(task: AnyTask, chunk: Chunk) -> float:
     return float(_goals(task)[chunk.columns].sum()) * (chunk.rows.stop - chunk.rows.start)
 
 
-def cut(
-    task: AnyTask, asked: Sequence[Chunk], workers: int, metre_s: Sequence[float] | None = None,
-    worth_s: float | None = None,
-) -> list[Parcel]:  # fmt: skip
-    """Cut what is asked for into parcels, by the seconds that it may take: large ones first, small ones last.
+def cut(task: AnyTask, asked: Sequence[Chunk], workers: int, least_m: float, most_m: float) -> list[Chunk]:
+    """Cut what is asked for into pieces, by the metres that it may take: large ones first, small ones last.
 
-    Each takes most of a worker's share of the rest, so that no worker waits long for the slowest, and little is sent
-    (guided self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or a part of one member's
-    episodes, so that even a single member is shared by all workers. The cut depends only on the arguments, and no
-    result depends on it.
+    Each takes half of a worker's share of the rest, so that no worker waits long for the slowest (guided
+    self-scheduling, Polychronopoulos and Kuck 1987). It holds whole members, or some episodes of one, so that even a
+    single member is shared by all workers. No result depends on the cut.
 
-    Args:
-        metre_s: seconds that a metre takes, for each of `asked`; None for METRE_S.
-        worth_s: the least seconds of evaluation in a parcel; None for what pays when the coordinator sends each.
+    Args: the least and the most metres of a piece. A metre takes a small network some microseconds at most.
     """
-    rates = [METRE_S] * len(asked) if metre_s is None else metre_s
-    parcels: list[Parcel] = []
-    left = sum(rate * metres(task, block) for rate, block in zip(rates, asked, strict=True))
-    if worth_s is None:
-        worth_s = max(WORTH_SENDING_S, PARCEL_S * workers)  # while one worker computes, all others get their parcels
-    least = min(worth_s, left / (2 * workers))  # every worker gets some, however little it costs
-    largest = max(LARGEST_S, LARGER * worth_s)
-    goals = _goals(task)
-    parcel: Parcel = ()  # not yet full
-    room = 0.0  # seconds left in it
-    for rate, (rows, columns) in zip(rates, asked, strict=True):
-        seconds = rate * np.concatenate([[0.0], np.cumsum(goals[columns])])  # of one member, up to each episode
-        row, column = rows.start, 0
-        while row < rows.stop and columns.stop > columns.start:
-            if not parcel:
-                room = min(max(SHARE * left / workers, least), largest)
-            if column == 0 and room >= seconds[-1]:
-                stop = min(row + max(int(room / seconds[-1]), 1), rows.stop)
-                parcel = (*parcel, Chunk(slice(row, stop), columns))
-                room -= (stop - row) * seconds[-1]
-                left -= (stop - row) * seconds[-1]
-                row = stop
-            elif parcel:
-                parcels.append(parcel)
-                parcel = ()
-            else:
-                rest = seconds[-1] - seconds[column]
-                piece = rest / math.ceil(rest / room)  # all as even as possible: a small one costs as much to send
-                stop = int(np.searchsorted(seconds, seconds[column] + piece * (1.0 + 1e-9), side="right")) - 1
-                stop = min(max(stop, column + 1), len(seconds) - 1)
-                parcels.append((Chunk(slice(row, row + 1), slice(columns.start + column, columns.start + stop)),))
-                left -= seconds[stop] - seconds[column]
-                row, column = (row + 1, 0) if stop == len(seconds) - 1 else (row, stop)
-    return [*parcels, parcel] if parcel else parcels
+    goals, pieces = _goals(task), list[Chunk]()
+    left = sum(metres(task, block) for block in asked)
+    least_m = min(least_m, left / (2 * workers))  # every worker gets some, however little there is
+    for rows, columns in asked:
+        ends = np.concatenate([[0.0], np.cumsum(goals[columns])])  # metres of one member, up to each episode
+        row = rows.start
+        while row < rows.stop and len(ends) > 1:
+            room = min(max(left / (2 * workers), least_m), most_m)
+            parts = math.ceil((rows.stop - row) * ends[-1] / room)
+            stop = row + max(int((rows.stop - row) / parts), 1)  # as even as possible
+            bounds = [0, len(ends) - 1]
+            if ends[-1] > room:
+                wanted = np.linspace(0.0, ends[-1], math.ceil(ends[-1] / room) + 1)[1:-1]
+                bounds = sorted({*bounds, *np.searchsorted(ends, wanted).tolist()})
+            at = columns.start
+            pieces += [Chunk(slice(row, stop), slice(at + first, at + last)) for first, last in pairwise(bounds)]
+            left -= (stop - row) * ends[-1]
+            row = stop
+    return pieces
 
 
 def last_line(error: BaseException) -> str:

@@ -1,0 +1,39 @@
+"""Processes that end when this one does, however it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+# This shell becomes the command. The one that it starts ends that when a pipe ends which only we hold open: if we close
+# it, and also if we are killed.
+_SHELL = 'exec 3<&0; (read _ <&3; kill -TERM $$) & exec "$@" 3<&- </dev/null'
+
+
+class Child:
+    """A command in a session of its own, so that Ctrl-C does not reach it. What it prints goes to a file, `log`."""
+
+    def __init__(self, command: Sequence[str], environment: dict[str, str] | None = None, log: Path | None = None):
+        with open(log or os.devnull, "wb") as output:
+            self._process = subprocess.Popen(
+                ["/bin/sh", "-c", _SHELL, "sh", *command], env=environment, start_new_session=True,
+                stdin=subprocess.PIPE, stdout=output, stderr=output,
+            )  # fmt: skip
+
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self._process.poll()
+
+    def close(self, patience_s: float) -> None:
+        """End it; after `patience_s` kill it, with all that is left in its session. May be called again."""
+        assert self._process.stdin
+        self._process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(patience_s)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
