@@ -47,7 +47,7 @@ from cluster.text import as_argument, count
 from cluster.tracking.address import check_uri
 from cluster.tracking.description import read_run
 from cluster.tracking.sync import saved_uri, sync
-from cluster.workers.ray_session import cluster_address
+from cluster.workers.address import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import is_map_file, label

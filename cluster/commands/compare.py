@@ -46,7 +46,7 @@ from cluster.store.folder import lock, new_folder
 from cluster.tracking.address import TrackingError, check_uri
 from cluster.tracking.mlflow_run import Identity, Status
 from cluster.tracking.tracker import Tracker
-from cluster.workers.ray_session import cluster_address
+from cluster.workers.address import cluster_address
 from gridsim.errors import GridSimError
 
 PROG = "gridsim-compare"

@@ -1,4 +1,4 @@
-"""Pools of workers: what the learners call, how their work is cut into pieces, and how a pool is opened."""
+"""Pools of workers: what the learners call, and how their work is cut into pieces."""
 
 from __future__ import annotations
 
@@ -211,32 +211,6 @@ class WorkerPool(ABC):
     @abstractmethod
     def close(self) -> None:
         """Stop all that the pool started. May be called again, and at any moment."""
-
-
-def open_pool(workers: int, address: str | None, patience_s: float, build_map: BuildMap) -> WorkerPool:
-    """Open a pool; returns when it can work. To be called before threads are started: it sets Ray's variables.
-
-    Args:
-        workers: how many Ray workers. With 0 and without an address: threads of this process, on all its cores.
-        address: of an existing Ray cluster (`host:port` or `auto`), with 0 workers as many as it has CPUs free; None is
-            a Ray of our own.
-        patience_s: how long to do without any Ray worker, and to wait for a silent one; 0 for the default.
-
-    Raises: PoolError, in one line.
-    """
-    if workers == 0 and address is None:
-        from cluster.workers.threads import ThreadPool
-
-        return ThreadPool(build_map)
-    from cluster.workers.ray_pool import RayPool  # here, because it imports Ray
-
-    pool = RayPool(workers, build_map, address, patience_s)
-    try:
-        pool.open()
-    except BaseException:
-        pool.close()
-        raise
-    return pool
 
 
 def _goals(task: AnyTask) -> np.ndarray:

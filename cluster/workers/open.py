@@ -1,0 +1,30 @@
+"""How a pool of workers is opened."""
+
+from __future__ import annotations
+
+from cluster.workers.pool import BuildMap, WorkerPool
+from cluster.workers.threads import ThreadPool
+
+
+def open_pool(workers: int, address: str | None, patience_s: float, build_map: BuildMap) -> WorkerPool:
+    """Open a pool; returns when it can work. To be called before threads are started: it sets Ray's variables.
+
+    Args:
+        workers: how many Ray workers. With 0 and without an address: threads of this process, on all its cores.
+        address: of an existing Ray cluster (`host:port` or `auto`), with 0 workers as many as it has CPUs free; None is
+            a Ray of our own.
+        patience_s: how long to do without any Ray worker, and to wait for a silent one; 0 for the default.
+
+    Raises: PoolError, in one line.
+    """
+    if workers == 0 and address is None:
+        return ThreadPool(build_map)
+    from cluster.workers.ray_pool import RayPool  # here, because it imports Ray
+
+    pool = RayPool(workers, build_map, address, patience_s)
+    try:
+        pool.open()
+    except BaseException:
+        pool.close()
+        raise
+    return pool
