@@ -20,9 +20,10 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from cluster import stopping
 from cluster.commands import common
 from cluster.commands.common import WorkFlags, command_path, fail, short_path
-from cluster.commands.progress import clock
+from cluster.commands.progress import clock, progress_in_words, row_in_words
 from cluster.compare import report, tables
 from cluster.compare.plan import ComparisonFolder, Plan, PlannedRun, limits, open_comparison, read_runs
 from cluster.compare.processes import Processes, RunProcess
@@ -86,17 +87,20 @@ def _compare() -> int:
     folder, flags = _prepare(arguments, flags)
     uri, wall_s = check_uri(flags.tracking_uri, saved_uri(folder.path)), limits(flags.budget)[1]
     left = [run for run in folder.planned() if not run.finished()]
-    address = cluster_address(flags.address) if left and (flags.workers or flags.address) else None
+    address = cluster_address(flags.address) if left else None
     lock(folder.path)
     if flags.jobs > 1 and wall_s:
         _warn("runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps")
     common.warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
-    given = [f"--workers={flags.workers}", f"--tracking-uri={redacted(uri)}", f"--experiment={flags.experiment}"]
-    more = {"address": address, "patience": flags.patience, "wall-time": wall_s}
-    given += [f"--{name}={value}" for name, value in more.items() if value]
+    shared = {
+        "workers": flags.workers, "address": address or "local", "patience": flags.patience, "wall-time": wall_s,
+        "tracking-uri": redacted(uri), "experiment": flags.experiment,
+    }  # fmt: skip
+    stopping.listen()
     folder.write()
     tracking = Tracking(folder.path, uri, flags.experiment, read_comparison)
-    return _train_and_compare(folder, left, tracking, Processes(left, flags.jobs, given))
+    processes = Processes(left, flags.jobs, [f"--{name}={value}" for name, value in shared.items()])
+    return _train_and_compare(folder, left, tracking, processes)
 
 
 def _prepare(arguments: Sequence[str], flags: CompareFlags) -> tuple[ComparisonFolder, CompareFlags]:
@@ -162,7 +166,7 @@ def _train_and_compare(
     console.print(f"compare: {tracking.where(command_path('mlflow'))}", soft_wrap=True)
     if status == "KILLED":
         print(f"{PROG}: stopped; continue with: {again}", file=sys.stderr)
-        return common.INTERRUPTED
+        return stopping.INTERRUPTED
     if shown.failed:
         fail(PROG, f"{shown.failed} of {len(folder.planned())} runs failed", f"continue with: {again}", common.FAILED)
     return 0
@@ -305,14 +309,13 @@ class Progress(Live):
 
 def _in_words(process: RunProcess) -> str:
     """How far a run is, by the newest row of its history."""
-    row = process.newest_row()
+    row, settings = process.newest_row(), process.run.settings
     if not row:
         return f"{process.run.name}  starting"
-    step = next(iter(row))
-    return (
-        f"{process.run.name}  {int(row[step]) + 1} {step}s  success {float(row['validation/success_rate']):.0%}  "
-        f"distance {float(row['distance_m/best']):,.0f} m best"
-    )
+    steps = int(row[settings.step_name]) + 1
+    done = progress_in_words(settings, steps, row, bounded=False)
+    success = f"success {row['validation/success_rate']:.0%}"
+    return f"{process.run.name}  {done}  {success}  {row_in_words(settings, steps, row)}"
 
 
 compare_main = partial(common.main, PROG, _compare)

@@ -51,7 +51,7 @@ class RunProcess:
         text = self.log.read_text(encoding="utf-8", errors="replace")
         return re.findall(rf"^gridsim-\w+: {kind}: (.*)$", text, re.MULTILINE)
 
-    def newest_row(self) -> dict[str, str]:
+    def newest_row(self) -> dict[str, float]:
         """The last row of its run's history.csv, by column; empty before there is one."""
         try:
             with (self.run.path / HISTORY).open("rb") as file:
@@ -60,7 +60,7 @@ class RunProcess:
                 whole = file.read().decode().split("\n")[:-1]
         except OSError:
             return {}
-        return dict(zip(columns, whole[-1].split(","), strict=True)) if whole else {}
+        return dict(zip(columns, map(float, whole[-1].split(",")), strict=True)) if whole else {}
 
 
 class Processes:

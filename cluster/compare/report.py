@@ -15,7 +15,7 @@ from cluster.compare.tables import DRIVING, ERRORS, Groups, introduction, notes,
 from cluster.store import checkpoint
 from cluster.store.checkpoint import SUMMARY
 from cluster.store.folder import PAGE
-from cluster.tracking.sync import Content
+from cluster.tracking.content import Content
 
 REPORT, TABLE, ROWS, PICTURE = "comparison.html", "table.md", "table.csv", "comparison.png"
 STYLE = """\

@@ -197,6 +197,6 @@ def test_gridsim_itself_has_the_python_api_and_its_examples_run():
     assert {name for name in api.__all__ if getattr(gridsim, name) is getattr(api, name)} == set(api.__all__)
     assert set(api.__all__) < set(dir(gridsim))
     with pytest.raises(AttributeError, match="no attribute 'evolv'"):
-        gridsim.evolv  # type: ignore[attr-defined]
+        gridsim.evolv  # type: ignore[attr-defined]  # noqa: B018
     done = doctest.testmod(api)
     assert (done.attempted >= 5, done.failed) == (True, 0)

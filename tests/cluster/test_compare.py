@@ -145,12 +145,15 @@ def test_the_live_display_shows_the_newest_row_of_each_run_and_an_eta(width, tmp
         planned.path.mkdir()
         both.append(Mock(spec=RunProcess, run=planned, began=time.perf_counter()))
         both[-1].newest_row = partial(RunProcess.newest_row, both[-1])
-    head = "generation,distance_m/best,validation/success_rate,wall_s\n"
-    (both[1].run.path / "history.csv").write_text(head + "10,1.0,0.0,1.0\n" * 1000 + "11,1812.3,0.37,9.0\n12,18")
+    names = "generation", "distance_m/best", "distance_m/mean", "target_m", "speed_mps/best", "validation/success_rate"
+    history = ",".join(names) + "\n" + "10,1.0,1.0,150.0,1.0,0.0\n" * 1000 + "11,1812.3,1300.0,2000.0,7.1,0.37\n12,18"
+    (both[1].run.path / "history.csv").write_text(history)
     shown.show(both)
     lines = ["".join(part.text for part in line) for line in screen.render_lines(shown.get_renderable(), pad=False)]
     assert lines[:2] == ["run 0/3  ETA 1:32:30", "roundabout-two-parents-s0  starting"]
-    newest = "roundabout-two-parents-s1  12 generations  success 37%  distance 1,812 m best"
+    newest = (
+        "roundabout-two-parents-s1  12 generations  success 37%  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"
+    )
     assert lines[2:] == [newest if len(newest) <= width else newest[: width - 1] + "…"]
     monkeypatch.setattr(compare.time, "perf_counter", partial(lambda now: now + 600.0, time.perf_counter()))
     shown.show(both)

@@ -63,7 +63,7 @@ def test_equal_scores_move_nothing():
     search = begun(SearchConfig(population=41, groups=2))
     before = state_of(search)
     for score in (0.0, -np.inf, np.nan):
-        told(search, lambda genomes: np.full(len(genomes), score))
+        told(search, lambda genomes: np.full(len(genomes), score))  # noqa: B023
         after = state_of(search)
         assert all(after[name] == before[name] for name in ("centre", "path", "sigma"))
 
@@ -76,7 +76,7 @@ def test_where_chance_decides_sigma_does_not_drift(population, groups, tournamen
         search = begun(SearchConfig(population=population, groups=groups, tournament=tournament), seed)
         rng = np.random.default_rng(seed)
         for _ in range(150):
-            told(search, lambda genomes: rng.random(len(genomes)))
+            told(search, lambda genomes: rng.random(len(genomes)))  # noqa: B023
             squares.append((search.path**2).mean())
             assert 0.05 < search.sigma < 5.0
         ends.append(np.log(search.sigma / search.config.sigma))
