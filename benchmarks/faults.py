@@ -1,4 +1,4 @@
-"""A campaign of faults: python benchmarks/faults.py [--faults N] [--seed N] [--jobs N] [--workers N] [--cluster] [--json]
+"""A campaign of faults: faults.py [--faults N] [--seed N] [--jobs N] [--workers N] [--cluster] [--json]
 
 A small evolution runs again and again, with two Ray workers or with --workers 0 in one process, several of them at
 once, beside an MLflow server of their own. At random moments one of FAULTS happens; a run that ended before its time is

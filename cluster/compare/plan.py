@@ -1,6 +1,6 @@
-"""The paper's comparison: scenarios x learners x seeds, each a training run in a folder of its own.
+"""A comparison's plan: scenarios x learners x seeds, each a training run in a folder of its own.
 
-Runs are ordered by seed first, so that a stopped comparison has results of every learner on every road. Its plan is
+Runs are ordered by seed first, so that a stopped comparison has results of every learner on every road. The plan is
 kept in comparison.json.
 """
 
@@ -11,7 +11,7 @@ import itertools
 import json
 import os
 import re
-import uuid
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -19,19 +19,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from cluster.compare.results import LEARNERS, Learner, Run, read_run
-from cluster.redaction import redacted
 from cluster.settings import IN_WORDS, MAX_STEPS, DqnSettings, EvolveSettings, RunSettings
 from cluster.store import checkpoint
-from cluster.store.folder import CHECKPOINT, CONFIG, SUMMARY, RunFolder, lock, open_run, read_config
+from cluster.store.checkpoint import SUMMARY
 from cluster.text import as_argument, file_name
 from evolution.networks.policy import Observation
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY, is_map_file, label
 
 COMPARISON = "comparison.json"
-FORMAT = 2
+FORMAT = 3
 MAX_SEEDS, MAX_CAR_STEPS, MAX_WALL_S = 1000, 10**13, 30 * 86_400.0
-UNBOUND = MAX_STEPS  # generations or car-steps, if a budget ends the run
+UNLIMITED = MAX_STEPS  # generations or car-steps of a run that its wall time ends
+CAR_STEPS = {None: 1, "k": 10**3, "M": 10**6, "G": 10**9}  # in units of a budget
+SECONDS = {"s": 1, "min": 60, "h": 3600}
 EVALUATIONS = 10  # of the DQN, at least
 # Settings that other flags or the comparison itself decide, so that --grid cannot vary them.
 PLANNED = (
@@ -40,29 +41,28 @@ PLANNED = (
 )  # fmt: skip
 
 
-class Cell(RunFolder):
-    """One training run of a comparison."""
+@dataclass(frozen=True)
+class PlannedRun:
+    """A training run of a comparison: its folder, which may not be there yet, and what it is asked to do."""
+
+    path: Path
+    settings: RunSettings
+
+    @property
+    def name(self) -> str:
+        return self.path.name
 
     def finished(self) -> bool:
         """Whether there is a summary, the last file that a run writes."""
         return (self.path / SUMMARY).is_file()
 
-    def check(self) -> None:
-        """Raises GridSimError if the folder holds something else."""
-        if (self.path / CONFIG).is_file():
-            if read_config(self.path / CONFIG)[0] != self.settings:
-                raise GridSimError(
-                    f"{self.path} is not what {COMPARISON} asks for: one of them was edited, or another version of "
-                    "GridSim wrote it; start a new comparison"
-                )
-        # A run that is killed while it writes its first file leaves a hidden one.
-        elif self.path.is_file() or any(self.path.glob("[!.]*")):
-            raise GridSimError(f"{self.path} is in the way and is not a run; move it elsewhere")
-
-    def open(self) -> RunFolder:
-        """A new run's folder, or that of a run to be resumed, after `check`. Raises RunError, CheckpointError."""
-        lock(self.path)  # first: a job that outlived its comparison may still write its first checkpoint
-        return open_run(self.path) if (self.path / CHECKPOINT).is_file() else self
+    def flags(self) -> list[str]:
+        """Flags with which the learner's command makes this run: the road, the seed, and what is not the default."""
+        own, always = vars(self.settings), ("scenario", "traffic", "seed", "observation")
+        usual = vars(type(self.settings)(own["scenario"], own["traffic"], observation=own["observation"]))
+        chosen = {name: value for name, value in own.items() if name in always or value != usual[name]}
+        chosen |= {"output": self.path.parent, "name": self.name}
+        return [f"--{name.replace('_', '-')}={value}" for name, value in chosen.items()]
 
 
 @dataclass(frozen=True)
@@ -97,32 +97,31 @@ class Plan:
     def check(self) -> None:
         """Raises GridSimError, one line that says what to change."""
         for flag, given in (("scenarios", self.scenarios), ("learners", self.learners)):
-            if not given:
-                raise GridSimError(f"--{flag}: name at least one")
-            if len(set(given)) != len(given):
-                raise GridSimError(f"--{flag}: {next(n for n in given if given.count(n) > 1)} is named twice")
-        for learner in self.learners:
-            if learner not in LEARNERS:
-                raise GridSimError(f"--learners: {learner!r:.40} is not a learner; use {', '.join(LEARNERS)}")
-        if not 1 <= self.seeds <= MAX_SEEDS:
-            raise GridSimError(f"--seeds must be 1 to {MAX_SEEDS:,}, not {self.seeds}")
-        for flag, count in (("population", self.population), ("generations", self.generations)):
-            if count < 0:
-                raise GridSimError(f"--{flag} must be positive, not {count}")
-        cells = dataclasses.replace(self, seeds=1).cells(Path())
-        if len({cell.name for cell in cells}) != len(cells):
+            if not given or len(set(given)) != len(given):
+                raise GridSimError(f"--{flag} {' '.join(given)}: name at least one, and each once")
+        if not set(self.learners) <= set(LEARNERS):
+            raise GridSimError(f"--learners: use {', '.join(LEARNERS)}")
+        for flag, number, least, most in (
+            ("seeds", self.seeds, 1, MAX_SEEDS),
+            ("population", self.population, 0, MAX_STEPS),
+            ("generations", self.generations, 0, MAX_STEPS),
+        ):
+            if not least <= number <= most:
+                raise GridSimError(f"--{flag} must be {least} to {most:,}, not {number}")
+        runs = dataclasses.replace(self, seeds=1).planned(Path())
+        if len({run.name for run in runs}) != len(runs):
             raise GridSimError("two runs would have the same name: rename a map, or name a value of --grid once")
-        for cell in cells:
-            cell.settings.check()
+        for run in runs:
+            run.settings.check()
 
-    def cells(self, folder: Path) -> list[Cell]:
+    def planned(self, folder: Path) -> list[PlannedRun]:
         """All runs of a comparison in that folder, in the order in which they are made."""
         found = []
         for seed, scenario, learner in itertools.product(range(self.seeds), self.scenarios, self.learners):
             for variant in self.variants(learner):
                 words = [label(scenario), learner, *(f"{name}={value}" for name, value in variant.items()), f"s{seed}"]
                 settings = self.settings(scenario, learner, seed, **variant)
-                found.append(Cell(folder / file_name("-".join(words)), settings))
+                found.append(PlannedRun(folder / file_name("-".join(words)), settings))
         return found
 
     def variants(self, learner: Learner) -> list[dict[str, Any]]:
@@ -153,20 +152,17 @@ class Plan:
             "seed": seed,
             "observation": self.observation,
             "until": 1.0,  # equal budgets: a run ends earlier only if its champion succeeds in every validation drive
+            **variant,
         }
         if learner == "dqn":
-            steps = car_steps or UNBOUND
-            usual = DqnSettings.suited[self.observation]["evaluate_every"]
-            every = min(usual, max(steps // EVALUATIONS, 1))
-            return DqnSettings(**common | variant, car_steps=steps, evaluate_every=every)
-        if self.population:
-            common["population"] = self.population
+            steps, usual = car_steps or UNLIMITED, DqnSettings(observation=self.observation).evaluate_every
+            return DqnSettings(**common, car_steps=steps, evaluate_every=min(usual, max(steps // EVALUATIONS, 1)))
         return EvolveSettings(
-            **common | variant,
+            **{"population": self.population, **common},
             search="random" if learner == "random" else "evolution",
             recombination="two" if learner == "two-parents" else "all",
             car_steps=car_steps,
-            generations=self.generations or UNBOUND,
+            generations=self.generations or UNLIMITED,
         )
 
 
@@ -176,30 +172,23 @@ def limits(budget: str) -> tuple[int, float]:
     Reads `20M`, `500k` or `20,000,000` car-steps; `60s`, `5min` or `1h` of wall time. Raises GridSimError.
     """
     match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?)\s*(k|M|G|s|min|h)?", re.sub(r"(?<=\d)[,_](?=\d)", "", budget))
-    if not match:
-        raise GridSimError(
-            f"--budget {budget[:40]}: give car-steps, as in 20M or 500k, or wall time, as in 60s, 5min or 1h"
-        )
-    number, unit = float(match[1]), match[2] or ""
-    if unit in ("s", "min", "h"):
-        seconds = round(number * {"s": 1.0, "min": 60.0, "h": 3600.0}[unit], 3)
-        if not 1.0 <= seconds <= MAX_WALL_S:
-            raise GridSimError(f"--budget {budget[:40]}: wall time must be 1 s to 30 days")
-        return 0, seconds
-    steps = round(number * {"": 1, "k": 10**3, "M": 10**6, "G": 10**9}[unit])
-    if not 1 <= steps <= MAX_CAR_STEPS:
-        raise GridSimError(f"--budget {budget[:40]}: car-steps must be 1 to {MAX_CAR_STEPS:,}")
-    return steps, 0.0
+    amount = float(match[1]) if match else 0.0
+    if match and match[2] in SECONDS:
+        if 1.0 <= (seconds := round(amount * SECONDS[match[2]], 3)) <= MAX_WALL_S:
+            return 0, seconds
+    elif match and 1 <= (steps := round(amount * CAR_STEPS[match[2]])) <= MAX_CAR_STEPS:
+        return steps, 0.0
+    usage = "give car-steps, as in 20M or 500k, or wall time from 1 s to 30 days, as in 60s, 5min or 1h"
+    raise GridSimError(f"--budget {budget[:40]}: {usage}")
 
 
 @dataclass
 class ComparisonFolder:
-    """Where a comparison is kept, its plan, and how its parent run is found in MLflow: the address and the key."""
+    """Where a comparison is kept, its plan, and when it began (s since the epoch)."""
 
     path: Path
     plan: Plan
-    tracking_uri: str = ""
-    tracking_key: str = field(default_factory=lambda: uuid.uuid4().hex)
+    started: float = field(default_factory=time.time)
 
     def write(self) -> None:
         """Write comparison.json. Raises CheckpointError."""
@@ -207,11 +196,14 @@ class ComparisonFolder:
             "format": FORMAT,
             "command": "gridsim-compare",
             "gridsim": version("gridsim"),
+            "started": self.started,
             "plan": dataclasses.asdict(self.plan),
-            "tracking_uri": redacted(self.tracking_uri),  # MLflow gets this file, so it must not hold a password
-            "tracking_key": self.tracking_key,
         }
         checkpoint.write_atomic(self.path / COMPARISON, (json.dumps(content, indent=2) + "\n").encode())
+
+    def planned(self) -> list[PlannedRun]:
+        """All runs, in the order in which they are made."""
+        return self.plan.planned(self.path)
 
 
 def open_comparison(folder: Path) -> ComparisonFolder:
@@ -223,39 +215,32 @@ def open_comparison(folder: Path) -> ComparisonFolder:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
-            raise GridSimError(f"not a {COMPARISON} of this GridSim")
+            raise GridSimError(f"not a {COMPARISON} of this version of GridSim; start a new comparison")
         values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in content["plan"].items()
         }
-        plan = Plan(**values)
-        plan.check()
-        uri, key = str(content.get("tracking_uri", "")), uuid.UUID(content["tracking_key"]).hex
-        return ComparisonFolder(folder.resolve(), plan, uri, key)
+        found = ComparisonFolder(folder.resolve(), Plan(**values), float(content["started"]))
+        found.plan.check()
+        return found
     except GridSimError as error:
         raise GridSimError(f"{path}: {error}") from error
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise GridSimError(f"{path}: not a {COMPARISON} of this GridSim ({type(error).__name__})") from error
+        raise GridSimError(f"{path}: damaged ({type(error).__name__}); start a new comparison") from error
 
 
 def read_runs(folders: Iterable[Path]) -> list[Run]:
-    """Finished runs from their folders; a comparison's folder stands for its finished runs. Raises GridSimError."""
-    found: list[Run] = []
+    """Finished runs from their folders, each once; a comparison's folder stands for its finished runs.
+
+    Raises: GridSimError.
+    """
+    found: dict[Path, Run] = {}
     for folder in folders:
+        paths = [folder]
         if (folder / COMPARISON).is_file():
-            comparison = open_comparison(folder)
-            runs = [read_run(cell.path) for cell in comparison.plan.cells(comparison.path) if cell.finished()]
-            if not runs:
+            paths = [run.path for run in open_comparison(folder).planned() if run.finished()]
+            if not paths:
                 again = f"continue it with --resume {as_argument(folder)}"
                 raise GridSimError(f"{folder}: none of its runs is finished; {again}")
-            found += runs
-        else:
-            found.append(read_run(folder))
-    first: dict[tuple[object, ...], Run] = {}
-    for run in found:  # the same run as two seeds would make figures look more certain than they are
-        same = (run.champion_sha256, run.settings.learner, run.settings.scenario, run.settings.traffic)
-        other = first.setdefault(same, run)
-        if other is not run:
-            if other.folder.resolve() == run.folder.resolve():
-                raise GridSimError(f"{run.folder.resolve()} is named twice")
-            raise GridSimError(f"{other.folder} and {run.folder} are the same run, made twice; leave one out")
-    return found
+        for path in paths:
+            found.setdefault(path.resolve(), read_run(path))
+    return list(found.values())

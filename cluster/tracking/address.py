@@ -39,20 +39,21 @@ def check_uri(uri: str | None = None, begun_with: str = "") -> str:
 
     If `uri` is None or "": the address `begun_with` of a resumed run, whose server is not probed, as the run goes on
     without it and the tracker reports it; else MLFLOW_TRACKING_URI, else `sqlite:///mlflow.db` in the working
-    directory. The password of `begun_with`, which no file holds, comes from MLFLOW_TRACKING_URI.
+    directory. A password, which no file and no flag needs to hold, comes from MLFLOW_TRACKING_URI.
+    A run of a comparison, which has MLFLOW_RUN_CONTEXT, does not probe it again: its server may be away meanwhile.
     Hosted stores (`databricks`, the schemes of MLflow's plug-ins) are not probed.
     Raises TrackingError for a server that does not answer, a database that cannot be written or is another MLflow's, a
     folder (MLflow 3 stores nothing in folders) and anything unknown.
     """
     reach_loopback_directly()
-    resumed = not uri and bool(begun_with)
-    uri = uri or with_password(begun_with) or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
+    probed = (not uri and bool(begun_with)) or "MLFLOW_RUN_CONTEXT" in os.environ
+    uri = with_password(uri or begun_with) or os.environ.get("MLFLOW_TRACKING_URI") or DEFAULT_URI
     scheme = address_scheme(uri)
     if scheme == "sqlite":
         return _check_sqlite(uri)
     if scheme == _HOSTED or scheme in entry_points(group="mlflow.tracking_store").names:
         return uri
-    if resumed and scheme in ("http", "https", *_DATABASES):
+    if probed and scheme in ("http", "https", *_DATABASES):
         return uri
     if scheme in ("http", "https"):
         uri = uri.rstrip("/")
@@ -97,7 +98,7 @@ def is_database(uri: str) -> bool:
 
 
 def with_password(saved: str) -> str:
-    """The address that a run was begun with, with the user and password that MLFLOW_TRACKING_URI may have for it."""
+    """An address of a file or a flag, with the user and password that MLFLOW_TRACKING_URI may have for it."""
     usual = os.environ.get("MLFLOW_TRACKING_URI", "").rstrip("/")
     return usual if redacted(usual) == redacted(saved) and not saved.endswith(UNCLEAR) else saved
 

@@ -230,8 +230,8 @@ def test_runs_at_once_have_the_champions_of_each_alone(up: Machines) -> None:
     asked = "--scenarios curved --learners evolution --seeds 2 --budget 1G --population 48 --generations 6 --name c"
     command = f"gridsim-compare --address auto --jobs 2 --workers 1 {asked}"
     up.laptop.run(RAY, "exec", up.config, command, timeout=UP_S)
-    for cell in plan.cells(up.head.home / "runs/c"):
-        assert summary(cell.path)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
+    for run in plan.planned(up.head.home / "runs/c"):
+        assert summary(run.path)["champion_sha256"] == evolve(**vars(run.settings))[0].sha256
 
 
 @pytest.mark.e2e

@@ -69,7 +69,7 @@ def test_a_wrong_flag_is_told_in_one_line_on_a_terminal_too(prog, line, said, te
     assert capsys.readouterr().err.splitlines() == [f"{prog}: error: {said}", f"see {prog} --help"]
 
 
-@pytest.mark.parametrize("kind", [EvolveFlags, DqnFlags, EvaluateFlags, CompareFlags])
+@pytest.mark.parametrize("kind", [EvolveFlags, DqnFlags, EvaluateFlags])
 @pytest.mark.parametrize("form", ["{} 3", "--traffic 1 {}=a=b --help"])
 def test_a_flag_that_went_is_refused_by_name_with_what_takes_its_place(form, kind):
     for flag, instead in kind.removed.items():

@@ -1,216 +1,204 @@
-"""The command gridsim-compare: wrong use, what is never trained again, a kill and Ctrl-C."""
+"""The command gridsim-compare: wrong use, what is never trained again, failures, Ctrl-C, a kill."""
 
 import csv
-import functools
+import io
 import json
 import os
-import shutil
 import signal
-import tempfile
 import time
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
 from unittest.mock import Mock
 
 import psutil  # type: ignore[import-untyped]
 import pytest
 import tracked
-from commands import call, command_line, finish, refused, running, summary, wait_until
+from commands import call, command_line, descendants, finish, refused, running, summary, wait_until
 from finished_runs import make_run
+from rich.console import Console
 
-from cluster.commands import compare, jobs
-from cluster.commands.compare import compare_main
-from cluster.commands.jobs import train_all
-from cluster.compare import results
+from cluster.commands import compare
+from cluster.commands.compare import Progress, compare_main
+from cluster.compare import processes, results
 from cluster.compare.plan import ComparisonFolder, Plan
-from cluster.run import Workers, undisturbed
-from cluster.workers.pool import PoolError
+from cluster.compare.processes import RunProcess
+from cluster.workers import kernels
 from gridsim import evolve
 
-NO_WORKERS = Workers(0, None, 0.0)
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
+ASKED = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k"]
+# In place of the learners' commands: puts a run that is made already where it belongs, or says why it cannot.
+STAND_IN = """\
+#!/bin/sh
+for flag; do case $flag in --output=*) output=${flag#*=};; --name=*) name=${flag#*=};; esac; done
+echo "$name $* $MLFLOW_TRACKING_URI $MLFLOW_RUN_CONTEXT" >> asked
+echo "gridsim-evolve: warning: MLflow is slow" >&2
+if [ -e "broken-$name" ]; then echo "gridsim-evolve: error: the workers are gone" >&2; exit 1; fi
+if [ -e "killed-$name" ]; then kill -9 $$; fi
+cp -r "made/$name" "$output/$name"
+"""
 
 
 def test_wrong_use_is_told_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     ComparisonFolder(tmp_path, PLAN).write()
     make_run(tmp_path / "a")
-    for arguments, said in [
+    wrong: list[tuple[list[object], str]] = [
         (["nowhere"], "no such folder"),
         (["."], "none of its runs is finished"),
-        ([tmp_path / "a" / "config.json"], "is not a folder"),
         (["a", "--seeds", 2], "--seeds"),
         (["--scenarios", "mars"], "unknown scenario"),
-        (["--learners", "dqn", "--population", -5], "--population must be positive, not -5"),
+        (["--learners", "dqn", "--population", -5], "--population must be 0 to"),
         (["--jobs", 0], "--jobs must be 1 to 256, not 0"),
-        (["--workers", 0, "--address", "auto"], "--address"),
         (["--resume", "a"], "not a comparison's folder"),
         (["--resume", ".", "--seeds", 1], "contradicts the comparison's 2"),
         (["--resume", ".", "--learners", "dqn"], "contradicts the comparison's evolution random"),
         (["--name", "a", "--output", "."], "exists already"),
         (["--tracking-uri", "ftp://x"], "not a tracking address"),
-    ]:
+    ]
+    for arguments, said in wrong:
         assert said in refused(compare_main, monkeypatch, capsys, *arguments)[0]
     assert sorted(os.listdir(tmp_path)) == ["a", "comparison.json"]
 
 
-def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(tmp_path, monkeypatch, capsys):
-    trained: list[str] = []
-    broken = {"seamless-evolution-s0"}
-
-    def train(run, *_, **__):
-        trained.append(run.name)
-        if run.name in broken:
-            raise PoolError("the workers are gone")
-        make_run(run.path, settings=run.settings)
-
+@pytest.fixture
+def made(tmp_path, monkeypatch, capsys):
+    """gridsim-compare in `tmp_path`, with STAND_IN in place of the learners' commands and without MLflow."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(compare, "train", train)
+    script = tmp_path / "stand-in"
+    script.write_text(STAND_IN)
+    script.chmod(0o755)
+    for planned in PLAN.planned(tmp_path / "made"):
+        make_run(planned.path, settings=planned.settings)
+    monkeypatch.setattr(processes, "_script", lambda command: script)
+    monkeypatch.setattr(kernels, "is_compiled", lambda settings: True)
     monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
-    monkeypatch.setattr(compare, "Tracker", Mock(**{"return_value.close.return_value": None}))
-    run = functools.partial(call, compare_main, monkeypatch, capsys)
-    asked = ["--scenarios", *PLAN.scenarios, "--learners", *PLAN.learners, "--budget", "1k", "--workers", 0]
-    code, _, err = run(*asked, "--name", "c", "--seeds", 1)
+    tracking: Any = Mock(uri="http://u:hunter2@h:5000", error="no answer", run_id="", close=lambda status: None)
+    tracking.wait_id.return_value = "17"
+    monkeypatch.setattr(compare, "check_uri", lambda *_: tracking.uri)
+    monkeypatch.setattr(compare, "Tracking", lambda *_: tracking)
+    return SimpleNamespace(run=partial(call, compare_main, monkeypatch, capsys), tracking=tracking)
+
+
+def asked(tmp_path):
+    return [line.split()[0] for line in (tmp_path / "asked").read_text().splitlines()]
+
+
+def test_what_is_finished_is_never_trained_again_and_what_failed_stops_no_other(tmp_path, made):
+    names = [planned.name for planned in PLAN.planned(tmp_path)]
+    for failing in (f"broken-{names[2]}", f"killed-{names[3]}"):
+        (tmp_path / failing).touch()
+    code, out, err = made.run(*ASKED, "--name", "c", "--seeds", 1)
     assert code == 1
-    names = [cell.name for cell in PLAN.cells(tmp_path)]
-    assert trained == names[:4]
-    assert "gridsim-compare: seamless-evolution-s0 failed: the workers are gone" in err
-    assert "gridsim-compare: error: 1 of 4 runs failed" in err
+    assert asked(tmp_path) == names[:4]
+    assert f"run 2/4  {names[1]}: success 50%, 90 m, velocity error 2.5 %, 6 s  ETA 0:00\n" in out
+    for line in (
+        f"{names[0]}: warning: MLflow is slow",
+        f"gridsim-compare: {names[2]} failed: the workers are gone",
+        f"gridsim-compare: {names[3]} failed: its process ended with exit code -9; see runs/c/logs/{names[3]}.log",
+        "gridsim-compare: error: 2 of 4 runs failed",
+    ):
+        assert line in err.splitlines()
     assert err.splitlines()[-1].endswith("--resume runs/c")
-    broken.clear()
-    champion = tmp_path / "runs/c" / names[0] / "champion.npz"
-    whole = champion.read_bytes()
-    champion.write_text("PK")
-    code, out, err = run("--resume", "runs/c", "--seeds", 2, "--budget", "1,000", "--workers", 0)
-    assert code == 1
-    assert "comparing 8 runs, 3 of them finished" in out
-    assert trained[4:] == ["seamless-evolution-s0", *names[4:]]
-    assert f"run 8/8  {names[-1]}: success 50%" in out
-    assert f"gridsim-compare: {names[0]} failed: {champion}" in err
-    assert "gridsim-compare: error: 1 of 8 runs failed" in err
+    for failing in tmp_path.glob("[bk][ri]*-*"):
+        failing.unlink()
+    champion = tmp_path / "runs/c" / names[0] / "config.json"
+    whole = champion.read_text()
+    champion.write_text(whole.replace('"sigma": 0.5', '"sigma": 0.25'))
+    code, out, err = made.run("--resume", "runs/c", "--seeds", 2, "--budget", "1,000", "--jobs", 3)
+    assert (code, sorted(asked(tmp_path)[4:])) == (1, sorted(names[2:]))
+    assert "comparing 8 runs, 2 of them finished" in out
+    assert f"gridsim-compare: {names[0]} failed: {champion.parent} is not what comparison.json asks for" in err
     assert "| curved | evolution | 1 of 2 |" in (tmp_path / "runs/c/table.md").read_text()
-    champion.write_bytes(whole)
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")  # of a cluster that is gone, and not needed any more
-    assert run("--resume", "runs/c", "--workers", 2)[0] == 0
-    assert len(trained) == 9
+    champion.write_text(whole)
+    assert made.run("--resume", "runs/c")[0] == 0
+    assert len(asked(tmp_path)) == 10
     assert {"comparison.html", "table.md", "table.csv", "comparison.png"} <= set(os.listdir("runs/c"))
     assert json.loads((tmp_path / "runs/c/comparison.json").read_text())["plan"]["seeds"] == 2
-    assert run("runs/c", "--name", "again")[0] == 0
+    assert made.run("runs/c", f"runs/c/{names[0]}", "--name", "again")[0] == 0
     rows = list(csv.DictReader((tmp_path / "runs/again/table.csv").read_text().splitlines()))
-    assert len(rows) == 8
+    assert len(rows) == 8, "each run once"
     assert {row["velocity_error_percent"] for row in rows} == {"2.5"}
 
 
-def fail(run, reporter):
-    raise PoolError(f"no workers for {run.name}")
+def test_a_run_gets_the_password_and_the_parent_of_its_mlflow_run_in_its_environment(tmp_path, made):
+    budget = ["--budget", "90s", "--learners", "evolution", "--scenarios", "curved", "--seeds", 1]
+    code, _, err = made.run(*budget, "--name", "c", "--patience", 7, "--workers", 1, "--experiment", "mine")
+    assert code == 1, "what is made is a run of another budget"
+    assert "is not what comparison.json asks for" in err
+    flags, environment = (tmp_path / "asked").read_text().split(" http://u:", 1)
+    assert environment == 'hunter2@h:5000 {"mlflow.parentRunId": "17"}\n'
+    for flag in ("wall-time=90.0", "patience=7.0", "workers=1", "experiment=mine", "tracking-uri=http://h:5000"):
+        assert f" --{flag} " in f"{flags} "
+    made.tracking.wait_id.return_value = ""
+    made.run(*budget, "--name", "d")
+    assert (tmp_path / "asked").read_text().endswith(" {}\n")
 
 
-def test_each_job_goes_on_after_a_run_that_failed(tmp_path):
-    cells, events = Plan(("curved",), ("evolution",), 5, budget="1k").cells(tmp_path), []
-    train_all(cells, NO_WORKERS, fail, 2, lambda *event: events.append(event[1:]))
-    assert sorted(said for kind, said in events if kind == "failed") == [f"no workers for {c.name}" for c in cells]
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_the_live_display_shows_the_newest_row_of_each_run_and_an_eta(width, tmp_path, monkeypatch):
+    folder = ComparisonFolder(tmp_path, Plan(("roundabout",), ("two-parents",), 3, budget="3700s"))
+    screen = Console(width=width, force_terminal=True, color_system=None, file=io.StringIO())
+    shown, both = Progress(screen, folder, 3, 2), []
+    for planned in folder.planned()[:2]:
+        planned.path.mkdir()
+        both.append(Mock(spec=RunProcess, run=planned, began=time.perf_counter()))
+        both[-1].newest_row = partial(RunProcess.newest_row, both[-1])
+    names = "generation", "distance_m/best", "distance_m/mean", "target_m", "speed_mps/best", "validation/success_rate"
+    history = ",".join(names) + "\n" + "10,1.0,1.0,150.0,1.0,0.0\n" * 1000 + "11,1812.3,1300.0,2000.0,7.1,0.37\n12,18"
+    (both[1].run.path / "history.csv").write_text(history)
+    shown.show(both)
+    lines = ["".join(part.text for part in line) for line in screen.render_lines(shown.get_renderable(), pad=False)]
+    assert lines[:2] == ["run 0/3  ETA 1:32:30", "roundabout-two-parents-s0  starting"]
+    newest = (
+        "roundabout-two-parents-s1  12 generations  success 37%  distance 1,812 m best, 1,300 mean of 2,000  7.1 m/s"
+    )
+    assert lines[2:] == [newest if len(newest) <= width else newest[: width - 1] + "…"]
+    monkeypatch.setattr(compare.time, "perf_counter", partial(lambda now: now + 600.0, time.perf_counter()))
+    shown.show(both)
+    assert "ETA 1:22:30" in str(shown.get_renderable())
 
 
-def close(run, reporter):
-    """A run that is being closed when the signal comes, which it ignores."""
-    with undisturbed():
-        reporter.note("closing")
-        time.sleep(1.0)
-
-
-def test_a_job_that_ignored_the_signal_ends_as_soon_as_its_run_is_closed(tmp_path, monkeypatch):
-    def interrupt(cell, kind, content):
-        if content == "closing":
-            raised.append(time.monotonic())
-            raise KeyboardInterrupt
-
-    raised: list[float] = []
-    monkeypatch.setattr(jobs, "CLOSING_S", 20.0)
-    with pytest.raises(KeyboardInterrupt):
-        train_all(Plan(("curved",), ("evolution",), 1, budget="1k").cells(tmp_path), NO_WORKERS, close, 2, interrupt)
-    assert time.monotonic() - raised[0] < 15.0
-
-
-def test_a_comparison_is_resumed_while_its_server_is_away(tmp_path, impatient, monkeypatch, capsys):
-    away = f"http://127.0.0.1:{tracked.free_port()}"
-    folder = ComparisonFolder(tmp_path / "c", Plan(("curved",), ("evolution",), 1, budget="1k"), away)
-    folder.path.mkdir()
-    folder.write()
-    monkeypatch.setattr(compare, "train", lambda run, *_, **__: make_run(run.path, settings=run.settings))
-    monkeypatch.setattr(results, "errors_of", lambda run: dict.fromkeys(results.ERROR_FIGURES, 2.5))
-    code, _, err = call(compare_main, monkeypatch, capsys, "--resume", folder.path, "--workers", 0)
-    assert code == 0
-    nested, unsent = err.splitlines()
-    assert nested.endswith(f"its runs are not nested in MLflow: {away}: Connection refused")
-    assert unsent.startswith(f"gridsim-compare: warning: not logged to MLflow at {away}: ")
-
-
-def files(folder):
-    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+def processes_of(process):
+    return [psutil.Process(pid) for pid in descendants(process.pid) if "--resume-if-exists" in command_line(pid)]
 
 
 @pytest.mark.e2e
-def test_a_comparison_stopped_by_ctrl_c_and_killed_goes_on_without_repeating_what_is_finished(tmp_path):
-    folder = tmp_path / "runs" / "c"
-    first, second = folder / "curved-evolution-s0", folder / "curved-random-s0"
-    asked = "--scenarios curved --learners evolution random --seeds 1 --population 32 --budget 1h --generations 3"
-    with running("gridsim-compare", *asked.split(), "--workers", "0", "--name", "c", cwd=tmp_path) as process:
-        wait_until(lambda: second.exists() or process.poll() is not None, 240)
-        process.send_signal(signal.SIGINT)
-        errors = process.communicate(timeout=120)[1]
-    assert process.returncode == 130, errors
-    assert "gridsim-compare --resume runs/c" in errors
-    assert "| curved | random search | missing |" in (folder / "table.md").read_text()
-    assert "| curved | evolution | 1 |" in (folder / "table.md").read_text()
-    with running("gridsim-compare", "--resume", "runs/c", "--workers", "0", cwd=tmp_path) as process:
-        wait_until(lambda: (second / "checkpoint.npz").exists() or process.poll() is not None, 240)
-    before = files(first)
-    assert "summary.json" in before
-    done = finish("gridsim-compare", "--resume", "runs/c", "--workers", "0", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert files(first) == before
-    rows = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
-    assert [(row["learner"], row["run"]) for row in rows] == [("evolution", first.name), ("random", second.name)]
-    assert float(rows[0]["velocity_error_percent"]) > 0.0
-    whole, *runs = sorted(tracked.runs(f"sqlite:///{tmp_path}/mlflow.db"), key=lambda run: run.info.run_name)
-    assert [run.info.run_name for run in (whole, *runs)] == ["c", first.name, second.name]
-    assert all(run.data.tags["mlflow.parentRunId"] == whole.info.run_id for run in runs)
-    assert (whole.info.status, whole.data.metrics["runs_done"]) == ("FINISHED", 2)
-
-
-@pytest.mark.e2e
-def test_runs_trained_at_once_are_saved_survive_kills_and_have_the_champions_of_each_alone(tmp_path):
-    folder = tmp_path / "runs" / "c"
-    asked = "--scenarios curved seamless --learners evolution --seeds 2 --budget 1G --population 64 --generations 12"
-    cells = Plan(("curved", "seamless"), ("evolution",), 2, budget="1G", population=64, generations=12).cells(folder)
+@pytest.mark.usefixtures("database")
+def test_a_comparison_that_is_stopped_and_killed_goes_on_to_the_champions_of_each_run_alone(tmp_path):
+    folder = tmp_path / "runs/c"
+    planned = Plan(("curved",), ("evolution",), 3, budget="1G", population=64, generations=40).planned(folder)
+    flags = "--scenarios curved --learners evolution --budget 1G --population 64 --generations 40 --seeds 2 --name c"
     at_once = ["--workers", "0", "--jobs", "2"]
 
-    def processes():
-        servers = [each for each in psutil.Process(process.pid).children() if "forkserver" in command_line(each.pid)]
-        return [child for server in servers for child in server.children()]
+    def saved():
+        return process.poll() is not None or all((run.path / "checkpoint.npz").exists() for run in planned[:2])
 
-    short = tempfile.mkdtemp(prefix="gs-", dir="/tmp")  # the path of a socket in it must be short
-    with running("gridsim-compare", *asked.split(), "--name", "c", *at_once, cwd=tmp_path, TMPDIR=short) as process:
-        wait_until(
-            lambda: all((cell.path / "checkpoint.npz").exists() for cell in cells[:2]) or process.poll() is not None,
-            240,
-        )
-        children = processes()
-        os.killpg(process.pid, signal.SIGTERM)
-        errors = process.communicate(timeout=120)[1]
-        assert process.returncode == 130, errors
-        assert len(children) == 2
-        assert not any(child.is_running() for child in children), "it has waited until they were saved"
+    with running("gridsim-compare", *flags.split(), *at_once, cwd=tmp_path) as process:
+        wait_until(saved, 240)
+        children = processes_of(process)
+        os.killpg(process.pid, signal.SIGINT)
+        errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, errors
+    assert "gridsim-compare --resume runs/c" in errors
+    assert len(children) == 2
+    assert not any(child.is_running() for child in children), "it has waited until they were saved"
+    assert not any(run.finished() for run in planned)
     with running("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path) as process:
-        wait_until(lambda: len(processes()) == 2, 60)
-        for child in processes():
-            child.kill()
-        errors = process.communicate(timeout=240)[1]
-    assert process.returncode == 1, errors
-    assert "failed: its process ended with exit code -9" in errors
-    assert "gridsim-compare: error: 2 of 4 runs failed" in errors
-    assert [(cell.path / "summary.json").exists() for cell in cells] == [False, False, True, True]
-    done = finish("gridsim-compare", "--resume", "runs/c", *at_once, cwd=tmp_path, TMPDIR=short)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert not [name for name in os.listdir(short) if name.startswith("pymp-")], "the folder of a socket"
-    shutil.rmtree(short)
-    for cell in cells:
-        assert summary(cell.path)["champion_sha256"] == evolve(**vars(cell.settings))[0].sha256
+        children = wait_until(lambda: len(found := processes_of(process)) == 2 and found, 60)
+        wait_until(lambda: all("continuing" in log.read_text() for log in folder.glob("logs/*s[01].log")), 60)
+        process.kill()
+        assert psutil.wait_procs(children, 60)[1] == [], "they notice that it is gone"
+    assert all("gridsim-evolve: stopped; continue with" in log.read_text() for log in folder.glob("logs/*s[01].log"))
+    done = finish("gridsim-compare", "--resume", "runs/c", "--seeds", "3", *at_once, cwd=tmp_path)
+    assert done.stderr == ""
+    for run in planned[:2]:
+        assert summary(run.path)["champion_sha256"] == evolve(**vars(run.settings))[0].sha256
+    rows = list(csv.DictReader((folder / "table.csv").read_text().splitlines()))
+    assert [row["run"] for row in rows] == [run.name for run in planned]
+    assert float(rows[0]["velocity_error_percent"]) > 0.0
+    logged = {run.info.run_name: run for run in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db")}
+    whole, nested = logged["c"], [logged[run.name] for run in planned]
+    assert {run.data.tags["mlflow.parentRunId"] for run in nested} == {whole.info.run_id}
+    assert (whole.info.status, whole.data.metrics["runs_done"]) == ("FINISHED", 3)

@@ -1,20 +1,19 @@
 """The paper's comparison: what is asked, what is trained once, what is not what was asked for."""
 
-import contextlib
 import dataclasses
-import fcntl
 import itertools
 import json
-import os
-import shutil
+from pathlib import Path
+from typing import Any
 
 import pytest
 from finished_runs import make_run
 
-from cluster.compare.plan import UNBOUND, ComparisonFolder, Plan, limits, open_comparison, read_runs
+from cluster.commands.cli import DqnFlags, EvolveFlags
+from cluster.commands.common import parse, select
+from cluster.compare.plan import UNLIMITED, ComparisonFolder, Plan, limits, open_comparison, read_runs
 from cluster.compare.results import LEARNERS
 from cluster.compare.tables import group
-from cluster.store.folder import RunError
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import REGISTRY
@@ -44,7 +43,7 @@ def test_budget_that_makes_no_sense(text):
     [
         ({"scenarios": ("mars",)}, "unknown scenario"),
         ({"scenarios": ()}, "at least one"),
-        ({"scenarios": ("city", "city")}, "twice"),
+        ({"scenarios": ("city", "city")}, "each once"),
         ({"scenarios": ("/a/m.png", "/b/m.png")}, "same name"),
         ({"learners": ("sarsa",)}, "--learners"),
         ({"seeds": 0}, "--seeds"),
@@ -63,7 +62,7 @@ def test_plan_that_makes_no_sense(change, said):
 
 def test_a_comparison_that_was_stopped_has_something_of_everything(tmp_path):
     roads = tuple(REGISTRY)
-    cells = Plan(seeds=3).cells(tmp_path)
+    cells = Plan(seeds=3).planned(tmp_path)
     assert len({cell.path for cell in cells}) == len(cells) == 60
     found = {(cell.settings.scenario, cell.settings.learner) for cell in cells[:20]}
     assert found == set(itertools.product(roads, LEARNERS))
@@ -73,17 +72,17 @@ def test_a_comparison_that_was_stopped_has_something_of_everything(tmp_path):
 def test_each_combination_of_a_grid_is_compared(tmp_path):
     plan = Plan(("curved",), ("evolution",), 2, grid=("policy=mlp:64,mlp:6,7", "sigma=0.3,0.5"))
     plan.check()
-    cells = plan.cells(tmp_path)
+    cells = plan.planned(tmp_path)
     assert [cell.name for cell in cells[:4]] == [
         f"curved-evolution-policy=mlp_{policy}-sigma={sigma}-s0" for policy in ("64", "6_7") for sigma in (0.3, 0.5)
     ]
     make_run(cells[2].path, settings=cells[2].settings)
     groups = group(read_runs([cells[2].path]), plan)
-    assert [(each.name, len(each.runs), each.seeds) for each in groups] == [
-        ("evolution, policy mlp:64, sigma 0.3", 0, (0, 1)),
-        ("evolution, policy mlp:64, sigma 0.5", 0, (0, 1)),
-        ("evolution, policy mlp:6,7, sigma 0.3", 1, (0, 1)),
-        ("evolution, policy mlp:6,7, sigma 0.5", 0, (0, 1)),
+    assert [(name, ["run" in row for row in rows]) for (_, name), rows in groups.items()] == [
+        ("evolution, policy mlp:64, sigma 0.3", [False, False]),
+        ("evolution, policy mlp:64, sigma 0.5", [False, False]),
+        ("evolution, policy mlp:6,7, sigma 0.3", [True, False]),
+        ("evolution, policy mlp:6,7, sigma 0.5", [False, False]),
     ]
 
 
@@ -92,7 +91,7 @@ def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, tra
     plan = Plan(("highway", "city"), observation=observation, traffic=traffic)
     plan.check()
     specs: dict[str, set[PolicySpec]] = {}
-    for cell in plan.cells(tmp_path):
+    for cell in plan.planned(tmp_path):
         assert cell.name == f"{cell.settings.scenario}-{cell.settings.learner}-s{cell.settings.seed}"
         specs.setdefault(cell.settings.learner, set()).add(PolicySpec.parse(cell.settings.policy))
     assert set(specs) == set(LEARNERS)
@@ -103,7 +102,7 @@ def test_searches_see_the_same_and_settings_are_valid(tmp_path, observation, tra
 
 
 def test_generations_are_those_asked_for_or_without_bound():
-    for plan, generations in ((Plan(generations=5), 5), (Plan(), UNBOUND)):
+    for plan, generations in ((Plan(generations=5), 5), (Plan(), UNLIMITED)):
         assert vars(plan.settings("curved", "two-parents", 0))["generations"] == generations
 
 
@@ -113,19 +112,28 @@ def test_budget_is_looked_at_often_enough(budget, every):
     assert (settings["car_steps"], settings["evaluate_every"]) == (limits(budget)[0], every)
 
 
-def test_same_run_twice_is_refused(tmp_path):
-    make_run(tmp_path / "a")
-    shutil.copytree(tmp_path / "a", tmp_path / "b")
-    with pytest.raises(GridSimError, match="named twice"):
-        read_runs([tmp_path / "a", tmp_path / "../" / tmp_path.name / "a"])
-    with pytest.raises(GridSimError, match="the same run"):
-        read_runs([tmp_path / "a", tmp_path / "b"])
+@pytest.mark.parametrize(
+    "plan",
+    [
+        Plan(budget="90s"),
+        Plan(budget="200k", traffic=3, population=64, generations=5, seeds=2),
+        Plan(observation="grid", learners=("evolution", "dqn"), grid=("policy=cnn:8,16,32@1,cnn:8,16,32@2",)),
+        Plan(("curved",), ("two-parents",), grid=("mutation-rate=0.03,0.5", "elites=0,8")),
+    ],
+)
+def test_the_flags_of_a_run_give_its_settings(plan):
+    plan.check()
+    for run in plan.planned(Path("runs/c")):
+        kind: Any = EvolveFlags if run.settings.command == "gridsim-evolve" else DqnFlags
+        flags = parse(kind, run.settings.command, run.flags())
+        assert select(type(run.settings), flags) == run.settings
+        assert (flags.output, flags.name) == ("runs/c", run.name)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"format": 1}, {"plan": None}, {"tracking_key": "'; drop table runs"}, "", "[]", "\0", {"seeds": "3"},
+        {"format": 2}, {"plan": None}, {"started": "yesterday"}, "", "[]", "\0", {"seeds": "3"},
         {"seeds": 10**9}, {"scenarios": [["curved"]]}, {"scenarios": ["../../etc"]}, {"learners": ["shell"]},
         {"budget": 5}, {"observation": "camera"}, {"traffic": 1e9}, {"extra": 1},
     ],
@@ -139,50 +147,3 @@ def test_edited_comparison_is_refused(tmp_path, change):
     path.write_text(change if isinstance(change, str) else json.dumps(content | change))
     with pytest.raises(GridSimError, match=r"^.*comparison\.json.*$"):
         open_comparison(tmp_path)
-
-
-def test_comparison_keeps_no_password(tmp_path):
-    ComparisonFolder(tmp_path, PLAN, "http://me:secret@host").write()
-    assert "secret" not in (tmp_path / "comparison.json").read_text()
-    assert open_comparison(tmp_path).tracking_uri == "http://host"
-
-
-def test_runs_that_are_not_what_the_comparison_asks_for_are_refused(tmp_path):
-    first, second, third = PLAN.cells(tmp_path)[:3]
-    make_run(first.path, settings=first.settings)
-    first.check()
-    with pytest.raises(GridSimError, match="one of them was edited, or another version of GridSim wrote it"):
-        dataclasses.replace(PLAN, traffic=4).cells(tmp_path)[0].check()
-    shutil.move(first.path, second.path)
-    with pytest.raises(GridSimError, match="one of them was edited"):
-        second.check()
-    third.path.mkdir()
-    (third.path / ".config.json.123.tmp").write_text("{")  # left by a run that was killed as it began
-    third.check()
-    (third.path / "mine.txt").write_text("dear diary")
-    with pytest.raises(GridSimError, match="in the way"):
-        third.check()
-
-
-def test_a_run_that_was_killed_before_its_first_step_begins_again_and_nothing_is_removed(tmp_path):
-    first, second = PLAN.cells(tmp_path)[:2]
-    for cell in (first, second):
-        cell.path.mkdir()
-        cell.write_config()
-        (cell.path / "notes.txt").write_text("dear diary")
-    with open_folder(first.path) as other:  # a job of a comparison that was killed, which goes on
-        fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(RunError, match="another process is at work on it"):
-            first.open()
-    assert second.open() is second
-    for cell in (first, second):
-        assert sorted(path.name for path in cell.path.iterdir()) == ["config.json", "notes.txt"]
-
-
-@contextlib.contextmanager
-def open_folder(path):
-    number = os.open(path, os.O_RDONLY)
-    try:
-        yield number
-    finally:
-        os.close(number)

@@ -1,23 +1,13 @@
 """Finished runs: what is read and measured once, what is damaged, what is refused."""
 
-import dataclasses
 import json
 
 import pytest
 from finished_runs import HELD_OUT, make_run
 
 import gridsim
-from cluster.compare.results import ERROR_FIGURES, errors_of, read_run
+from cluster.compare.results import ERROR_FIGURES, measured, read_run
 from gridsim.errors import GridSimError
-
-
-def test_champions_that_do_not_drive_as_their_summary_says_are_refused(tmp_path):
-    make_run(tmp_path / "r")
-    made = read_run(tmp_path / "r")
-    assert set(errors_of(made)) == set(ERROR_FIGURES)  # however short: it is no other version's
-    other = dataclasses.replace(made, figures={**made.figures, "distance_m": 2000.0})
-    with pytest.raises(GridSimError, match="another version of GridSim made it"):
-        errors_of(other)
 
 
 def test_runs_are_compared_from_python(tmp_path):
@@ -40,14 +30,10 @@ def test_runs_are_compared_from_python(tmp_path):
     [
         ("summary.json", None, "not finished"),
         ("config.json", None, "not a run's folder"),
-        ("champion.npz", None, "no such file"),
         *(("summary.json", text, "damaged") for text in ("", "{", "[" * 100_000, "[1]", "{}")),
         *(("config.json", text, "not a config.json of this GridSim") for text in ('{"settings": []}', '{"format": 3}')),
-        ("champion.npz", "PK", "truncated|not a GridSim file"),
-        ("summary.json", {"champion_sha256": "0" * 64}, "do not belong together"),
         ("summary.json", {"held_out": {**HELD_OUT, "distance_m": None}}, "damaged"),
-        *(("summary.json", {"held_out": HELD_OUT | {"success_rate": x}}, "damaged") for x in (7, True, "0.5", 10**400)),
-        *(("summary.json", {"car_steps": x}, "damaged") for x in (-3, 1e300, float("nan"))),
+        ("summary.json", {"car_steps": 10**400}, "damaged"),
         ("summary.json", {"held_out": {}}, "make it again with --resume"),
     ],
 )
@@ -59,3 +45,13 @@ def test_damaged_or_edited_run_is_refused(tmp_path, file, content, said):
         path.write_text(json.dumps(summary | content) if isinstance(content, dict) else content)
     with pytest.raises(GridSimError, match=rf"^[^\n]*({said})[^\n]*$"):
         read_run(tmp_path / "a")
+
+
+@pytest.mark.parametrize(("content", "said"), [("", "no such file"), ("PK", "truncated|not a GridSim file")])
+def test_a_champion_that_is_damaged_is_told_as_its_errors_are_measured(tmp_path, content, said):
+    make_run(tmp_path / "a")
+    (tmp_path / "a/champion.npz").unlink()
+    if content:
+        (tmp_path / "a/champion.npz").write_text(content)
+    with pytest.raises(GridSimError, match=rf"^[^\n]*({said})[^\n]*$"):
+        measured(read_run(tmp_path / "a"))

@@ -96,8 +96,6 @@ def test_a_long_temporary_folder_is_no_matter(tmp_path: Path) -> None:
     folder.mkdir()
     finish("gridsim-evolve", *TINY, "--workers", "1", "--name", "r", cwd=tmp_path, TMPDIR=str(folder))
     assert list(folder.glob("gs-*")) == []
-    job = "from cluster.commands import jobs; job = jobs._Job(None, None); job.assign([]); job.process.join()"
-    finish("python", "-c", job, cwd=tmp_path, TMPDIR=str(folder))  # of gridsim-compare --jobs
 
 
 @pytest.mark.parametrize(("folder", "why"), [("long" * 25, "is too long for its sockets"), ("none", "No such file")])

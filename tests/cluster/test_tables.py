@@ -1,4 +1,4 @@
-"""Tables of a comparison: medians, what is missing; its pictures."""
+"""Tables of a comparison: medians, what is missing; its picture and its page."""
 
 import csv
 import dataclasses
@@ -14,26 +14,26 @@ from hypothesis import strategies as st
 from PIL import Image
 from rich.console import Console
 
-from cluster.commands.compare import Results
+from cluster.commands.compare import _print
 from cluster.compare import picture, tables
-from cluster.compare.page import page
 from cluster.compare.plan import Plan
+from cluster.compare.report import page
 
 PLAN = Plan(("curved", "seamless"), ("evolution", "random"), 2, budget="1k")
+RUNS = [run("evolution", "curved", 0, 10.0), run("evolution", "curved", 1, 20.0), run("random", "seamless", 0, 5.0)]
 
 
 @given(st.lists(st.integers(-100, 100), min_size=2, max_size=6))
 def test_medians_lie_between_quartiles(values):
-    measured = [run("evolution", "curved", seed, value) for seed, value in enumerate([*values, math.nan, math.inf])]
-    (group,) = tables.group(measured)
-    n, lower, median, upper = group.spread("velocity_error_percent")
-    assert (n, median) == (len(values), np.median(values))
+    made = [run("evolution", "curved", seed, value) for seed, value in enumerate([*values, math.nan, math.inf])]
+    (rows,) = tables.group(made).values()
+    found, (lower, median, upper) = tables.quartiles(rows, "velocity_error_percent")
+    assert (found, median) == (values, np.median(values))
     assert min(values) <= lower <= median <= upper <= max(values)
 
 
 def test_tables_show_what_is_missing():
-    runs = [run("evolution", "curved", 0, 10.0), run("evolution", "curved", 1, 20.0), run("random", "seamless", 0, 5.0)]
-    groups = tables.group(runs, PLAN)
+    groups = tables.group(RUNS, PLAN)
     text = tables.table_md(groups, PLAN).decode()
     assert text.startswith("2 seeds, at most 1k a run, 31 rays, traffic as each road has it by default.\n\n| road |")
     (_, *driving), (_, *errors) = (tables.table(groups, columns) for columns in (tables.DRIVING, tables.ERRORS))
@@ -43,47 +43,40 @@ def test_tables_show_what_is_missing():
         ["seamless", "evolution", "missing"],
         ["seamless", "random search", "1 of 2"],
     ]
-    assert errors[0][3] == "15.0 (12.5 to 17.5)"
-    assert set(errors[1][2:]) == {"–"}
-    assert errors[3][3] == "5.0"
+    assert errors[0][4] == "15.0 (12.5 to 17.5)"
+    assert set(errors[1][3:]) == {"–"}
+    assert errors[3][4] == "5.0"
     rows = list(csv.DictReader(io.StringIO(tables.table_csv(groups, Path()).decode())))
     assert [row["velocity_error_percent"] for row in rows] == ["10.0", "20.0", "", "", "", "", "5.0", ""]
     assert [(row["learner"], row["seed"]) for row in rows[2:4]] == [("random", "0"), ("random", "1")]
 
 
 def test_the_page_links_to_the_drives_of_its_runs(tmp_path):
-    there, gone = (
-        dataclasses.replace(run("evolution", "curved", seed, 10.0), folder=tmp_path / f"a b<{seed}>") for seed in (0, 1)
-    )
+    there, gone = (dataclasses.replace(RUNS[k], folder=tmp_path / f"a b<{k}>") for k in (0, 1))
     there.folder.mkdir()
     (there.folder / "drive.html").touch()
-    Image.new("RGB", (2, 2)).save(tmp_path / "shown.png")
-    folder = tmp_path / "<c>"
-    text = page(folder, tables.group([there, gone]), None, tmp_path / "shown.png").decode()
+    text = page(tmp_path / "<c>", tables.group([there, gone]), None, b"PNG").decode()
     assert '<td><a href="../a%20b%3C0%3E/drive.html">a b&lt;0&gt;</a><td>0<td>90<td>' in text
     assert "<td>a b&lt;1&gt;<td>1<td>90<td>" in text
-    assert "<td>10.0 (10.0 to 10.0)" in text
-    assert 'src="data:image/png;base64,' in text
+    assert "<td>15.0 (12.5 to 17.5)" in text
+    assert 'src="data:image/png;base64,UE5H"' in text
     assert "<title>GridSim: &lt;c&gt;</title>" in text
 
 
 def test_runs_of_different_traffic_and_views_are_not_mixed():
     runs = [run("evolution", "city", 0, 1.0), run("evolution", "city", 0, 1.0, traffic=6)]
-    assert [group.road for group in tables.group(runs)] == ["city, 0 cars", "city, 6 cars"]
+    assert list(tables.group(runs)) == [("city, 0 cars", "evolution"), ("city, 6 cars", "evolution")]
     runs.append(run("evolution", "city", 1, 1.0, traffic=6, observation="grid"))
-    assert {group.name for group in tables.group(runs)} == {"evolution on rays", "evolution on grid"}
-    assert len(tables.group(runs)) == 3
+    assert {name for _, name in tables.group(runs)} == {"evolution on rays", "evolution on grid"}
 
 
 @pytest.mark.parametrize("plan", [None, PLAN])
 def test_the_terminal_shows_the_tables(tmp_path, plan):
-    results = Results(tmp_path, plan)
-    results.runs = [run("evolution", "curved", 0, 12.5), run("random", "seamless", 0, 5.0, car_steps=3e6)]
     shown = io.StringIO()
-    results.show(Console(width=80, file=shown))
+    _print(Console(width=80, file=shown), tmp_path, tables.group(RUNS, plan), plan)
     text = shown.getvalue()
     assert max(map(len, text.splitlines()[:-1])) <= 80
-    for word in ("evolution", "90", "12.5", "Fewer than 3 seeds are too few for a verdict."):
+    for word in ("evolution", "90", "15.0", "Fewer than 3 seeds are too few for a verdict."):
         assert word in text
 
 
@@ -93,9 +86,8 @@ def test_picture_shows_who_was_compared(tmp_path):
         wanted = 0.75 * np.array(colour) + 0.25 * 255
         return (np.abs(pixels - wanted).max(axis=2) < 6).sum() > 500
 
-    groups = tables.group([run(learner, "city", seed, 5.0) for learner in ("evolution", "dqn") for seed in range(2)])
-    picture.comparison(groups, tmp_path / "two.png")
-    picture.comparison([group for group in groups if group.learner == "evolution"], tmp_path / "one.png")
+    both = [run(learner, "city", seed, 5.0) for learner in ("evolution", "dqn") for seed in range(2)]
     evolution, dqn = (0x0B, 0x72, 0x85), (0xF0, 0x8C, 0x00)
-    assert [has(tmp_path / "two.png", colour) for colour in (evolution, dqn)] == [True, True]
-    assert [has(tmp_path / "one.png", colour) for colour in (evolution, dqn)] == [True, False]
+    for runs, there in ((both, [True, True]), (both[:2], [True, False])):
+        picture.comparison(tables.group(runs), tmp_path / "drawn.png")
+        assert [has(tmp_path / "drawn.png", colour) for colour in (evolution, dqn)] == there
