@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
 
 from gridsim.cache import cache_folder
@@ -124,3 +125,10 @@ def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
     third of a step's time. Do not use it for a kernel that returns or stores an array.
     """
     return njit(function, forceinline=True, _nrt=False)
+
+
+def freeze(array: np.ndarray) -> np.ndarray:
+    """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view

@@ -1,7 +1,7 @@
 """Experience of the DQN as arrays, and the compact format of observations.
 
 Episodes are concatenated. An episode of T steps has T + 1 rows. Row t < T has the observation before step t, its
-action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.car.ego.End` of the episode. Row T has the
+action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.state.End` of the episode. Row T has the
 observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. COLLISION, IDLE and SUCCESS terminate: the
 value after them is 0. TIME truncates: the value after it is estimated from row T.
 
@@ -22,8 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution.networks.policy import SPEED_SCALE, CnnSpec, PolicySpec
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 
 _F = np.float32

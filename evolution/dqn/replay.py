@@ -14,9 +14,9 @@ import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, ages, empty, unpack
 from evolution.networks.policy import CnnSpec, PolicySpec
-from gridsim.car.ego import End
 from gridsim.counter import GOLDEN, mix, uniform64
 from gridsim.jit import njit
+from gridsim.state import End
 
 _U = np.uint64
 

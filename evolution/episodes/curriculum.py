@@ -19,11 +19,10 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
-from gridsim.traffic.world import FIELDS, LANE
+from gridsim.state import LANE, TRAFFIC_FIELDS, End
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
@@ -168,7 +167,7 @@ class Curriculum:
         """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
 
         Args: `leader_episodes`; RESULT [e]; the states `rewind` steps before each end, float32 [e, 5], and the traffic
-        at that time, float32 [e, cars, world.FIELDS].
+        at that time, float32 [e, cars, TRAFFIC_FIELDS].
         """
         crashed = np.isin(results["end"], (End.COLLISION, End.IDLE)) & (results["steps"] > 10)
         if crashed.any():
@@ -190,7 +189,7 @@ class Curriculum:
         """
         if seeds not in self._validation:
             maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic)
-            absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
+            absent = np.zeros((len(rows), self.crowd - self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
             self._validation[seeds] = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
         return self._validation[seeds]

@@ -15,20 +15,20 @@ import numpy as np
 from evolution.dqn.experience import NO_ACTION, Experience, empty, store_grid, store_rays
 from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
-from gridsim.car.ego import DISTANCE, FIELDS, PACED, SPEED, STEERING, End, control, look, place, start_from, visit_cells
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import leaf, njit
+from gridsim.jit import freeze, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
-from gridsim.maps.roads import Road, freeze
+from gridsim.maps.roads import Road
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.sensing.rays import fan
+from gridsim.sensing.rays import fan, look
+from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
+from gridsim.step import control, place, start_from, visit_cells
 from gridsim.traffic.behaviour import Drivers, drivers, flow
-from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
 _F, _U = np.float32, np.uint64
 _IDLE = int(End.IDLE)
@@ -93,11 +93,11 @@ class EpisodeSetup(NamedTuple):
 class Workspace(NamedTuple):
     """State and buffers of an episode; reused for the next one."""
 
-    car: np.ndarray  # float32 [FIELDS]
+    car: np.ndarray  # float32 [CAR_FIELDS]
     visits: np.ndarray  # float32 [cells]
     ranges: np.ndarray  # float32 [rays]
     scratch: np.ndarray  # float32, of the network
-    ring: np.ndarray  # float32 [n, FIELDS], the last n states: that of step k in row k % n
+    ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
 
 
@@ -120,11 +120,11 @@ def _copy_world(world, kept):
 def make_workspace(simulation, layers, rows, cars):
     """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
     return Workspace(
-        np.empty(FIELDS, dtype=np.float32),
+        np.empty(CAR_FIELDS, dtype=np.float32),
         np.empty(visit_cells(simulation.road), dtype=np.float32),
         np.empty(simulation.rays, dtype=np.float32),
         np.zeros(scratch_size(layers), dtype=np.float32),
-        np.zeros((rows, FIELDS), dtype=np.float32),
+        np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
     )
 
@@ -303,10 +303,10 @@ def evaluate(
     """Drive every genome through every episode.
 
     Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
-    with, float32 [e, cars, world.FIELDS].
+    with, float32 [e, cars, TRAFFIC_FIELDS].
 
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
-    start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, world.FIELDS]).
+    start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -387,9 +387,9 @@ def trajectory(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive one genome through one episode and record all states.
 
-    Args: as `evaluate`'s; start float32 [5], target m and steps as in EPISODE, world float32 [cars, world.FIELDS].
-    Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
-    `gridsim.car.ego`, and the traffic at these times, float32 [steps + 1, cars, world.FIELDS]).
+    Args: as `evaluate`'s; start float32 [5], target m and steps as in EPISODE, world float32 [cars, TRAFFIC_FIELDS].
+    Returns: (RESULT [], states float32 [steps + 1, CAR_FIELDS] before each step and at the end, with fields as in
+    `gridsim.state`, and the traffic at these times, float32 [steps + 1, cars, TRAFFIC_FIELDS]).
     """
     simulation, cars = simulations_on([road_map], config)[0], 0 if world is None else len(world)
     workspace = make_workspace(simulation, spec.layers, steps + 1, cars)

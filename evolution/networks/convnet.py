@@ -23,8 +23,7 @@ from evolution.networks.policy import (
     CnnSpec,
     greatest,
 )
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze, leaf, njit
 from gridsim.sensing.grid import CELLS
 
 _F = np.float32

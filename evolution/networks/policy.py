@@ -18,8 +18,7 @@ import numpy as np
 
 from evolution.networks.dense import tile
 from gridsim.config import SimConfig
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
 
 RAYS = 31

@@ -15,7 +15,7 @@ import numpy as np
 
 from evolution.networks.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec
 from gridsim.car.vehicle import Action
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze
 
 #: The mirror image of each action.
 MIRRORED_ACTIONS = np.array(

@@ -15,8 +15,7 @@ import numpy as np
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
 from gridsim.counter import GOLDEN, mix
-from gridsim.jit import njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze, njit
 
 
 class Kind(IntEnum):

@@ -34,16 +34,15 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.episodes import Episodes
 from gridsim.envs.observing import Observer, row
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
 from gridsim.sensing.grid import MAX_FRAMES
-from gridsim.traffic.world import LANE
+from gridsim.simulator import Simulator
+from gridsim.state import DISTANCE, LANE, SPEED, End
 from gridsim.view.display import has_display
 
 if TYPE_CHECKING:
@@ -66,9 +65,9 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     its last info as `final_info`. `DISABLED`: the caller resets the cars that have ended before the next step, by
     `reset(options={"reset_mask": mask})`.
 
-    info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of an
-    `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes on
-    and the observation shows neither.
+    info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of a
+    `state.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes
+    on and the observation shows neither.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form

@@ -15,7 +15,8 @@ from gridsim.jit import njit
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build, is_map_file, seed_of_map
-from gridsim.traffic.world import FIELDS, spawn
+from gridsim.state import TRAFFIC_FIELDS
+from gridsim.traffic.world import spawn
 
 _U = np.uint64
 #: The maps of this process's environments, kept while one of them uses them.
@@ -64,7 +65,7 @@ class Episodes:
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
     ) -> tuple[list[Map], np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and worlds [k, traffic, FIELDS] of the current episodes of `which`, unless given."""
+        """Maps [k], starts [k, 5] and worlds [k, traffic, TRAFFIC_FIELDS] of the episodes of cars `which` [k]."""
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
@@ -79,7 +80,7 @@ class Episodes:
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is not None:
             starts[:] = self._checked_start(start, which, maps)
-        worlds = np.empty((len(which), self.traffic, FIELDS), dtype=np.float32)
+        worlds = np.empty((len(which), self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
         on_each: defaultdict[Map, list[int]] = defaultdict(list)
         for k, road_map in enumerate(maps):
             on_each[road_map].append(k)

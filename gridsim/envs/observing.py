@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from gridsim.car.ego import SPEED, STEERING
-from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.sensing.grid import CELLS, grid_table, grids
+from gridsim.simulator import Simulator
+from gridsim.state import SPEED, STEERING
 
 _F = np.float32
 _ALL = slice(None)

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import CROSSING_GAP
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.network import Network
-from gridsim.maps.roads import Strips, freeze
+from gridsim.maps.roads import Strips
 
 Plan = tuple[Strips, Network]  # of a map: its drivable area and its lanes
 

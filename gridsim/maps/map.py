@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, freeze, make_road
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, make_road
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import Road, clearances, freeze
+from gridsim.jit import freeze, leaf, njit
+from gridsim.maps.roads import Road, clearances
 
 _F, _N = np.float32, np.uint64
 _HALF, _NEXT = _F(0.5), _N(1)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gridsim.jit import leaf, njit
+from gridsim.jit import freeze, leaf, njit
 
 CELLS_PER_M = 2  # nodes of the clearance field per metre
 FIELD_FLOOR = -2.0  # m, clearance of byte 0, also of places deeper inside a wall
@@ -161,13 +161,6 @@ def clearances(road, points):
     for k in range(points.shape[0]):
         found[k] = clearance(road, points[k, 0], points[k, 1])
     return found
-
-
-def freeze(array: np.ndarray) -> np.ndarray:
-    """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
-    view = np.ascontiguousarray(array).view()
-    view.setflags(write=False)
-    return view
 
 
 def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:

@@ -21,8 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import SimConfig, constants
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze, leaf, njit
 
 _F, _N = np.float32, np.uint64
 

@@ -17,9 +17,7 @@ from gridsim import config
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
-from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
-from gridsim.traffic.junctions import may_enter
-from gridsim.traffic.world import (
+from gridsim.state import (
     ACCELERATION,
     ALONG,
     COS,
@@ -39,11 +37,10 @@ from gridsim.traffic.world import (
     SWAY,
     X,
     Y,
-    choose_lane,
-    lane_after,
-    point_at,
-    set_pose,
 )
+from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
+from gridsim.traffic.junctions import may_enter
+from gridsim.traffic.world import choose_lane, lane_after, point_at, set_pose
 
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
@@ -400,7 +397,7 @@ def _move(network, drivers, car, ego):
 def flow(network, drivers, world, ego):
     """One control period of a world's traffic. The ego car must not have moved yet.
 
-    Args: world [cars, FIELDS], changed; ego, a car's state of which X to STEERING are read.
+    Args: world [cars, TRAFFIC_FIELDS], changed; ego, a car's state of which X to STEERING are read.
     """
     cars = world.shape[0]
     _find_gaps(network, drivers, world, ego)

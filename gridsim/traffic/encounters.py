@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from gridsim.car.ego import STEERING
+from gridsim.car.collision import boxes_touch
 from gridsim.car.vehicle import advance, path_curvature
 from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import lane_length, wrapped, wrapped_any
-from gridsim.sensing.boxes import boxes_touch
-from gridsim.traffic.world import ALONG, COS, LANE, SHIFT, SIN, SPEED, X, Y, lane_after
+from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, X, Y
+from gridsim.traffic.world import lane_after
 
 _F, _I, _N = np.float32, np.int32, np.uint64
 _ZERO, _ONE = _F(0.0), _F(1.0)

@@ -12,20 +12,7 @@ import numpy as np
 from gridsim import config
 from gridsim.jit import leaf
 from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
-from gridsim.traffic.world import (
-    ALONG,
-    COS,
-    HORIZON,
-    JUNCTION_BEHIND,
-    LANE,
-    NEXT,
-    PERMIT,
-    SECOND_NEXT,
-    SIN,
-    SPEED,
-    X,
-    Y,
-)
+from gridsim.state import ALONG, COS, HORIZON, JUNCTION_BEHIND, LANE, NEXT, PERMIT, SECOND_NEXT, SIN, SPEED, X, Y
 
 _F, _I = np.float32, np.int32
 _ZERO, _HALF = _F(0.0), _F(0.5)

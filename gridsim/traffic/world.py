@@ -1,7 +1,8 @@
 """Worlds: the state of the other cars around one ego car, and where they are spawned.
 
-A world is float32 [cars, FIELDS], with the fields below. Its evolution depends only on that array and on the ego car. A
-car's centre of mass lies on its lane, shifted sideways while it changes lanes or meets the ego car.
+A world is float32 [cars, TRAFFIC_FIELDS] with the columns of `gridsim.state`. Its evolution depends only on that array
+and on the ego car. A car's centre of mass lies on its lane, shifted sideways while it changes lanes or meets the ego
+car.
 """
 
 from __future__ import annotations
@@ -14,30 +15,29 @@ from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SP
 from gridsim.counter import GOLDEN, mix, uniform, uniform64
 from gridsim.jit import leaf, njit
 from gridsim.maps.network import Network, wrapped
+from gridsim.state import (
+    ALONG,
+    COS,
+    DRAWS,
+    JUNCTION_BEHIND,
+    LANE,
+    LANE_TIMER,
+    NEXT,
+    PERMIT,
+    SECOND_NEXT,
+    SEED,
+    SHIFT,
+    SIN,
+    SPEED,
+    SPEED_FACTOR,
+    SWAY,
+    TRAFFIC_FIELDS,
+    X,
+    Y,
+)
 
 _F, _I, _U = np.float32, np.int32, np.uint64
 _ZERO, _ONE = _F(0.0), _F(1.0)
-
-# Fields of a traffic car's state; X to SPEED have the same indices as the ego car's.
-X, Y = 0, 1  # m, centre of mass
-COS, SIN = 2, 3  # heading
-SPEED = 4  # m/s
-LANE = 5  # index of its lane; -1 for an absent car, which is ignored
-ALONG = 6  # m along it
-NEXT, SECOND_NEXT = 7, 8  # its next two lanes
-JUNCTION_BEHIND = 9  # junction lane on which its rear may still be, or -1
-PERMIT = 10  # junction lane that it may enter next, or -1
-SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
-SPEED_FACTOR = 12  # its desired speed, relative to the lane's
-SEED = 13  # of its random turns, below 2 ** 24
-DRAWS = 14  # random numbers drawn so far, one a lane
-ACCELERATION = 15  # m/s2, its acceleration in this step
-HORIZON = 16  # m ahead that it looks in this step
-GAP = 17  # m from its middle to the nearest obstacle
-LEAD_SPEED = 18  # m/s, of that obstacle along its heading
-LANE_TIMER = 19  # control steps until its next decision on a change of lanes
-SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
-FIELDS = 21
 
 
 @leaf
@@ -138,11 +138,11 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
 
 
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
-    """Worlds float32 [n, cars, FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
+    """Worlds float32 [n, cars, TRAFFIC_FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
     Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
-    worlds, traffic = np.zeros((len(starts), cars, FIELDS), dtype=np.float32), config.traffic
+    worlds, traffic = np.zeros((len(starts), cars, TRAFFIC_FIELDS), dtype=np.float32), config.traffic
     worlds[:, :, LANE] = -1.0
     if cars and len(network.offsets) > 1:
         half = config.vehicle.length / 2

@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import check_name
-from gridsim.traffic.world import LANE, spawn
+from gridsim.simulator import Simulator
+from gridsim.state import DISTANCE, LANE, SPEED, STEPS, End, X, Y, poses_of
+from gridsim.traffic.world import spawn
 from gridsim.view.render import Renderer, Window, interpolate
 
 COLUMNS = (
@@ -72,13 +72,6 @@ def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int)
     key = np.random.SeedSequence([road_map.seed, episode, *b"drive"]).generate_state(1, np.uint64)
     worlds = spawn(road_map.network, start[None], simulator.worlds.shape[1], key, simulator.config)
     simulator.reset(road_map, start[None], worlds=worlds)
-
-
-def poses_of(states: np.ndarray) -> np.ndarray:
-    """Poses float32 [..., 5] of states [..., FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
-    poses = states[..., [X, Y, SIN, SPEED, STEERING]]
-    poses[..., 2] = np.arctan2(states[..., SIN], states[..., COS])
-    return poses
 
 
 def action_for(keys: set[str], speed: float) -> Action:
@@ -185,8 +178,8 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
 def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     """Replay a recorded drive by its actions.
 
-    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
-    traffic float32 [n, others, world.FIELDS]).
+    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, CAR_FIELDS]; ranges float32 [n, rays] in m;
+    the traffic float32 [n, others, TRAFFIC_FIELDS]).
     Raises: GridSimError with one line if an episode ends too early, which means that the map is another one.
     """
     simulator = manual(drive.traffic)
@@ -206,7 +199,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
 
 
 def _present(world: np.ndarray) -> np.ndarray:
-    """The cars [n, world.FIELDS] of a world that are on a lane: a copy."""
+    """The cars [n, TRAFFIC_FIELDS] of a world that are on a lane: a copy."""
     return world[world[:, LANE] >= 0.0]
 
 

@@ -13,11 +13,11 @@ from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.rollout import collect, evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode
-from gridsim.car.ego import SPEED, STEERING, End
 from gridsim.config import SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
+from gridsim.simulator import Simulator
+from gridsim.state import SPEED, STEERING, End
 
 F = np.float32
 CONFIG = SimConfig()

@@ -5,8 +5,8 @@ import pytest
 
 from evolution.episodes.curriculum import Curriculum, CurriculumConfig
 from evolution.episodes.rollout import RESULT
-from gridsim.car.ego import End
 from gridsim.maps.scenarios import build
+from gridsim.state import End
 
 CONFIG = CurriculumConfig(maps=3, first_maps=2, groups=3, starts=2, crash_starts=2, crash_memory=10, leader_episodes=8)
 

@@ -11,7 +11,7 @@ from evolution.dqn.experience import NO_ACTION, Experience
 from evolution.dqn.learner import RANDOM_SHARE, DqnConfig, DqnLearner, QNetwork, exploration, new_weights, tanh
 from evolution.dqn.replay import Batch, Replay
 from evolution.networks.policy import PolicySpec
-from gridsim.car.ego import End
+from gridsim.state import End
 
 F = np.float32
 SPEC = PolicySpec.parse("mlp:5")

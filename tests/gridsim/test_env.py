@@ -18,16 +18,15 @@ from gymnasium.wrappers import TimeAwareObservation
 
 import gridsim
 from gridsim import ENVIRONMENTS
-from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.episodes import Episodes
-from gridsim.envs.simulator import Simulator, views
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.scenarios import REGISTRY
 from gridsim.sensing.grid import CELLS, grid_table, grids
-from gridsim.traffic.world import LANE
+from gridsim.simulator import Simulator, views
+from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End
 
 IDS = list(ENVIRONMENTS)
 Maps = dict[str, list[Map]]

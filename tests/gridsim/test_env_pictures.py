@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
 
+from gridsim import simulator
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig
-from gridsim.envs import episodes, observing, simulator
+from gridsim.envs import episodes, observing
 from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
 from gridsim.maps import map
 from gridsim.maps.map import Map

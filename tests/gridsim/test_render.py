@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pictures import read
 
-from gridsim.car.ego import COS, FIELDS, SIN, SPEED, STEERING, X, Y
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.simulator import Simulator
+from gridsim.state import CAR_FIELDS, COS, SIN, SPEED, STEERING, X, Y
 from gridsim.view import paint, render
 from gridsim.view.render import Renderer, interpolate
 
@@ -28,7 +28,7 @@ def state(scenario):
 
 
 def car_at(x, y, heading=0.0):
-    car = np.zeros(FIELDS, dtype=np.float32)
+    car = np.zeros(CAR_FIELDS, dtype=np.float32)
     car[[X, Y, COS, SIN]] = x, y, np.cos(heading), np.sin(heading)
     return car
 

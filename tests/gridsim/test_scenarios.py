@@ -12,16 +12,17 @@ from pictures import crashes
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from gridsim.car.ego import SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import CROSSING_GAP
-from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
+from gridsim.jit import freeze
 from gridsim.maps.generators import curved, highway, roundabout
 from gridsim.maps.lanes import Path, beside, lay_lanes
 from gridsim.maps.map import sample_starts
-from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances, freeze
+from gridsim.maps.roads import FIELD_FLOOR, FIELD_UNITS, clearances
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, TRAINING_SEED, VALIDATION_SEED, build
+from gridsim.simulator import Simulator
+from gridsim.state import SPEED, End
 
 F = np.float32
 ROUND = 215.0  # m, of the shortest loop: more than the 200 m within which ground driven again counts nothing

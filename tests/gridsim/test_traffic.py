@@ -11,30 +11,35 @@ from hypothesis import strategies as st
 from pictures import cars_on, crashes, straight_road
 from scipy import stats
 
-from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
+from gridsim.car.collision import boxes_touch, hits_box
 from gridsim.car.vehicle import path_curvature
 from gridsim.config import SimConfig, VehicleConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
-from gridsim.maps.roads import clearances, freeze
+from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.sensing.boxes import boxes_touch, hits_box
-from gridsim.traffic.behaviour import drivers, flow, idm
-from gridsim.traffic.world import (
+from gridsim.state import (
     ALONG,
+    COS,
     DRAWS,
-    FIELDS,
     LANE,
     LANE_TIMER,
     NEXT,
     PERMIT,
     SECOND_NEXT,
     SEED,
+    SIN,
+    SPEED,
     SPEED_FACTOR,
-    spawn,
+    STEERING,
+    TRAFFIC_FIELDS,
+    X,
+    Y,
 )
+from gridsim.traffic.behaviour import drivers, flow, idm
+from gridsim.traffic.world import spawn
 
 F = np.float32
 CONFIG = SimConfig()
@@ -84,7 +89,7 @@ def ego(x, y, heading=0.0, speed=0.0):
 
 @njit(nogil=True)
 def _watch(network, drivers, constants, world, ego, history):
-    """Let traffic flow, kept in history [steps, cars, FIELDS]; returns how often a car overlapped another."""
+    """Let traffic flow, kept in history [steps, cars, TRAFFIC_FIELDS]; returns how often a car overlapped another."""
     overlaps, width, height = 0, network.width, network.height
     for step in range(len(history)):
         flow(network, drivers, world, ego)
@@ -97,7 +102,7 @@ def _watch(network, drivers, constants, world, ego, history):
 
 
 def watch(network, world, seconds, ego=NOBODY, config=CONFIG):
-    """States [steps, cars, FIELDS] of a world after each step; no two cars overlap in any of them."""
+    """States [steps, cars, TRAFFIC_FIELDS] of a world after each step; no two cars overlap in any of them."""
     history = np.zeros((round(seconds / DT), *world.shape), dtype=F)
     assert _watch(network, drivers(config), constants(config), world.copy(), ego, history) == 0
     return history
@@ -444,7 +449,7 @@ def test_a_change_that_is_refused_leaves_no_trace(abreast):
     flow(abreast, D, world, NOBODY)
     flow(abreast, D, asked, NOBODY)
     assert asked[1, DRAWS] == world[1, DRAWS] + 2  # it was about to change
-    same = np.setdiff1d(np.arange(FIELDS), [DRAWS, LANE_TIMER])
+    same = np.setdiff1d(np.arange(TRAFFIC_FIELDS), [DRAWS, LANE_TIMER])
     np.testing.assert_array_equal(asked[:, same], world[:, same])
 
 

@@ -1,4 +1,4 @@
-"""Batches of cars; what one car does in a control period is in `car.ego`."""
+"""Batches of cars; what one car does in a control period is in `gridsim.step`."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place, visit_cells
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.rays import fan
+from gridsim.sensing.rays import fan, look
+from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
+from gridsim.step import control, place, visit_cells
 from gridsim.traffic.behaviour import Drivers, drivers, flow
-from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
 
 MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
 
@@ -86,10 +86,10 @@ class Simulator:
     A car's behaviour depends only on its own map, start and actions, not on the batch it is in.
 
     Attributes, which steps and resets change:
-        cars: float32 [n, ego.FIELDS].
+        cars: float32 [n, CAR_FIELDS].
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         ends: uint8 [n], End.
-        worlds: float32 [n, traffic, world.FIELDS], the other cars around each.
+        worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
         closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `boxes.cast_boxes`.
     """
@@ -118,7 +118,7 @@ class Simulator:
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode needs a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
         constants(self.config)  # raises for a wrong configuration
-        self.cars = np.zeros((cars, FIELDS), dtype=np.float32)
+        self.cars = np.zeros((cars, CAR_FIELDS), dtype=np.float32)
         self.visits = np.zeros((cars, 0), dtype=np.float32)
         self.ends = np.zeros(cars, dtype=np.uint8)
         self.worlds = np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32)  # all are absent
@@ -150,7 +150,7 @@ class Simulator:
             maps: the map of each car [k], or one for all.
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             cars: indices [k] of the cars that begin; None is all of them.
-            worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
+            worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.
 
         Raises: ValueError with one line for a wrong shape or a start that is not finite.
         """
@@ -222,7 +222,7 @@ class Simulator:
 
 
 def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:
-    """What cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS].
+    """What cars in states [n, CAR_FIELDS] see among traffic [n, others, TRAFFIC_FIELDS].
 
     Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].
     """

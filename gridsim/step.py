@@ -1,76 +1,37 @@
-"""The ego car: its state, float32 [FIELDS] with the fields below, and its control step."""
+"""What the ego car does in a control step: drive, collide, gain new ground, reach the end of its episode."""
 
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 
 import numpy as np
 
-from gridsim.car.vehicle import advance, front_velocity, path_curvature
+from gridsim.car.collision import collides, hits_box, stands_ahead, top_speed_near
+from gridsim.car.vehicle import advance, path_curvature
 from gridsim.config import REENTRY, SUBSTEP
 from gridsim.jit import leaf, njit
-from gridsim.maps.roads import VISIT_CELL, Road, clearance
-from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
-from gridsim.sensing.rays import sense
+from gridsim.maps.roads import VISIT_CELL, Road
+from gridsim.state import (
+    CELL,
+    COS,
+    DEBT,
+    DISTANCE,
+    FRESH,
+    IDLE,
+    ODOMETER,
+    PACED,
+    SIN,
+    SPEED,
+    STEERING,
+    STEPS,
+    X,
+    Y,
+)
 
 _F, _I = np.float32, np.int32
-_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
-
-# Fields of a car's state.
-X, Y = 0, 1  # m, centre of mass
-COS, SIN = 2, 3  # heading
-SPEED = 4  # m/s, negative backwards
-STEERING = 5  # rad, left positive
-DISTANCE = 6  # m of new ground
-PACED = 7  # m of new ground at a speed within the scenario's interval
-ODOMETER = 8  # m driven, either way
-DEBT = 9  # m reversed that must be driven forward again before distance counts
-IDLE = 10  # control steps in a row without progress
-STEPS = 11  # control steps
-CELL = 12  # index of the visit cell the car is in
-FRESH = 13  # 1 if this cell's ground is new
-FIELDS = 14
+_ZERO, _ONE = _F(0.0), _F(1.0)
 
 _VISIT_SCALE = _F(1.0 / VISIT_CELL)
-
-
-class End(IntEnum):
-    """How an episode ended."""
-
-    RUNNING = 0
-    COLLISION = 1  # off the road or into a car
-    IDLE = 2  # too many steps without progress
-    SUCCESS = 3  # the target distance is reached
-    TIME = 4  # the time limit (truncation)
-
-
-# Points on the outline that are checked against the edge, as shares of half length and half width: corners first.
-_OUTLINE = np.array(
-    [[1, 1], [1, -1], [-1, 1], [-1, -1], [0.5, 1], [0.5, -1], [0, 1], [0, -1], [-0.5, 1], [-0.5, -1], [1, 0], [-1, 0]],
-    dtype=np.float32,
-)
-_OUTLINE.setflags(write=False)
-
-
-@leaf
-def collides(road, constants, x, y, cosine, sine):
-    """Whether any part of the car's outline is off the road."""
-    length, width = constants.half_length, constants.half_width
-    # Two circles cover the car, one each half. If both are clear of the edge, the outline need not be checked.
-    half = _HALF * length
-    radius = math.sqrt(half * half + width * width)
-    front = clearance(road, x + half * cosine, y + half * sine)
-    rear = clearance(road, x - half * cosine, y - half * sine)
-    if min(front, rear) > radius + _F(0.02):
-        return False
-    if min(front, rear) < _ZERO:
-        return True
-    for k in range(_OUTLINE.shape[0]):
-        along, across = _OUTLINE[k, 0] * length, _OUTLINE[k, 1] * width
-        if clearance(road, x + along * cosine - across * sine, y + along * sine + across * cosine) < _ZERO:
-            return True
-    return False
 
 
 @njit
@@ -112,27 +73,10 @@ def start_from(car, start):
 
 
 @leaf
-def look(road, constants, fan, car, world, ranges, closing):
-    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
-
-    Here and below, a world of None means no traffic: Numba then leaves the traffic code out. closing is as in
-    `boxes.cast_boxes`; without traffic it is not changed.
-    """
-    x = car[X] + constants.front_axle * car[COS]
-    y = car[Y] + constants.front_axle * car[SIN]
-    sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
-    if world is not None:
-        velocity = (_ZERO, _ZERO)
-        if closing is not None:
-            velocity = front_velocity(constants, car[SPEED], car[STEERING])
-        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
-
-
-@leaf
 def control(road, constants, car, visits, world, acceleration, steering, target, max_steps):
     """One control step of a car: advance in sub-steps with collision checks, count new ground, check for the end.
 
-    The traffic in `world` must already have moved.
+    The traffic in `world` must already have moved; None means that there is none, and Numba compiles its branches away.
     Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits, m of new ground and control steps.
     Returns: an End as a number.
     """
