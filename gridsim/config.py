@@ -149,6 +149,7 @@ class Constants(NamedTuple):
     braking: np.float32  # m/s2
     grip: np.float32  # m/s2
     dt: np.float32  # s
+    rays: np.int32
     ray_range: np.float32  # m
     ray_first: np.float32  # rad, of the rightmost ray from the heading
     ray_step: np.float32  # rad
@@ -202,6 +203,7 @@ def constants(config: SimConfig) -> Constants:
         braking=f(vehicle.braking),
         grip=f(vehicle.lateral_grip),
         dt=f(episode.control_period),
+        rays=np.int32(sensors.rays),
         ray_range=f(sensors.range),
         ray_first=f(-view / 2),
         ray_step=f(view / (sensors.rays - 1)),

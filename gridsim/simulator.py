@@ -13,16 +13,15 @@ from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.rays import fan, look
 from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
-from gridsim.step import control, place, visit_cells
-from gridsim.traffic.behaviour import Drivers, drivers, flow
+from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
+from gridsim.traffic.behaviour import Drivers
 
 MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
 
 
 class Physics(NamedTuple):
-    """What all cars share, as kernels read it; arrays are read-only."""
+    """A `step.Simulation` of several maps."""
 
     atlas: Atlas
     constants: Constants
@@ -30,16 +29,23 @@ class Physics(NamedTuple):
     fan: np.ndarray
 
 
+@njit
+def _on_map(physics, row):
+    """The Simulation of a map of the atlas."""
+    road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
+    return Simulation(road, network, physics.constants, physics.drivers, physics.fan)
+
+
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; they look around."""
     for row, first, last in runs:
-        road = road_of(physics.atlas, row)
+        simulation = _on_map(physics, row)
         for k in order[first:last]:
             i = which[k]
             world = None if worlds is None else worlds[i]
-            place(road, starts[k], cars[i], visits[i])
-            look(road, physics.constants, physics.fan, cars[i], world, ranges[i], closing[i])
+            place(simulation, starts[k], cars[i], visits[i])
+            look(simulation, cars[i], world, ranges[i], closing[i])
 
 
 @njit(nogil=True)
@@ -49,10 +55,11 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
     `order` lists the cars map by map; runs int64 [maps, 3]: a map's row in the atlas, and its cars' range in `order`.
     seen: ranges and closing speeds [n, rays] and rewards [n], to be filled.
     """
-    constants, drivers = physics.constants, physics.drivers
+    constants = physics.constants
     ranges, closing, rewards = seen
     for row, first, last in runs:
-        road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
+        simulation = _on_map(physics, row)
+        fastest = simulation.road.speed_high
         for i in order[first:last]:
             car = cars[i]
             world = None if worlds is None else worlds[i]
@@ -64,12 +71,10 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 else:
                     pedal, wheel = actions[i, 0], actions[i, 1]
                     acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
-                if world is not None:
-                    flow(network, drivers, world, car)
-                ends[i] = control(road, constants, car, visits[i], world, acceleration, steering, target, max_steps)
-            look(road, constants, physics.fan, car, world, ranges[i], closing[i])
+                ends[i] = step(simulation, car, visits[i], world, acceleration, steering, target, max_steps)
+            look(simulation, car, world, ranges[i], closing[i])
             if runs_on:
-                gained, fastest = car[DISTANCE] - before, road.speed_high
+                gained = car[DISTANCE] - before
                 rewards[i] = reward(ranges[i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
 
 
@@ -183,9 +188,8 @@ class Simulator:
 
     def _kernel_physics(self) -> Physics:
         if self._physics is None:
-            k, rays = constants(self.config), self.config.sensors.rays
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
-            self._physics = Physics(atlas, k, drivers(self.config), fan(rays, k.ray_first, k.ray_step))
+            self._physics = Physics(atlas, *parameters(self.config))
         return self._physics
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
@@ -226,12 +230,11 @@ def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
 
     Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].
     """
-    k = constants(config)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    simulation = simulations_on([scenario], config)[0]
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     closing = np.zeros_like(ranges)
     for car, world, seen, speeds in zip(cars, worlds, ranges, closing, strict=True):
-        look(scenario.road, k, rays, car, world, seen, speeds)
+        look(simulation, car, world, seen, speeds)
     return ranges, closing
 
 

@@ -1,16 +1,26 @@
-"""What the ego car does in a control step: drive, collide, gain new ground, reach the end of its episode."""
+"""A control step: traffic moves, the ego car drives, collides, gains new ground or ends its episode, and looks around.
+
+Everything that drives cars is a loop over `step` and `look`: `gridsim.simulator` and `evolution.episodes.rollout`.
+In kernels, a world of None means no traffic: Numba then compiles that branch away.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from gridsim.car.collision import collides, hits_box, stands_ahead, top_speed_near
-from gridsim.car.vehicle import advance, path_curvature
-from gridsim.config import REENTRY, SUBSTEP
+from gridsim.car.vehicle import advance, front_velocity, path_curvature
+from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
 from gridsim.jit import leaf, njit
+from gridsim.maps.map import Map
+from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
+from gridsim.sensing.boxes import cast_boxes
+from gridsim.sensing.rays import fan, sense
 from gridsim.state import (
     CELL,
     COS,
@@ -27,11 +37,34 @@ from gridsim.state import (
     X,
     Y,
 )
+from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
 
 _F, _I = np.float32, np.int32
 _ZERO, _ONE = _F(0.0), _F(1.0)
 
 _VISIT_SCALE = _F(1.0 / VISIT_CELL)
+
+
+class Simulation(NamedTuple):
+    """A map and the simulator's parameters as kernels read them."""
+
+    road: Road
+    network: Network
+    constants: Constants
+    drivers: Drivers
+    fan: np.ndarray  # of `rays.fan`
+
+
+def parameters(config: SimConfig) -> tuple[Constants, Drivers, np.ndarray]:
+    """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
+    k = constants(config)
+    return k, drivers(config), fan(config.sensors.rays, k.ray_first, k.ray_step)
+
+
+def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
+    """A Simulation for each map. Raises: ValueError for an invalid configuration."""
+    shared = parameters(config)
+    return [Simulation(each.road, each.network, *shared) for each in road_maps]
 
 
 @njit
@@ -51,8 +84,9 @@ def visit_cell(road, x, y):
 
 
 @leaf
-def place(road, start, car, visits):
+def place(simulation, start, car, visits):
     """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
+    road = simulation.road
     car[:] = _ZERO
     car[X] = start[0] - math.floor(start[0] / road.width) * road.width
     car[Y] = start[1] - math.floor(start[1] / road.height) * road.height
@@ -73,13 +107,32 @@ def start_from(car, start):
 
 
 @leaf
-def control(road, constants, car, visits, world, acceleration, steering, target, max_steps):
-    """One control step of a car: advance in sub-steps with collision checks, count new ground, check for the end.
+def look(simulation, car, world, ranges, closing):
+    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
-    The traffic in `world` must already have moved; None means that there is none, and Numba compiles its branches away.
+    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], if not None, as in `boxes.cast_boxes`.
+    """
+    road, constants, fan = simulation.road, simulation.constants, simulation.fan
+    x = car[X] + constants.front_axle * car[COS]
+    y = car[Y] + constants.front_axle * car[SIN]
+    sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
+    if world is not None:
+        velocity = (_ZERO, _ZERO)
+        if closing is not None:
+            velocity = front_velocity(constants, car[SPEED], car[STEERING])
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
+
+
+@leaf
+def step(simulation, car, visits, world, acceleration, steering, target, max_steps):
+    """One control step: advance in sub-steps with collision checks, count new ground, check for the end.
+
     Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits, m of new ground and control steps.
     Returns: an End as a number.
     """
+    road, constants = simulation.road, simulation.constants
+    if world is not None:
+        step_traffic(simulation.network, simulation.drivers, world, car)
     car[STEERING] = steering
     x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
     curvature = path_curvature(constants, speed, car[STEERING])

@@ -17,18 +17,14 @@ from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
-from gridsim.config import Constants, SimConfig, constants
+from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
 from gridsim.jit import freeze, leaf, njit
 from gridsim.maps.map import Map
-from gridsim.maps.network import Network
-from gridsim.maps.roads import Road
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.sensing.rays import fan, look
 from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
-from gridsim.step import control, place, start_from, visit_cells
-from gridsim.traffic.behaviour import Drivers, drivers, flow
+from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
 _F, _U = np.float32, np.uint64
 _IDLE = int(End.IDLE)
@@ -62,24 +58,6 @@ def policy_buffers(spec: PolicySpec, config: SimConfig) -> tuple[np.ndarray | No
     if config.sensors.rays != RAYS:
         raise GridSimError(f"{spec} sees {RAYS} rays, the sensor has {config.sensors.rays}")
     return np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None, None
-
-
-class Simulation(NamedTuple):
-    """A map and the simulator's parameters as kernels read them."""
-
-    road: Road
-    network: Network
-    constants: Constants
-    drivers: Drivers
-    fan: np.ndarray
-    rays: int
-
-
-def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
-    """A Simulation for each map."""
-    k, others = constants(config), drivers(config)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return [Simulation(s.road, s.network, k, others, rays, config.sensors.rays) for s in road_maps]
 
 
 class EpisodeSetup(NamedTuple):
@@ -122,7 +100,7 @@ def make_workspace(simulation, layers, rows, cars):
     return Workspace(
         np.empty(CAR_FIELDS, dtype=np.float32),
         np.empty(visit_cells(simulation.road), dtype=np.float32),
-        np.empty(simulation.rays, dtype=np.float32),
+        np.empty(simulation.constants.rays, dtype=np.float32),
         np.zeros(scratch_size(layers), dtype=np.float32),
         np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
@@ -146,7 +124,7 @@ class Recorder(NamedTuple):
 @leaf
 def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
-    look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.ranges, closing)
+    look(simulation, car, world, workspace.ranges, closing)
     if grid_buffers is None:
         encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
     else:
@@ -179,25 +157,22 @@ def _choose_action(packed, layers, car, workspace, grid_buffers, begun):
 
 
 @leaf
-def _explore(recorder, step, action, actions):
+def _explore(recorder, steps, action, actions):
     """A random action with probability epsilon, else the given one. Uses one random number a step."""
-    bits = mix(mix(recorder.key) + _U(step) * GOLDEN)
+    bits = mix(mix(recorder.key) + _U(steps) * GOLDEN)
     if uniform(bits) < recorder.epsilon:
         return int((bits & _U(0xFFFFFFFF)) * _U(actions) >> _U(32))
     return action
 
 
 @leaf
-def _control_step(simulation, setup, car, visits, world, action):
-    """One control step of the car and of the traffic around it. Returns an End as a number.
+def _drive(simulation, setup, car, visits, world, action):
+    """One control step with an action. Returns an End as a number.
 
     A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
     """
-    if world is not None:
-        flow(simulation.network, simulation.drivers, world, car)
-    k = simulation.constants
-    acceleration, steering = act(k, action, car[SPEED], car[STEERING])
-    return control(simulation.road, k, car, visits, world, acceleration, steering, setup.target, setup.steps)
+    acceleration, steering = act(simulation.constants, action, car[SPEED], car[STEERING])
+    return step(simulation, car, visits, world, acceleration, steering, setup.target, setup.steps)
 
 
 @njit(nogil=True)
@@ -208,7 +183,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
     is NaN, the episode ends as IDLE; so does the last recorded step, if any.
     """
     car = workspace.car
-    place(simulation.road, setup.start, car, workspace.visits)
+    place(simulation, setup.start, car, workspace.visits)
     keep = workspace.ring.shape[0]
     end = 0
     steps = 0
@@ -236,7 +211,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             if world is not None:
                 _copy_world(world, workspace.world_ring[steps % keep])
         before = car[DISTANCE]
-        end = _control_step(simulation, setup, car, workspace.visits, world, action)
+        end = _drive(simulation, setup, car, workspace.visits, world, action)
         steps += 1
     result["distance"], result["paced"] = car[DISTANCE], car[PACED]
     result["steps"], result["end"] = steps, end

@@ -12,15 +12,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsim.car.vehicle import front_velocity
 from gridsim.jit import freeze, leaf
 from gridsim.maps.roads import CELLS_PER_M, THICK_WALL
-from gridsim.sensing.boxes import cast_boxes
 from gridsim.sensing.simd import LEAP, MARGIN, SIMD_RAYS, vector_march
-from gridsim.state import COS, SIN, SPEED, STEERING, X, Y
 
-_F = np.float32
-_ZERO, _SCALE = _F(0.0), _F(CELLS_PER_M)
+_SCALE = np.float32(CELLS_PER_M)
 _march, _march_among_thin_walls = vector_march(16, False), vector_march(24, True)
 
 
@@ -51,20 +47,3 @@ def sense(road, fan, reach, x, y, cosine, sine, ranges):
             _march(road.field, road.columns, road.rows, px0, py0, reach, cosine, sine,
                    fan, block, LEAP, ranges)
         # fmt: on
-
-
-@leaf
-def look(road, constants, fan, car, world, ranges, closing):
-    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
-
-    Args: a world, or None for no traffic: Numba then compiles that branch away; closing float32 [rays] or None, as in
-    `boxes.cast_boxes`. Without traffic it is not changed.
-    """
-    x = car[X] + constants.front_axle * car[COS]
-    y = car[Y] + constants.front_axle * car[SIN]
-    sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
-    if world is not None:
-        velocity = (_ZERO, _ZERO)
-        if closing is not None:
-            velocity = front_velocity(constants, car[SPEED], car[STEERING])
-        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)

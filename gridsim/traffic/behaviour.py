@@ -394,7 +394,7 @@ def _move(network, drivers, car, ego):
 
 
 @leaf
-def flow(network, drivers, world, ego):
+def step_traffic(network, drivers, world, ego):
     """One control period of a world's traffic. The ego car must not have moved yet.
 
     Args: world [cars, TRAFFIC_FIELDS], changed; ego, a car's state of which X to STEERING are read.

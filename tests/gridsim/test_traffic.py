@@ -38,7 +38,7 @@ from gridsim.state import (
     X,
     Y,
 )
-from gridsim.traffic.behaviour import drivers, flow, idm
+from gridsim.traffic.behaviour import drivers, idm, step_traffic
 from gridsim.traffic.world import spawn
 
 F = np.float32
@@ -92,7 +92,7 @@ def _watch(network, drivers, constants, world, ego, history):
     """Let traffic flow, kept in history [steps, cars, TRAFFIC_FIELDS]; returns how often a car overlapped another."""
     overlaps, width, height = 0, network.width, network.height
     for step in range(len(history)):
-        flow(network, drivers, world, ego)
+        step_traffic(network, drivers, world, ego)
         history[step] = world
         for i in range(len(world)):
             x, y, cosine, sine = world[i, X], world[i, Y], world[i, COS], world[i, SIN]
@@ -220,7 +220,7 @@ def test_the_ego_car_in_the_lane_is_followed_and_waited_for(ring):
     car = ego(440.0, 32.7, 0.05, 4.0)
     for _ in range(600):
         car[X] = (car[X] + 0.4) % 1024
-        flow(ring, D, world, car)
+        step_traffic(ring, D, world, car)
         assert (car[X] - world[0, ALONG]) % 1024 > LENGTH
     assert world[:, SPEED] == pytest.approx(4.0, abs=0.1)
     assert (car[X] - world[0, ALONG]) % 1024 < LENGTH + oracle.equilibrium_gap(CONFIG, 4.0, 12.0) + 3.0
@@ -261,7 +261,7 @@ def test_who_meets_the_ego_car_keeps_to_the_right_and_passes(narrow, lane, lengt
     car = ego(world[0, X] + 80.0 * ahead, 32.0, math.pi * (1 - lane), 6.0)
     right, speeds = [], []
     for _ in range(300):
-        flow(narrow, others, world, car)
+        step_traffic(narrow, others, world, car)
         car[X] -= 6.0 * DT * ahead
         dx = wrapped(F(car[X] - world[0, X]), narrow.width)
         assert not boxes_touch(k, dx, car[Y] - world[0, Y], world[0, COS], world[0, SIN], car[COS], car[SIN])
@@ -294,7 +294,7 @@ def test_a_car_in_a_junction_foresees_the_ego_car(crossing, turn, late):
                 heading += angle
             car = ego(x, y, heading, 6.0)
             car[STEERING] = turn
-            flow(crossing, D, world, car if foresees else NOBODY)
+            step_traffic(crossing, D, world, car if foresees else NOBODY)
             dx, dy = car[X] - world[0, X], car[Y] - world[0, Y]
             touched |= boxes_touch(K, dx, dy, world[0, COS], world[0, SIN], car[COS], car[SIN])
         return touched
@@ -357,7 +357,7 @@ def test_the_ego_car_that_comes_crosswise_goes_first(crossing, speed, phase):
     world = cars_on(crossing, (0, 105.0, 6.0, 1.0))
     car = ego(128.0, 128.0 - 2.0 * speed - phase * speed / 15.0, math.pi / 2, speed)
     while car[Y] < 132.0:
-        flow(crossing, D, world, car)
+        step_traffic(crossing, D, world, car)
         assert world[0, LANE] == 0
         car[Y] += speed * DT
     car[Y] = 150.0
@@ -416,7 +416,7 @@ def test_a_car_changes_lanes_for_a_faster_one_behind(abreast, behind, gives_way)
     """Equation 2 of Kesting et al. 2007: a car that gains nothing itself moves over for what its follower gains."""
     world = cars_on(abreast, (1, 200.0, 8.0, 0.4), (1, 200.0 - behind, 8.0, 1.0))
     world[1, LANE_TIMER] = 9.0
-    flow(abreast, D, world, NOBODY)
+    step_traffic(abreast, D, world, NOBODY)
     assert (world[0, LANE] == 0) == gives_way
 
 
@@ -425,7 +425,7 @@ def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
     ahead, follower = (1, 214.8, 8.0, 0.4), (0, 186.0, 8.0, 2.0)
     world = cars_on(abreast, ahead, (1, 200.0, 8.0, 0.8), follower, (0, 222.0, 8.0, 0.4))
     world[[0, 2, 3], LANE_TIMER] = 9.0
-    flow(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
+    step_traffic(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
     assert world[1, LANE] == 0
 
 
@@ -436,7 +436,7 @@ def test_no_car_cuts_in_where_its_new_follower_would_have_to_brake_hard(abreast,
     world[[0, 2], LANE_TIMER] = 9.0
     brakes = -oracle.idm(CONFIG, 16.0, 24.0, behind - LENGTH, 8.0)
     assert (brakes <= CONFIG.traffic.safe_braking) == changes
-    flow(abreast, D._replace(politeness=F(0.0)), world, NOBODY)
+    step_traffic(abreast, D._replace(politeness=F(0.0)), world, NOBODY)
     assert (world[1, LANE] == 0) == changes
 
 
@@ -446,8 +446,8 @@ def test_a_change_that_is_refused_leaves_no_trace(abreast):
     world[:, LANE_TIMER] = 9.0
     asked = world.copy()
     asked[1, LANE_TIMER] = 0.0
-    flow(abreast, D, world, NOBODY)
-    flow(abreast, D, asked, NOBODY)
+    step_traffic(abreast, D, world, NOBODY)
+    step_traffic(abreast, D, asked, NOBODY)
     assert asked[1, DRAWS] == world[1, DRAWS] + 2  # it was about to change
     same = np.setdiff1d(np.arange(TRAFFIC_FIELDS), [DRAWS, LANE_TIMER])
     np.testing.assert_array_equal(asked[:, same], world[:, same])
