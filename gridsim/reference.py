@@ -104,21 +104,15 @@ def errors(parts: Sequence[Series], vehicle: VehicleConfig) -> dict[str, float]:
 
     velocity = [np.abs(part.speed - part.reference_speed) for part in parts]
     steering = [np.abs(np.degrees(part.steering - part.reference_steering)) for part in parts]
-    velocity_mean, velocity_max = mean(velocity), max(float(each.max()) for each in velocity)
-    steering_mean, steering_max = mean(steering), max(float(each.max()) for each in steering)
     reference = mean([part.reference_speed for part in parts])
-    return {
-        "velocity_mean_mps": velocity_mean,
-        "velocity_max_mps": velocity_max,
-        "velocity_mean_percent": 100.0 * velocity_mean / reference,
-        "velocity_max_percent": 100.0 * velocity_max / reference,
-        "reference_mps": reference,
-        "steering_mean_deg": steering_mean,
-        "steering_max_deg": steering_max,
-        "steering_mean_percent": 100.0 * steering_mean / vehicle.steering_limit,
-        "steering_max_percent": 100.0 * steering_max / vehicle.steering_limit,
-        "metres": metres,
-    }
+    found = {"reference_mps": reference, "metres": metres}
+    for name, unit, values, whole in (
+        ("velocity", "mps", velocity, reference),
+        ("steering", "deg", steering, vehicle.steering_limit),
+    ):
+        for kind, value in (("mean", mean(values)), ("max", max(float(each.max()) for each in values))):
+            found |= {f"{name}_{kind}_{unit}": value, f"{name}_{kind}_percent": 100.0 * value / whole}
+    return found
 
 
 def error_series(poses: np.ndarray, road_map: Map, vehicle: VehicleConfig) -> Series:

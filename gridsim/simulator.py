@@ -88,15 +88,13 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class Simulator:
     """A batch of cars, each on a map and in an episode of its own: arrays in, arrays out.
 
-    A car's behaviour depends only on its own map, start and actions, not on the batch it is in.
-
-    Attributes, which steps and resets change:
+    A car's behaviour depends only on its own map, start and actions. Attributes, which steps and resets change:
         cars: float32 [n, CAR_FIELDS].
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         ends: uint8 [n], End.
         worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
-        closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `boxes.cast_boxes`.
+        closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `rays.cast_boxes`.
     """
 
     def __init__(
@@ -107,10 +105,9 @@ class Simulator:
         max_steps: int | None = None,
         traffic: int = 0,
     ):
-        """Make room for `cars` cars, each with a world of `traffic` other cars.
+        """Make room for `cars` cars, each with a world of `traffic` other cars. Raises: ValueError.
 
         `target` (m) and `max_steps` (control steps) are the configuration's unless given.
-        Raises: ValueError with one line for an invalid number.
         """
         self.config = config or SimConfig()
         episode = self.config.episode
@@ -156,8 +153,7 @@ class Simulator:
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             cars: indices [k] of the cars that begin; None is all of them.
             worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.
-
-        Raises: ValueError with one line for a wrong shape or a start that is not finite.
+        Raises: ValueError for a wrong shape or a start that is not finite.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
@@ -175,22 +171,19 @@ class Simulator:
         if cells > self.visits.shape[1]:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
-        physics, around = self._kernel_physics(), self._kernel_worlds()
-        groups = _by_map(self._rows[cars])
-        _place_all(physics, *groups, cars, starts, self.cars, self.visits, around, self.ranges, self.closing)
+        (physics, worlds), groups = self._for_kernels(), _by_map(self._rows[cars])
+        _place_all(physics, *groups, cars, starts, self.cars, self.visits, worlds, self.ranges, self.closing)
 
     def forget_maps(self) -> None:
         """Have the next reset keep only maps on which there are cars."""
         self._row_of = {}
 
-    def _kernel_worlds(self) -> np.ndarray | None:
-        return self.worlds if self.worlds.shape[1] else None
-
-    def _kernel_physics(self) -> Physics:
+    def _for_kernels(self) -> tuple[Physics, np.ndarray | None]:
+        """What all cars share, and the worlds, or None without traffic."""
         if self._physics is None:
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
             self._physics = Physics(atlas, *parameters(self.config))
-        return self._physics
+        return self._physics, self.worlds if self.worlds.shape[1] else None
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
         """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
@@ -211,7 +204,7 @@ class Simulator:
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
         Returns: the rewards float32 [n], 0 where no episode was going on.
-        Raises: ValueError with one line for invalid actions; RuntimeError before the first reset.
+        Raises: ValueError for invalid actions; RuntimeError before the first reset.
         """
         if self._rows.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
@@ -219,9 +212,9 @@ class Simulator:
             raise ValueError(f"there are {len(self)} cars, not actions of shape {np.shape(actions)}")
         actions = checked_actions(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
-        physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
-        arrays = self.cars, self.visits, around, self.ends, (self.ranges, self.closing, rewards)
-        _control_all(physics, *self._groups, actions, target, self.max_steps, *arrays)
+        physics, worlds = self._for_kernels()
+        arrays = self.cars, self.visits, worlds, self.ends, (self.ranges, self.closing, rewards)
+        _control_all(physics, *self._groups, actions, np.float32(self.target), self.max_steps, *arrays)
         return rewards
 
 
@@ -241,7 +234,7 @@ def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig
 def checked_actions(actions: np.ndarray) -> np.ndarray:
     """Actions [n] as int64, or continuous ones [n, 2] as float32 clipped to [-1, 1]; C-contiguous.
 
-    Raises: ValueError with one line unless they are whole numbers that name actions, or pairs of numbers.
+    Raises: ValueError unless they are whole numbers that name actions, or pairs of numbers.
     """
     array = np.asarray(actions)
     if array.ndim == 2:

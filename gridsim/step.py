@@ -15,34 +15,15 @@ import numpy as np
 from gridsim.car.collision import collides, hits_box, stands_ahead, top_speed_near
 from gridsim.car.vehicle import advance, front_velocity, path_curvature
 from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
-from gridsim.jit import leaf, njit
+from gridsim.jit import ONE, ZERO, F, I, leaf, njit
 from gridsim.maps.map import Map
 from gridsim.maps.network import Network
 from gridsim.maps.roads import VISIT_CELL, Road
-from gridsim.sensing.boxes import cast_boxes
-from gridsim.sensing.rays import fan, sense
-from gridsim.state import (
-    CELL,
-    COS,
-    DEBT,
-    DISTANCE,
-    FRESH,
-    IDLE,
-    ODOMETER,
-    PACED,
-    SIN,
-    SPEED,
-    STEERING,
-    STEPS,
-    X,
-    Y,
-)
+from gridsim.sensing.rays import cast_boxes, fan, sense
+from gridsim.state import CELL, COS, DEBT, DISTANCE, FRESH, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, X, Y
 from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
 
-_F, _I = np.float32, np.int32
-_ZERO, _ONE = _F(0.0), _F(1.0)
-
-_VISIT_SCALE = _F(1.0 / VISIT_CELL)
+_VISIT_SCALE = F(1.0 / VISIT_CELL)
 
 
 class Simulation(NamedTuple):
@@ -76,10 +57,10 @@ def visit_cells(road: Road) -> int:
 @leaf
 def visit_cell(road, x, y):
     """Index of the visit cell that contains a point of the torus."""
-    columns = _I(road.width * _VISIT_SCALE)
-    rows = _I(road.height * _VISIT_SCALE)
-    column = min(max(_I(x * _VISIT_SCALE), _I(0)), columns - _I(1))
-    row = min(max(_I(y * _VISIT_SCALE), _I(0)), rows - _I(1))
+    columns = I(road.width * _VISIT_SCALE)
+    rows = I(road.height * _VISIT_SCALE)
+    column = min(max(I(x * _VISIT_SCALE), I(0)), columns - I(1))
+    row = min(max(I(y * _VISIT_SCALE), I(0)), rows - I(1))
     return row * columns + column
 
 
@@ -87,15 +68,15 @@ def visit_cell(road, x, y):
 def place(simulation, start, car, visits):
     """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
     road = simulation.road
-    car[:] = _ZERO
+    car[:] = ZERO
     car[X] = start[0] - math.floor(start[0] / road.width) * road.width
     car[Y] = start[1] - math.floor(start[1] / road.height) * road.height
     car[COS], car[SIN] = math.cos(start[2]), math.sin(start[2])
     car[SPEED], car[STEERING] = start[3], start[4]
-    visits[:] = _F(-1e6)
+    visits[:] = F(-1e6)
     cell = visit_cell(road, car[X], car[Y])
-    car[CELL], car[FRESH] = _F(cell), _ONE
-    visits[cell] = _ZERO
+    car[CELL], car[FRESH] = F(cell), ONE
+    visits[cell] = ZERO
 
 
 @leaf
@@ -110,14 +91,14 @@ def start_from(car, start):
 def look(simulation, car, world, ranges, closing):
     """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
 
-    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], if not None, as in `boxes.cast_boxes`.
+    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], if not None, as in `rays.cast_boxes`.
     """
     road, constants, fan = simulation.road, simulation.constants, simulation.fan
     x = car[X] + constants.front_axle * car[COS]
     y = car[Y] + constants.front_axle * car[SIN]
     sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
     if world is not None:
-        velocity = (_ZERO, _ZERO)
+        velocity = (ZERO, ZERO)
         if closing is not None:
             velocity = front_velocity(constants, car[SPEED], car[STEERING])
         cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
@@ -140,12 +121,12 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
     near = False
     if world is not None:
         closing = top_speed_near(world, constants.near, road.width, road.height, x, y)
-        near = closing >= _ZERO
+        near = closing >= ZERO
         if near:
             fastest += closing
-    parts = _I(1) + _I(fastest * constants.dt / SUBSTEP)
-    dt = constants.dt / _F(parts)
-    moved = _ZERO
+    parts = I(1) + I(fastest * constants.dt / SUBSTEP)
+    dt = constants.dt / F(parts)
+    moved = ZERO
     crashed = False
     for part in range(parts):
         x, y, cosine, sine, speed, length = advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
@@ -154,31 +135,31 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
             crashed = True
             break
         if world is not None and near:
-            back = _ONE - _F(part + 1) / _F(parts)
+            back = ONE - F(part + 1) / F(parts)
             if hits_box(constants, world, back, constants.dt, road.width, road.height, x, y, cosine, sine):
                 crashed = True
                 break
-    if x < _ZERO:
+    if x < ZERO:
         x += road.width
     elif x >= road.width:
         x -= road.width
-    if y < _ZERO:
+    if y < ZERO:
         y += road.height
     elif y >= road.height:
         y -= road.height
     car[X], car[Y], car[COS], car[SIN], car[SPEED] = x, y, cosine, sine, speed
-    car[STEPS] += _ONE
+    car[STEPS] += ONE
     odometer = car[ODOMETER] + abs(moved)
     car[ODOMETER] = odometer
     cell = visit_cell(road, x, y)
-    if _F(cell) != car[CELL]:
+    if F(cell) != car[CELL]:
         gap = odometer - visits[cell]
-        car[CELL] = _F(cell)
+        car[CELL] = F(cell)
         if gap > REENTRY:
-            car[FRESH] = _ONE if gap > constants.revisit else _ZERO
+            car[FRESH] = ONE if gap > constants.revisit else ZERO
     visits[cell] = odometer
-    gained = _ZERO
-    if moved < _ZERO:
+    gained = ZERO
+    if moved < ZERO:
         car[DEBT] -= moved
     else:
         paid = min(car[DEBT], moved)
@@ -193,12 +174,12 @@ def step(simulation, car, visits, world, acceleration, steering, target, max_ste
         if world is not None and near:
             waits = stands_ahead(constants, world, road.width, road.height, car[X], car[Y], cosine, sine)
         if not waits:
-            car[IDLE] += _ONE
+            car[IDLE] += ONE
     else:
-        car[IDLE] = _ZERO
+        car[IDLE] = ZERO
     if crashed:
         return 1
-    if car[IDLE] >= _F(constants.patience):
+    if car[IDLE] >= F(constants.patience):
         return 2
     if car[DISTANCE] >= target:
         return 3

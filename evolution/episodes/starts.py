@@ -26,9 +26,7 @@ class Episodes(NamedTuple):
         rows = others.rows.copy()
         rows["map"] += len(self.maps)
         return Episodes(
-            self.maps + others.maps,
-            np.concatenate([self.rows, rows]),
-            np.concatenate([self.worlds, others.worlds]),
+            self.maps + others.maps, np.concatenate([self.rows, rows]), np.concatenate([self.worlds, others.worlds])
         )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -37,10 +38,7 @@ class Path(NamedTuple):
 
 def _poses(path: Path) -> list[tuple[float, float, float]]:
     """Poses (m, m, rad) where each piece of a path begins, and where the last one ends."""
-    poses = [path[:3]]
-    for length, curvature in path.pieces:
-        poses.append(_pose_after(*poses[-1], length, curvature))
-    return poses
+    return list(accumulate(path.pieces, lambda pose, piece: _pose_after(*pose, *piece), initial=path[:3]))
 
 
 def beside(path: Path, offset: float) -> list[Path]:

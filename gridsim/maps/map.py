@@ -51,7 +51,7 @@ class Map:
         return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts))
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what follows from the rest."""
+        """State without the cached arc length."""
         return {name: part for name, part in vars(self).items() if name != "mileage"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -231,7 +231,7 @@ class Window:
     _open: ClassVar[dict[Any, Window]] = {}  # by pygame's windows, which events name
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
-        """Open it. Raises: NoDisplayError with one line that says what to do."""
+        """Open it. Raises: NoDisplayError that says what to do."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         import pygame
 

@@ -15,8 +15,7 @@ from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.sensing.boxes import cast_boxes
-from gridsim.sensing.rays import fan
+from gridsim.sensing.rays import cast_boxes, fan
 from gridsim.simulator import Simulator
 from gridsim.state import COS, DISTANCE, IDLE, LANE, SIN, SPEED, TRAFFIC_FIELDS, End, X, Y
 

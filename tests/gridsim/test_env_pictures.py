@@ -76,16 +76,6 @@ def test_a_window_that_is_closed_leaves_the_others_open_with_their_own_keys() ->
     assert not pygame.display.get_init()
 
 
-def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
-    options: Any = {"scenario": "highway", "maps": maps["highway"], "observation": "grid"}
-    env: Any = GridSimVectorEnv(3, render_mode="rgb_array", **options)
-    env.reset(seed=0)
-    pictures = env.render()
-    assert len(pictures) == 3
-    assert len({p.tobytes() for p in pictures}) == 3
-    np.testing.assert_array_equal(pictures, env.render())
-
-
 def test_record_video_films_in_real_time(tmp_path: Path) -> None:
     plain = gymnasium.make("GridSim/Highway-v0", maps=1, render_mode="rgb_array", max_episode_steps=6)
     env: Any = RecordVideo(plain, str(tmp_path / "films"))

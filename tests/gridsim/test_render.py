@@ -119,16 +119,6 @@ def test_rays_end_where_the_ranges_say(scenario, state):
     assert seen > 15
 
 
-@pytest.mark.parametrize(("reach", "dot"), [(49.9, True), (50.0, False)])
-def test_a_ray_that_meets_nothing_ends_without_a_dot(scenario, state, reach, dot):
-    renderer = Renderer(scenario, (1000, 480))
-    image = renderer.draw(state[0], ranges=np.full(31, reach, dtype=np.float32))
-    for turn in np.radians([-60.0, 60.0]):
-        column = 500 - reach * np.sin(turn) * renderer.pixels_per_m
-        row = 480 * render.CAR_AT - (1.25 + reach * np.cos(turn)) * renderer.pixels_per_m
-        assert (distance(image[int(row), int(column)], paint.RAY) < 40) == dot
-
-
 def test_off_a_map_that_is_no_torus_there_is_ground(scenario):
     flat = dataclasses.replace(scenario, torus=False)
     image = Renderer(flat, (320, 240)).draw(car_at(0.0, 100.0, np.pi))  # heading out of the map

@@ -29,7 +29,6 @@ from gridsim.state import (
     NEXT,
     PERMIT,
     SECOND_NEXT,
-    SEED,
     SIN,
     SPEED,
     SPEED_FACTOR,
@@ -145,14 +144,6 @@ def test_spawned_cars_keep_their_distance(scenario):
         assert np.hypot(*road_map.shortest(here - start[:2]).T).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
         for k in range(1, len(here)):
             assert np.hypot(*road_map.shortest(here[:k] - here[k]).T).min() >= CONFIG.traffic.spawn_gap - 1e-3
-
-
-def test_cars_of_other_episodes_and_of_one_turn_elsewhere():
-    road_map = build("city", 2)
-    starts, keys = np.tile(FAR, (8, 1)), np.arange(8, dtype=np.uint64)
-    worlds = spawn(road_map.network, starts, 6, keys, CONFIG)
-    assert len(np.unique(worlds[..., SEED])) == worlds[..., SEED].size
-    assert spawn(road_map.network, starts, 6, keys, CONFIG).tobytes() == worlds.tobytes()
 
 
 def test_no_car_keeps_further_right_than_there_is_room():
@@ -330,23 +321,6 @@ def test_a_lane_is_blocked_until_a_crossing_car_of_any_width_is_past(width):
     config = SimConfig(vehicle=VehicleConfig(width=width))
     network = network_of(crossing_paths(), 256.0, 256.0, config=config)
     assert (network.clear == 8.0 + math.floor(width + CONFIG.traffic.beside)).all()
-
-
-def test_a_car_waits_while_the_crossing_car_has_a_permit(crossing):
-    """It has one and does not come: the ego car stands before it. When that goes, both get through."""
-    world = cars_on(crossing, (0, 100.0, 5.0, 1.0), (3, 80.0, 5.0, 1.0))
-    world[0, PERMIT] = 1
-    stuck = watch(crossing, world, 60, ego(115.0, 128.0))
-    assert 120.0 - 3.0 < front(stuck[-1], 1) <= 120.0
-    world = cars_on(crossing, (0, 60.0, 9.0, 1.0), (3, 90.0, 9.0, 1.0))
-    waits = watch(crossing, world, 60, ego(128.0, 128.0, 0.8))  # as both do for the ego car in the junction
-    assert max(front(waits, 0).max(), front(waits, 1).max()) <= 120.0
-    for last in (stuck[-1], waits[-1]):
-        assert (last[:, SPEED] < 0.02).all()
-        assert (last[:, LANE] == [0, 3]).all()
-        after = watch(crossing, last, 30)
-        assert {1, 2} <= set(after[:, 0, LANE])
-        assert {4, 5} <= set(after[:, 1, LANE])
 
 
 @pytest.mark.parametrize("speed", [4.0, 8.0, 15.0])
