@@ -52,8 +52,8 @@ def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges
 def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen):
     """One control period of every car; one whose episode has ended stands still.
 
-    `order` lists the cars map by map; runs int64 [maps, 3]: a map's row in the atlas, and its cars' range in `order`.
-    seen: ranges and closing speeds [n, rays] and rewards [n], to be filled.
+    Args: cars `order` map by map; runs int64 [maps, 3], a map's row in the atlas and its cars' range in `order`; seen,
+    ranges and closing speeds [n, rays] and rewards [n], to be filled.
     """
     constants = physics.constants
     ranges, closing, rewards = seen

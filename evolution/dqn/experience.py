@@ -45,7 +45,7 @@ class Experience(NamedTuple):
 
 
 def empty(spec: PolicySpec, *shape: int) -> Experience:
-    """Uninitialised experience of shape [rows] or [episodes, rows]. Memory that is not written to is not taken."""
+    """Uninitialised experience of shape [rows] or [episodes, rows]; untouched pages cost no memory (np.empty)."""
     grids = isinstance(spec, CnnSpec)
     return Experience(
         np.empty((*shape, _FRAME + 2 if grids else spec.inputs), dtype=np.uint8 if grids else np.int16),

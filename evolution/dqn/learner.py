@@ -49,8 +49,8 @@ class DqnConfig:
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates between copies of the network to the target
     average: int = 2000  # time constant, in updates, of the exponential average of weights (Polyak and Juditsky 1992)
-    # Error above which the loss is linear: as large as returns. With 1 (Mnih et al. 2015), the large error of a rare
-    # crash hardly counts: values become medians instead of means, and drivers reckless.
+    # Error above which the loss is linear. As large as returns: with 1 (Mnih et al. 2015), Q estimates the median
+    # return, and underweights rare crashes.
     huber_delta: float = 30.0
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
 

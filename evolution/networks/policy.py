@@ -192,7 +192,7 @@ def encode(ranges, closing, speed, steering, inputs):
     """Write the network's inputs: float32 [rays + 2], or [2 * rays + 2] if closing is not None.
 
     Ranges r (m) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds, the speed and the steering
-    angle (rad) follow. The angle is last, so that a network without it reads one input less.
+    angle (rad) follow; a network without `+steering` has one input fewer and does not read the angle.
     """
     rays = ranges.shape[0]
     for i in range(rays):
@@ -340,11 +340,9 @@ def outputs_of(
 
 
 def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config: SimConfig) -> int | np.ndarray:
-    """Actions of a genome for the environment's observations, whose scales are the configuration's.
+    """Actions of a genome for the environment's observations, float32 [inputs] or [n, inputs] (`gridsim.envs.env`).
 
-    Args: observation float32 [32] or [n, 32]: ranges / the sensor's range, then speed / speed_limit; with motion [63]
-    or [n, 63], closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit.
-    Returns: an action, or int64 [n]; -1 if an output is NaN.
+    Returns: an action, or int64 [n]; -1 if an output is NaN. Raises: ValueError for a wrong shape.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:

@@ -61,9 +61,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """Many cars at once, each in its own episode.
 
     `autoreset_mode` says how the next episode begins. `NEXT_STEP`: in the step after the end, in which the car does not
-    drive. `SAME_STEP`: at once; info has the ended episode's last observations as `final_obs`, an array of objects, and
-    its last info as `final_info`. `DISABLED`: the caller resets the cars that have ended before the next step, by
-    `reset(options={"reset_mask": mask})`.
+    drive. `SAME_STEP`: at once; info has the last observations as `final_obs`, an array of objects, and the last info
+    as `final_info`. `DISABLED`: the caller resets cars that have ended, by `reset(options={"reset_mask": mask})`.
 
     info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of a
     `state.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes
@@ -97,7 +96,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
 
         Args:
-            num_envs: cars.
             scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first map; the others' seeds follow.
@@ -198,8 +196,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; ignored where an episode begins.
         Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n], info).
-        Raises: gymnasium.error.ResetNeeded before the first reset, and after the end of an episode that only the caller
-        can reset; ValueError for invalid actions.
+        Raises: gymnasium.error.ResetNeeded where a reset is up to the caller; ValueError for invalid actions.
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")

@@ -24,8 +24,7 @@ class Network(NamedTuple):
     speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
     offsets: np.ndarray  # int32 [lanes + 1], where each lane's points begin
     steps: np.ndarray  # float32 [lanes], m between a lane's points; 1 m at most
-    # int32 [lanes, k], padded with -1; every lane has at least one. A successor begins where the lane ends, up to whole
-    # turns of the torus.
+    # int32 [lanes, k], padded with -1, at least one: lanes that start at its end point, modulo the torus's sides
     successors: np.ndarray
     left: np.ndarray  # int32 [lanes], lane to which a car may change, or -1; its point i is beside point i
     right: np.ndarray  # as `left`

@@ -23,8 +23,8 @@ _NEAR = F(2.0)  # m of clearance below which Newton steps are taken
 _STRETCH = F(1.5)  # length of a step above it, in clearances
 _CLOSE = F(0.04)  # m of clearance at which a ray has arrived
 _SLOPE_MIN = F(0.1)  # a Newton step is at most ten times the clearance, and at most a stretched step plus a leap
-LEAP = F(2.0)  # m by which a step may be longer than a stretched one, too short to jump over an island
-MARGIN = F(0.1)  # m; among thin walls, leaps and blind parts are that much shorter than a wall is thick
+LEAP = F(2.0)  # m added to a stretched step; still shorter than any wall of 3 m or more
+MARGIN = F(0.1)  # m of safety: among thin walls, unseen gaps are at most the walls' thickness less this
 
 
 def vector_march(steps: int, look_back: bool) -> Any:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
+from gridsim import state as s
 from gridsim.car.collision import boxes_touch
 from gridsim.car.vehicle import advance, path_curvature
 from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import lane_length, wrapped, wrapped_any
-from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, X, Y
 from gridsim.traffic.world import lane_after
 
 
@@ -19,18 +19,18 @@ def meets_ego(network, drivers, car, ego):
 
     A car that has already moved to the right stays there until the ego car has passed.
     """
-    if car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= ZERO:
+    if car[s.COS] * ego[s.COS] + car[s.SIN] * ego[s.SIN] > SAME_WAY_COSINE and car[s.SHIFT] >= ZERO:
         return False  # they go the same way
-    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
+    dx, dy = wrapped(ego[s.X] - car[s.X], network.width), wrapped(ego[s.Y] - car[s.Y], network.height)
     behind = F(-2.0) * drivers.half_length
-    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > behind
+    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[s.COS] + dy * car[s.SIN] > behind
 
 
 @leaf
 def touches_ego(network, drivers, car, ego):
     """Whether a car touches the ego car."""
-    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
-    return boxes_touch(drivers, dx, dy, car[COS], car[SIN], ego[COS], ego[SIN])
+    dx, dy = wrapped(ego[s.X] - car[s.X], network.width), wrapped(ego[s.Y] - car[s.Y], network.height)
+    return boxes_touch(drivers, dx, dy, car[s.COS], car[s.SIN], ego[s.COS], ego[s.SIN])
 
 
 @leaf
@@ -52,20 +52,20 @@ def way_to_ego_collision(network, drivers, car, ego):
     longer stop in time.
     Not inlined: calls, with all the network's arguments, are expensive but rare.
     """
-    lane = I(car[LANE])
-    length, begin = lane_length(network, lane), -car[ALONG]  # length of the lane, distance to its beginning (m)
+    lane = I(car[s.LANE])
+    length, begin = lane_length(network, lane), -car[s.ALONG]  # length of the lane, distance to its beginning (m)
     contact = F(2.0) * math.sqrt(drivers.half_length * drivers.half_length + drivers.half_width * drivers.half_width)
-    x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
-    curvature = path_curvature(drivers.ego, speed, ego[STEERING])
-    dx, dy = wrapped(x - car[X], network.width), wrapped(y - car[Y], network.height)
+    x, y, cosine, sine, speed = ego[s.X], ego[s.Y], ego[s.COS], ego[s.SIN], ego[s.SPEED]
+    curvature = path_curvature(drivers.ego, speed, ego[s.STEERING])
+    dx, dy = wrapped(x - car[s.X], network.width), wrapped(y - car[s.Y], network.height)
     t = ZERO
     while True:
         # The earliest time at which they can touch.
-        hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[SPEED] + abs(speed)), FORESIGHT_STEP)
+        hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[s.SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
         if t > FORESIGHT:
             return F(1e9)
-        way = car[SPEED] * t
+        way = car[s.SPEED] * t
         while way - begin >= length:
             begin += length
             lane = lane_after(car, lane)
@@ -74,7 +74,7 @@ def way_to_ego_collision(network, drivers, car, ego):
             length = lane_length(network, lane)
         k = U(network.offsets[U(lane)]) + U(I((way - begin) / network.steps[U(lane)]))
         k = min(k, U(network.offsets[U(lane) + U(1)]) - U(2))
-        right = min(network.room[k], drivers.lane_change_speed * t - car[SHIFT])
+        right = min(network.room[k], drivers.lane_change_speed * t - car[s.SHIFT])
         px, py = shifted_right(network, k, k + U(1), right)
         x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, ZERO, curvature, hop)
         dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
@@ -87,5 +87,5 @@ def way_to_ego_collision(network, drivers, car, ego):
         if boxes_touch(drivers, dx, dy, ux, uy, cosine, sine):
             ahead = dx * ux + dy * uy
             at = way + ahead - drivers.half_width
-            stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (F(2.0) * EMERGENCY_BRAKING)
+            stops = at - drivers.half_length > car[s.SPEED] * car[s.SPEED] / (F(2.0) * EMERGENCY_BRAKING)
             return max(at, ZERO) if ahead >= ZERO or stops else F(1e9)

@@ -11,40 +11,21 @@ import math
 
 import numpy as np
 
+from gridsim import state as s
 from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, STOP_LINE_GAP, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform, uniform64
 from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import Network, wrapped
-from gridsim.state import (
-    ALONG,
-    COS,
-    DRAWS,
-    JUNCTION_BEHIND,
-    LANE,
-    LANE_TIMER,
-    NEXT,
-    PERMIT,
-    SECOND_NEXT,
-    SEED,
-    SHIFT,
-    SIN,
-    SPEED,
-    SPEED_FACTOR,
-    SWAY,
-    TRAFFIC_FIELDS,
-    X,
-    Y,
-)
 
 
 @leaf
 def set_pose(network, car):
     """Set a car's pose from LANE, ALONG, SHIFT and SWAY."""
     one, two = U(1), U(2)
-    lane = U(I(car[LANE]))
+    lane = U(I(car[s.LANE]))
     first = U(network.offsets[lane])
     last = U(network.offsets[lane + one]) - first - two
-    at = car[ALONG] / network.steps[lane]
+    at = car[s.ALONG] / network.steps[lane]
     k = min(U(max(I(at), I(0))), last)
     part = at - F(I(k))
     x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
@@ -56,38 +37,38 @@ def set_pose(network, car):
     tx, ty = ax + part * (bx - ax), ay + part * (by - ay)
     norm = ONE / math.sqrt(max(tx * tx + ty * ty, F(1e-12)))
     tx, ty = tx * norm, ty * norm
-    x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
+    x, y = x0 + part * dx - car[s.SHIFT] * ty, y0 + part * dy + car[s.SHIFT] * tx
     # NumPy's floor, because that of `math` returns int64, whose product with float32 is float64.
-    car[X] = x - np.floor(x / network.width) * network.width
-    car[Y] = y - np.floor(y / network.height) * network.height
-    sway = car[SWAY]
+    car[s.X] = x - np.floor(x / network.width) * network.width
+    car[s.Y] = y - np.floor(y / network.height) * network.height
+    sway = car[s.SWAY]
     if sway != ZERO:
         norm = ONE / math.sqrt(ONE + sway * sway)
         tx, ty = (tx - sway * ty) * norm, (ty + sway * tx) * norm
-    car[COS], car[SIN] = tx, ty
+    car[s.COS], car[s.SIN] = tx, ty
 
 
 @leaf
 def point_at(network, car):
     """Index of the point of its lane that a car has passed last."""
-    lane = U(I(car[LANE]))
-    at = network.offsets[lane] + I(car[ALONG] / network.steps[lane])
+    lane = U(I(car[s.LANE]))
+    at = network.offsets[lane] + I(car[s.ALONG] / network.steps[lane])
     return U(min(at, I(network.offsets[lane + U(1)] - 1)))
 
 
 @leaf
 def lane_after(car, lane):
     """The lane after `lane` on a car's way, which is known for its next two lanes; else -1."""
-    if lane == I(car[LANE]):
-        return I(car[NEXT])
-    return I(car[SECOND_NEXT]) if lane == I(car[NEXT]) else I(-1)
+    if lane == I(car[s.LANE]):
+        return I(car[s.NEXT])
+    return I(car[s.SECOND_NEXT]) if lane == I(car[s.NEXT]) else I(-1)
 
 
 @leaf
 def _draw(car):
     """A car's next random number in [0, 1)."""
-    car[DRAWS] += ONE
-    return uniform(mix(mix(U(car[SEED])) + U(car[DRAWS]) * GOLDEN))
+    car[s.DRAWS] += ONE
+    return uniform(mix(mix(U(car[s.SEED])) + U(car[s.DRAWS]) * GOLDEN))
 
 
 @leaf
@@ -106,32 +87,32 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
-        car[JUNCTION_BEHIND], car[PERMIT] = -ONE, -ONE
-        car[LANE_TIMER] = F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
+        car[s.JUNCTION_BEHIND], car[s.PERMIT] = -ONE, -ONE
+        car[s.LANE_TIMER] = F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
         for _ in range(60):
             draws += 1
             bits = mix(key + U(draws) * GOLDEN)
             metres = uniform64(bits) * mileage[-1]
             lane = np.searchsorted(mileage, metres, side="right") - 1
             lane = min(lane, len(mileage) - 2)
-            car[LANE], car[ALONG] = F(lane), F(first[lane] + metres - mileage[lane])
+            car[s.LANE], car[s.ALONG] = F(lane), F(first[lane] + metres - mileage[lane])
             set_pose(network, car)
-            dx, dy = car[X] - start[0], car[Y] - start[1]
+            dx, dy = car[s.X] - start[0], car[s.Y] - start[1]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             free = dx * dx + dy * dy >= ego_gap * ego_gap
             for j in range(i):
-                if world[j, LANE] >= ZERO:
-                    dx, dy = world[j, X] - car[X], world[j, Y] - car[Y]
+                if world[j, s.LANE] >= ZERO:
+                    dx, dy = world[j, s.X] - car[s.X], world[j, s.Y] - car[s.Y]
                     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
                     free &= dx * dx + dy * dy >= gap * gap
             if free:
-                car[SEED] = F(mix(bits) >> U(40))
-                car[SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
-                car[NEXT] = F(choose_lane(network, lane, car))
-                car[SECOND_NEXT] = F(choose_lane(network, I(car[NEXT]), car))
-                car[SPEED] = SPAWN_SPEED * car[SPEED_FACTOR] * network.speeds[point_at(network, car)]
+                car[s.SEED] = F(mix(bits) >> U(40))
+                car[s.SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
+                car[s.NEXT] = F(choose_lane(network, lane, car))
+                car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
+                car[s.SPEED] = SPAWN_SPEED * car[s.SPEED_FACTOR] * network.speeds[point_at(network, car)]
                 break
-            car[LANE] = -ONE
+            car[s.LANE] = -ONE
 
 
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
@@ -139,8 +120,8 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
 
     Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
-    worlds, traffic = np.zeros((len(starts), cars, TRAFFIC_FIELDS), dtype=np.float32), config.traffic
-    worlds[:, :, LANE] = -1.0
+    worlds, traffic = np.zeros((len(starts), cars, s.TRAFFIC_FIELDS), dtype=np.float32), config.traffic
+    worlds[:, :, s.LANE] = -1.0
     if cars and len(network.offsets) > 1:
         half = config.vehicle.length / 2
         lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
