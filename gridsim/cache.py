@@ -28,7 +28,7 @@ def cache_folder(name: str) -> Path:
 
     It is in `GRIDSIM_CACHE_DIR`, `XDG_CACHE_HOME` or `~/.cache`; else in the temporary folder; else, with a warning, in
     a new folder for this process and its children, which is removed when the process ends.
-    Raises: GridSimError with one line if there is none that only the user can write to.
+    Raises: GridSimError if there is none that only the user can write to.
     """
     named = os.environ.get(VARIABLE) or os.environ.get("XDG_CACHE_HOME")
     problems: list[str] = []

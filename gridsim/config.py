@@ -28,17 +28,16 @@ SLOWEST_DRIVER, DRIVER_SPREAD = _F(0.9), _F(0.3)  # desired speed as a share of 
 SPAWN_SPEED = _F(0.5)  # share of the desired speed, at the start of an episode
 LANE_CHANGE_PERIOD = _F(10.0)  # control steps between two decisions whether to change lanes
 LANE_CHANGE_SIGHT = _F(100.0)  # m within which other cars matter to a lane change
-NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance; margin for judging the ego car's lane, since roads bend
-LOOK_AHEAD = _F(8.0)  # m that a car at standstill looks ahead, beyond the jam distance ...
-LOOK_AHEAD_TIME = _F(1.5)  # s; ... plus the distance driven in this time and the comfortable braking distance
+NEIGHBOUR_WIDENING = _F(0.004)  # m per m2 of distance: tolerance of the ego car's lane, judged along a straight line
+# A car looks ahead the jam distance, LOOK_AHEAD m, the distance driven in LOOK_AHEAD_TIME s, and that of braking.
+LOOK_AHEAD, LOOK_AHEAD_TIME = _F(8.0), _F(1.5)
 CAUTION = _F(0.25)  # m, added on every side of a car that might be in the way
-# m from a waiting car's front to the junction's line; if longer, its rear might be in the junction behind
-STOP_LINE_GAP = _F(0.25)
+STOP_LINE_GAP = _F(0.25)  # m between a waiting car and the stop line; small, so that its rear clears a junction behind
 SWERVE_RADIUS = _F(16.0)  # m, least radius of the arcs by which a car moves sideways; bends are as tight
 STEEPEST_SWERVE = _F(0.2)  # m sideways per m driven, at most
-LANE_CHANGE_ALONE = _F(20.0)  # m within which no two cars change to or from the same lane at once
+LANE_CHANGE_ALONE = _F(20.0)  # m within which only one car at a time changes to or from a lane
 WALKING_PACE = _F(2.0)  # m/s below which a car in a junction may be about to stop
-JUNCTION_MARGIN = _F(0.5)  # m past what a lane crosses, until which a car's rear still blocks it
+JUNCTION_MARGIN = _F(0.5)  # m that a car's rear must be beyond a conflict before the other lane is free
 
 # How traffic meets the ego car.
 MEETING_DISTANCE = _F(35.0)  # m within which a car keeps to the right for the oncoming ego car
@@ -69,8 +68,8 @@ class VehicleConfig:
     reverse_limit: float = 3.0  # m/s backward
     acceleration: float = 3.0  # m/s2, forward and in reverse
     braking: float = 8.0  # m/s2
-    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. Together with full braking it
-    # is 9.4 m/s2: less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
+    # m/s2, half of g (Polack et al. 2017); math.inf is the paper's pure kinematic model. With full braking it is 9.4:
+    # less than g, and than the 11.5 of CommonRoad's friction circle (Althoff et al. 2017).
     lateral_grip: float = 4.9
 
 
@@ -149,6 +148,7 @@ class Constants(NamedTuple):
     braking: np.float32  # m/s2
     grip: np.float32  # m/s2
     dt: np.float32  # s
+    rays: np.int32
     ray_range: np.float32  # m
     ray_first: np.float32  # rad, of the rightmost ray from the heading
     ray_step: np.float32  # rad
@@ -161,10 +161,7 @@ class Constants(NamedTuple):
 
 
 def constants(config: SimConfig) -> Constants:
-    """Check a configuration and convert it for the kernels.
-
-    Raises: ValueError with one line if a value is invalid.
-    """
+    """Check a configuration and convert it for the kernels. Raises: ValueError if a value is invalid."""
     vehicle, sensors, episode = config.vehicle, config.sensors, config.episode
     for name, value in (
         ("length", vehicle.length),
@@ -202,6 +199,7 @@ def constants(config: SimConfig) -> Constants:
         braking=f(vehicle.braking),
         grip=f(vehicle.lateral_grip),
         dt=f(episode.control_period),
+        rays=np.int32(sensors.rays),
         ray_range=f(sensors.range),
         ray_first=f(-view / 2),
         ray_step=f(view / (sensors.rays - 1)),

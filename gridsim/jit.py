@@ -17,24 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
 
 from gridsim.cache import cache_folder
-from gridsim.errors import GridSimError
-from gridsim.packages import package_folder
 
 # Packages that may contain kernels. All their files enter the digest, so that no list of files has to be maintained.
 KERNEL_PACKAGES = ("gridsim", "evolution")
-
-
-def _sources() -> list[Path]:
-    """Folders of the packages that may contain kernels."""
-    own = Path(__file__).parent
-    try:
-        evolution = package_folder("evolution")
-    except GridSimError:  # The simulator also works beside a user's file of that name, with the same kernels.
-        evolution = own.parent / "evolution"
-    return [own] if evolution is None else [own, evolution]
 
 
 def kernel_digest() -> str:
@@ -43,7 +32,8 @@ def kernel_digest() -> str:
     for name in ("numba", "llvmlite", "numpy"):
         digest.update(f"{name}=={version(name)}\n".encode())
     digest.update(platform.python_version().encode())
-    for folder in _sources():
+    for package in KERNEL_PACKAGES:
+        folder = Path(__file__).parents[1] / package
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
@@ -53,11 +43,15 @@ CONFIG: Any = numba.config  # Any, because its attributes are set at import time
 CACHE_FOLDER = cache_folder(f"kernels-{kernel_digest()}")
 FAST_MATH = {"contract", "arcp", "nsz", "reassoc"}
 
+# Kernels compute in float32, which a plain number would turn into float64.
+F, I, U = np.float32, np.int32, np.uint64  # noqa: E741
+ZERO, HALF, ONE = F(0.0), F(0.5), F(1.0)
+
 
 class CacheLocator(UserProvidedCacheLocator):
     """Finds cached kernels by their path within the package, not by the absolute path as Numba does.
 
-    So a copy of the same sources elsewhere finds them: Ray unpacks code into a new folder each time a cluster starts.
+    Ray unpacks code into a new folder each time a cluster starts.
     """
 
     @classmethod
@@ -120,7 +114,14 @@ def njit(function: Callable[..., Any] | None = None, **options: Any) -> Callable
 def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
     """`njit` for small kernels that return only numbers: inlined into their callers, without reference counting.
 
-    Otherwise, passing a road and its constants (some 60 arguments, with reference counts of the arrays) would take a
-    third of a step's time. Do not use it for a kernel that returns or stores an array.
+    Otherwise, passing a road and its constants (some 60 arguments) would take a third of a step's time. Do not use it
+    for a kernel that returns or stores an array.
     """
     return njit(function, forceinline=True, _nrt=False)
+
+
+def freeze(array: np.ndarray) -> np.ndarray:
+    """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view

@@ -1,7 +1,7 @@
 """Experience of the DQN as arrays, and the compact format of observations.
 
 Episodes are concatenated. An episode of T steps has T + 1 rows. Row t < T has the observation before step t, its
-action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.car.ego.End` of the episode. Row T has the
+action, its reward, and `ends` 0; only in row T - 1, `ends` is the `gridsim.state.End` of the episode. Row T has the
 observation after the last step, the action NO_ACTION, reward 0 and `ends` 0. COLLISION, IDLE and SUCCESS terminate: the
 value after them is 0. TIME truncates: the value after it is estimated from row T.
 
@@ -22,19 +22,16 @@ from typing import NamedTuple
 import numpy as np
 
 from evolution.networks.policy import SPEED_SCALE, CnnSpec, PolicySpec
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import F, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, FREE, OCCUPIED, UNKNOWN
 
-_F = np.float32
-
 NO_ACTION = 255  # of an episode's last row
-UNITS = _F(4096.0)  # fixed-point units per 1
+UNITS = F(4096.0)  # fixed-point units per 1
 _AREA = CELLS * CELLS
 _FRAME = _AREA // 4  # bytes
-_LEAST, _GREATEST = _F(-32768.0), _F(32767.0)
+_LEAST, _GREATEST = F(-32768.0), F(32767.0)
 # A network's inputs for the four cells of each byte: float32 [256, 4]. The unused fourth code means occupied.
-_SEEN = np.array([UNKNOWN, FREE, OCCUPIED, OCCUPIED]).astype(np.float32) * _F(1.0 / 255.0)
+_SEEN = np.array([UNKNOWN, FREE, OCCUPIED, OCCUPIED]).astype(np.float32) * F(1.0 / 255.0)
 _CELLS_OF = freeze(_SEEN[np.arange(256)[:, None] >> np.arange(0, 8, 2) & 3])
 
 
@@ -48,7 +45,7 @@ class Experience(NamedTuple):
 
 
 def empty(spec: PolicySpec, *shape: int) -> Experience:
-    """Uninitialised experience of shape [rows] or [episodes, rows]. Memory that is not written to is not taken."""
+    """Uninitialised experience of shape [rows] or [episodes, rows]; untouched pages cost no memory (np.empty)."""
     grids = isinstance(spec, CnnSpec)
     return Experience(
         np.empty((*shape, _FRAME + 2 if grids else spec.inputs), dtype=np.uint8 if grids else np.int16),
@@ -74,7 +71,7 @@ def ages(experience: Experience) -> np.ndarray:
 @leaf
 def to_fixed_point(value):
     """Convert a network's input to fixed point: the nearest int16, clipped."""
-    return np.int16(min(max(math.floor(value * UNITS + _F(0.5)), _LEAST), _GREATEST))
+    return np.int16(min(max(math.floor(value * UNITS + F(0.5)), _LEAST), _GREATEST))
 
 
 @leaf
@@ -92,13 +89,13 @@ def store_grid(grid, speed, row):
         for j in range(4):  # the codes 0, 127 and 255 become 0, 1 and 2
             byte |= (int(grid[4 * i + j]) + 1 >> 7) << 2 * j
         row[i] = byte
-    bits = int(to_fixed_point(speed / SPEED_SCALE - _F(1.0))) & 0xFFFF
+    bits = int(to_fixed_point(speed / SPEED_SCALE - F(1.0))) & 0xFFFF
     row[_FRAME], row[_FRAME + 1] = bits & 0xFF, bits >> 8
 
 
 @njit(nogil=True)
 def _unpack_rays(observations, rows, inputs):
-    scale = _F(1.0) / UNITS
+    scale = F(1.0) / UNITS
     for n in range(rows.shape[0]):
         row = observations[rows[n]]
         for i in range(inputs.shape[1]):
@@ -117,7 +114,7 @@ def _unpack_grids(observations, rows, ages, cells, frames, inputs):
                     inputs[n, at + 4 * i + j] = seen[j]
         row = observations[rows[n]]
         bits = int(row[_FRAME]) | int(row[_FRAME + 1]) << 8
-        inputs[n, frames * _AREA] = _F((bits ^ 0x8000) - 0x8000) / UNITS
+        inputs[n, frames * _AREA] = F((bits ^ 0x8000) - 0x8000) / UNITS
 
 
 def unpack(spec: PolicySpec, observations: np.ndarray, rows: np.ndarray, ages: np.ndarray) -> np.ndarray:

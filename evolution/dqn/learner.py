@@ -10,8 +10,7 @@ and moves Q(s_t, a_t) towards
 which is Double DQN (van Hasselt et al. 2016, "Deep Reinforcement Learning with Double Q-learning"). The loss is
 Huber's, the optimiser Adam (Kingma and Ba 2015).
 
-The result depends only on the seed, the parameters and the replay's contents. On the CPU it is bit-identical in all
-processes on one type of machine.
+The result depends only on the seed, the parameters and the replay's contents, bit for bit on the CPU.
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class DqnConfig:
     adam_epsilon: float = 1e-5  # Adam's; greater than its authors' 1e-8 since squared gradients are small (Rainbow)
     target_period: int = 500  # updates between copies of the network to the target
     average: int = 2000  # time constant, in updates, of the exponential average of weights (Polyak and Juditsky 1992)
-    # Error above which the loss is linear: as large as returns. With 1 (Mnih et al. 2015), the large error of a rare
-    # crash hardly counts: values become medians instead of means, and drivers reckless.
+    # Error above which the loss is linear. As large as returns: with 1 (Mnih et al. 2015), Q estimates the median
+    # return, and underweights rare crashes.
     huber_delta: float = 30.0
     gradient_clip: float = 10.0  # greatest norm of a gradient (Wang et al. 2016, "Dueling Network Architectures")
 
@@ -64,7 +63,7 @@ class DqnConfig:
 def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
     """Shares of random actions in a batch's episodes, declining from 1: float32 [episodes].
 
-    Args: epsilon: the first episode's final share, the others' are smaller; progress: car-steps relative to --anneal.
+    Args: epsilon, the first episode's final share, the others' are smaller; progress, car-steps relative to --anneal.
     """
     usual = epsilon ** (1.0 + SPREAD * np.arange(episodes) / max(episodes - 1, 1))
     random = max(1.0 - min(progress, 1.0) / RANDOM_SHARE, 0.0)
@@ -72,7 +71,7 @@ def exploration(epsilon: float, progress: float, episodes: int) -> np.ndarray:
 
 
 def finite(numbers: T, update: int) -> T:
-    """Weights, values or a loss, unchanged. Raises: FloatingPointError with one line if they are not finite."""
+    """Weights, values or a loss, unchanged. Raises: FloatingPointError if they are not finite."""
     if not np.isfinite(numbers).all():
         raise FloatingPointError(f"the Q network diverged at update {update}: try a lower learning rate")
     return numbers
@@ -81,7 +80,7 @@ def finite(numbers: T, update: int) -> T:
 def device_of(name: str) -> torch.device:
     """The device `auto`, `cpu` or `cuda`; `auto` is cuda where there is one.
 
-    Raises: ValueError with one line for a missing device.
+    Raises: ValueError for a missing device.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
@@ -148,7 +147,7 @@ def new_weights(spec: PolicySpec, seed: int) -> np.ndarray:
 class DqnLearner:
     """A Q network in training; `seed` is that of its initial weights and its samples.
 
-    Raises: ValueError with one line for a missing device (`device_of`).
+    Raises: ValueError for a missing device (`device_of`).
     """
 
     def __init__(self, spec: PolicySpec, config: DqnConfig, seed: int, device: str = "cpu"):
@@ -189,23 +188,20 @@ class DqnLearner:
         """Targets y [n] for the values of a batch's actions, without gradients."""
         with torch.no_grad():
             following = self._tensor(batch.next_observations)
-            values = self.target(following)
             best = self.online(following).argmax(dim=1, keepdim=True)
-            return torch.addcmul(
-                self._tensor(batch.rewards), self._tensor(batch.discounts), values.gather(1, best).squeeze(1)
-            )
+            values = self.target(following).gather(1, best).squeeze(1)
+            return torch.addcmul(self._tensor(batch.rewards), self._tensor(batch.discounts), values)
 
     def loss(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
         """The loss [] of a batch, with gradients, and the values of its actions [n], without."""
-        y = self.targets(batch)
-        actions = self._tensor(batch.actions)[:, None]
+        y, actions = self.targets(batch), self._tensor(batch.actions)[:, None]
         q = self.online(self._tensor(batch.observations)).gather(1, actions).squeeze(1)
         return torch.nn.functional.huber_loss(q, y, delta=self.config.huber_delta), q.detach()
 
     def update(self, batch: Batch) -> tuple[float, float]:
         """Make one update from a batch. Returns: its loss, and the mean value of its actions.
 
-        Raises: FloatingPointError with one line if the network has diverged.
+        Raises: FloatingPointError if the network has diverged.
         """
         loss, q = self.loss(batch)
         finite(loss.item(), self.updates)

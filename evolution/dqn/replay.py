@@ -14,11 +14,9 @@ import numpy as np
 
 from evolution.dqn.experience import NO_ACTION, Experience, ages, empty, unpack
 from evolution.networks.policy import CnnSpec, PolicySpec
-from gridsim.car.ego import End
 from gridsim.counter import GOLDEN, mix, uniform64
-from gridsim.jit import njit
-
-_U = np.uint64
+from gridsim.jit import U, njit
+from gridsim.state import End
 
 
 class Batch(NamedTuple):
@@ -34,12 +32,12 @@ class Batch(NamedTuple):
 @njit(nogil=True)
 def _draw(drawable, size, key, rows):
     """Fill rows [n] uniformly with drawable rows below `size`."""
-    key, place = mix(key), _U(0)
+    key, place = mix(key), U(0)
     for i in range(rows.shape[0]):
         row = 0
         while True:
             row = int(uniform64(mix(key + place * GOLDEN)) * size)
-            place += _U(1)
+            place += U(1)
             if drawable[row]:
                 break
         rows[i] = row
@@ -88,7 +86,7 @@ class Replay:
         if not self.transitions:
             raise ValueError("the replay holds no transition yet; add experience first")
         rows = np.empty(batch, dtype=np.int64)
-        _draw(self._drawable, len(self), _U(key), rows)
+        _draw(self._drawable, len(self), U(key), rows)
         after = (rows + 1) % self.capacity
         observations, actions, rewards, ends, age = self._rings.values()
         goes_on = (ends[rows] == End.RUNNING) | (ends[rows] == End.TIME)

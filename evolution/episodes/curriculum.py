@@ -19,17 +19,16 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE
 from evolution.episodes.starts import Episodes, lane_starts
 from evolution.search.base import SearchConfig
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, TRAINING_SEED, VALIDATION_SEED
-from gridsim.traffic.world import FIELDS, LANE
+from gridsim.state import LANE, TRAFFIC_FIELDS, End
 
 HELD_OUT_SEEDS = range(HELD_OUT_SEED, HELD_OUT_SEED + 16)  # of maps
 HELD_OUT_EPISODES = 64
 VALIDATION_SEEDS = range(VALIDATION_SEED, VALIDATION_SEED + 48)  # of maps
 FINAL_SEEDS = range(VALIDATION_SEED + 48, VALIDATION_SEED + 96)  # of maps, for the choice that ends a run
-LEAST_CRASH_WEIGHT = 0.05  # of a crash that all members avoid or none does; one that half of them avoid has weight 1
+LEAST_CRASH_WEIGHT = 0.05  # floor of the weight 4p(1 - p) of a crash start, p the share of members that fail there
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class CurriculumConfig:
     first_maps: int = 4  # of these, how many the first generation uses; each later one uses one more
     groups: int = SearchConfig.groups  # of members, each with episodes of its own
     starts: int = 1  # new episodes for each group and generation
-    crash_starts: int = 1  # ... and short ones that start before a crash of a recent leader
+    crash_starts: int = 1  # short episodes, for each too, that start before a crash of a recent leader
     crash_target: float = 120.0  # m, target of crash starts
     crash_memory: int = 24  # crashes that are remembered
     crowd: float = 2.0  # factor on the number of other cars in training, for more encounters over the same distance
@@ -52,8 +51,8 @@ class CurriculumConfig:
     growth: float = 0.6  # share of the leader's episodes that must reach the target before it doubles
     pace: float = 7.0  # m/s, mean speed required by a training episode's time limit; seamless's, like champion_pace
     slack: float = 3.0  # s, added to that time limit
-    promising: float = 0.5  # least success rate of the leader before candidates are validated ...
-    latest: int = 4  # ... averaged over this many generations
+    promising: float = 0.5  # least success rate of the leader, over `latest` generations, before one is validated
+    latest: int = 4  # generations
     validation_share: float = 0.25  # largest share of validation in all car-steps
     validation: int = 256  # episodes of validation
     champion_pace: float = 5.85  # m/s, mean speed below which a champion's success counts for less
@@ -80,10 +79,8 @@ class Curriculum:
         self.crashes, self.crash_worlds = lane_starts([], np.zeros(0, dtype=int), np.random.default_rng(0), self.crowd)
         self.failures = np.zeros(0)  # [crashes], moving average of the share of members that fail there
         self._validation: dict[range, Episodes] = {}
-        rng = np.random.default_rng(np.random.SeedSequence([seed, 11]))
-        self.map_seeds = [
-            int(s) for s in TRAINING_SEED + rng.choice(VALIDATION_SEED - TRAINING_SEED, config.maps, replace=False)
-        ]
+        rng, seeds = np.random.default_rng(np.random.SeedSequence([seed, 11])), VALIDATION_SEED - TRAINING_SEED
+        self.map_seeds: list[int] = (TRAINING_SEED + rng.choice(seeds, config.maps, replace=False)).tolist()
 
     def _rng(self, generation: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence([self.seed, generation, 12, purpose]))
@@ -123,9 +120,8 @@ class Curriculum:
         used = sorted({*fresh.maps, *seeds})
         fresh.rows["map"] = np.searchsorted(used, np.take(fresh.maps, fresh.rows["map"]))
         crashes["map"] = np.searchsorted(used, seeds)
-        return Episodes(
-            used, self._by_group(fresh.rows, crashes), self._by_group(fresh.worlds, self.crash_worlds[chosen])
-        )
+        worlds = self._by_group(fresh.worlds, self.crash_worlds[chosen])
+        return Episodes(used, self._by_group(fresh.rows, crashes), worlds)
 
     def _choose_crashes(self, generation: int) -> np.ndarray:
         """Indices of a generation's crash starts, group by group: likeliest where half of the members failed."""
@@ -168,7 +164,7 @@ class Curriculum:
         """Learn from the leader's episodes: remember its crashes, and lengthen the task when it succeeds.
 
         Args: `leader_episodes`; RESULT [e]; the states `rewind` steps before each end, float32 [e, 5], and the traffic
-        at that time, float32 [e, cars, world.FIELDS].
+        at that time, float32 [e, cars, TRAFFIC_FIELDS].
         """
         crashed = np.isin(results["end"], (End.COLLISION, End.IDLE)) & (results["steps"] > 10)
         if crashed.any():
@@ -190,7 +186,7 @@ class Curriculum:
         """
         if seeds not in self._validation:
             maps, rows, worlds = spread_starts(self.build, seeds, self.config.validation, self.traffic)
-            absent = np.zeros((len(rows), self.crowd - self.traffic, FIELDS), dtype=np.float32)
+            absent = np.zeros((len(rows), self.crowd - self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
             absent[:, :, LANE] = -1.0
             self._validation[seeds] = Episodes(maps, rows, np.concatenate([worlds, absent], axis=1))
         return self._validation[seeds]

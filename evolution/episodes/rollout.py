@@ -1,8 +1,7 @@
 """Drives episodes in one fused kernel: sense, network, act, advance until the end.
 
-`evaluate` drives whole populations, `collect` one policy with some random actions (epsilon-greedy), recording its
-experience for the DQN. Results depend only on the arguments; experience of an episode only on its own row, world,
-epsilon and key.
+`evaluate` drives whole populations; `collect` drives one policy with some random actions and records its experience.
+Results depend only on the arguments; experience of an episode only on its own row, world, epsilon and key.
 """
 
 from __future__ import annotations
@@ -15,22 +14,17 @@ import numpy as np
 from evolution.dqn.experience import NO_ACTION, Experience, empty, store_grid, store_rays
 from evolution.networks import convnet
 from evolution.networks.policy import RAYS, CnnSpec, MlpSpec, PolicySpec, decide, encode, pack, scratch_size
-from gridsim.car.ego import DISTANCE, FIELDS, PACED, SPEED, STEERING, End, control, look, place, start_from, visit_cells
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import act
-from gridsim.config import Constants, SimConfig, constants
+from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform
 from gridsim.errors import GridSimError
-from gridsim.jit import leaf, njit
+from gridsim.jit import F, U, freeze, leaf, njit
 from gridsim.maps.map import Map
-from gridsim.maps.network import Network
-from gridsim.maps.roads import Road, freeze
 from gridsim.sensing.grid import CELLS, GridTable, fill_grid, grid_table
-from gridsim.sensing.rays import fan
-from gridsim.traffic.behaviour import Drivers, drivers, flow
-from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.state import CAR_FIELDS, DISTANCE, PACED, SPEED, STEERING, TRAFFIC_FIELDS, End
+from gridsim.step import look, place, simulations_on, start_from, step, visit_cells
 
-_F, _U = np.float32, np.uint64
 _IDLE = int(End.IDLE)
 
 #: An episode: index of its map in the task; x, y (m), heading (rad), speed (m/s), steering (rad) at its start; its
@@ -64,24 +58,6 @@ def policy_buffers(spec: PolicySpec, config: SimConfig) -> tuple[np.ndarray | No
     return np.zeros(RAYS, dtype=np.float32) if isinstance(spec, MlpSpec) and spec.motion else None, None
 
 
-class Simulation(NamedTuple):
-    """A map and the simulator's parameters as kernels read them."""
-
-    road: Road
-    network: Network
-    constants: Constants
-    drivers: Drivers
-    fan: np.ndarray
-    rays: int
-
-
-def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
-    """A Simulation for each map."""
-    k, others = constants(config), drivers(config)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
-    return [Simulation(s.road, s.network, k, others, rays, config.sensors.rays) for s in road_maps]
-
-
 class EpisodeSetup(NamedTuple):
     """Start and limits of an episode as kernels read them."""
 
@@ -93,11 +69,11 @@ class EpisodeSetup(NamedTuple):
 class Workspace(NamedTuple):
     """State and buffers of an episode; reused for the next one."""
 
-    car: np.ndarray  # float32 [FIELDS]
+    car: np.ndarray  # float32 [CAR_FIELDS]
     visits: np.ndarray  # float32 [cells]
     ranges: np.ndarray  # float32 [rays]
     scratch: np.ndarray  # float32, of the network
-    ring: np.ndarray  # float32 [n, FIELDS], the last n states: that of step k in row k % n
+    ring: np.ndarray  # float32 [n, CAR_FIELDS], the last n states: that of step k in row k % n
     world_ring: np.ndarray  # float32 [n, cars, fields], the same of the world
 
 
@@ -120,11 +96,11 @@ def _copy_world(world, kept):
 def make_workspace(simulation, layers, rows, cars):
     """A Workspace that keeps the last `rows` states of a car and of `cars` others."""
     return Workspace(
-        np.empty(FIELDS, dtype=np.float32),
+        np.empty(CAR_FIELDS, dtype=np.float32),
         np.empty(visit_cells(simulation.road), dtype=np.float32),
-        np.empty(simulation.rays, dtype=np.float32),
+        np.empty(simulation.constants.rays, dtype=np.float32),
         np.zeros(scratch_size(layers), dtype=np.float32),
-        np.zeros((rows, FIELDS), dtype=np.float32),
+        np.zeros((rows, CAR_FIELDS), dtype=np.float32),
         np.zeros((rows, cars, TRAFFIC_FIELDS), dtype=np.float32),
     )
 
@@ -146,7 +122,7 @@ class Recorder(NamedTuple):
 @leaf
 def _observe(simulation, car, world, workspace, closing, grid_buffers):
     """Compute a car's ranges, then the network's inputs in `workspace.scratch`, or `grid_buffers.grid`."""
-    look(simulation.road, simulation.constants, simulation.fan, car, world, workspace.ranges, closing)
+    look(simulation, car, world, workspace.ranges, closing)
     if grid_buffers is None:
         encode(workspace.ranges, closing, car[SPEED], car[STEERING], workspace.scratch)
     else:
@@ -161,7 +137,7 @@ def _record(simulation, car, workspace, grid_buffers, experience, row, gained, e
         store_rays(workspace.scratch, observations[row])
     else:
         store_grid(grid_buffers.grid, car[SPEED], observations[row])
-    actions[row], rewards[row], ends[row] = NO_ACTION, _F(0.0), 0
+    actions[row], rewards[row], ends[row] = NO_ACTION, F(0.0), 0
     if row > 0:
         k, ranges = simulation.constants, workspace.ranges
         fastest = simulation.road.speed_high
@@ -179,40 +155,34 @@ def _choose_action(packed, layers, car, workspace, grid_buffers, begun):
 
 
 @leaf
-def _explore(recorder, step, action, actions):
+def _explore(recorder, steps, action, actions):
     """A random action with probability epsilon, else the given one. Uses one random number a step."""
-    bits = mix(mix(recorder.key) + _U(step) * GOLDEN)
+    bits = mix(mix(recorder.key) + U(steps) * GOLDEN)
     if uniform(bits) < recorder.epsilon:
-        return int((bits & _U(0xFFFFFFFF)) * _U(actions) >> _U(32))
+        return int((bits & U(0xFFFFFFFF)) * U(actions) >> U(32))
     return action
 
 
 @leaf
-def _control_step(simulation, setup, car, visits, world, action):
-    """One control step of the car and of the traffic around it. Returns an End as a number.
+def _drive(simulation, setup, car, visits, world, action):
+    """One control step with an action. Returns an End as a number.
 
     A `leaf`: in `run_episode`, reading parts of `simulation` would count their references: 15 % slower among 8 cars.
     """
-    if world is not None:
-        flow(simulation.network, simulation.drivers, world, car)
-    k = simulation.constants
-    acceleration, steering = act(k, action, car[SPEED], car[STEERING])
-    return control(simulation.road, k, car, visits, world, acceleration, steering, setup.target, setup.steps)
+    acceleration, steering = act(simulation.constants, action, car[SPEED], car[STEERING])
+    return step(simulation, car, visits, world, acceleration, steering, setup.target, setup.steps)
 
 
 @njit(nogil=True)
 def run_episode(simulation, packed, layers, setup, workspace, world, closing, grid_buffers, recorder, result):
     """One episode of one car, driven by an `mlp`, or by a `cnn` if there are grid_buffers; fills a RESULT.
 
-    Anything that may be None is passed separately, because Numba removes dead branches only for arguments. If an output
-    is NaN, the episode ends as IDLE; so does the last recorded step, if any.
+    What may be None is an argument of its own: Numba prunes `is None` branches on arguments only, not on fields. If an
+    output is NaN, the episode ends as IDLE; so does the last recorded step, if any.
     """
-    car = workspace.car
-    place(simulation.road, setup.start, car, workspace.visits)
-    keep = workspace.ring.shape[0]
-    end = 0
-    steps = 0
-    before = _F(0.0)
+    car, keep = workspace.car, workspace.ring.shape[0]
+    place(simulation, setup.start, car, workspace.visits)
+    end, steps, before = 0, 0, F(0.0)
     while True:
         if recorder is None and end != 0:
             break
@@ -236,7 +206,7 @@ def run_episode(simulation, packed, layers, setup, workspace, world, closing, gr
             if world is not None:
                 _copy_world(world, workspace.world_ring[steps % keep])
         before = car[DISTANCE]
-        end = _control_step(simulation, setup, car, workspace.visits, world, action)
+        end = _drive(simulation, setup, car, workspace.visits, world, action)
         steps += 1
     result["distance"], result["paced"] = car[DISTANCE], car[PACED]
     result["steps"], result["end"] = steps, end
@@ -303,10 +273,9 @@ def evaluate(
     """Drive every genome through every episode.
 
     Args: genomes float32 [n, spec.size]; the maps that the episodes index; EPISODE [e]; the traffic that each begins
-    with, float32 [e, cars, world.FIELDS].
-
+    with, float32 [e, cars, TRAFFIC_FIELDS].
     Returns: (RESULT [n, e]; for the k episodes with a `rewind`, the states that many steps before their ends, or at the
-    start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, world.FIELDS]).
+    start of shorter ones, as starts float32 [n, k, 5]; and the traffic then, float32 [n, k, cars, TRAFFIC_FIELDS]).
     Raises: ValueError if shapes do not fit.
     """
     if genomes.ndim != 2 or genomes.shape[1] != spec.size:
@@ -322,18 +291,13 @@ def evaluate(
     rewound_worlds = np.zeros((max(k, 1), len(genomes), *worlds.shape[1:]), dtype=np.float32)
     simulations = simulations_on(road_maps, config)
     for column, episode in enumerate(episodes):
+        setup = EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"]))
+        traffic = freeze(worlds[column].copy()) if worlds.shape[1] else None
+        row = kept[column]
         _rollout(
-            simulations[episode["map"]],
-            genomes,
-            spec.layers,
-            EpisodeSetup(freeze(episode["start"].copy()), episode["target"], int(episode["steps"])),
-            freeze(worlds[column].copy()) if worlds.shape[1] else None,
-            *buffers,
-            int(episode["rewind"]),
-            results[column],
-            rewound[kept[column]],
-            rewound_worlds[kept[column]],
-        )
+            simulations[episode["map"]], genomes, spec.layers, setup, traffic, *buffers, int(episode["rewind"]),
+            results[column], rewound[row], rewound_worlds[row],
+        )  # fmt: skip
     return results.T.copy(), rewound[:k].swapaxes(0, 1), rewound_worlds[:k].swapaxes(0, 1)
 
 
@@ -349,11 +313,10 @@ def collect(
 ) -> tuple[Experience, np.ndarray]:
     """Drive one policy through every episode, with some random actions, and record its experience.
 
-    Args: as `evaluate`'s; weights float32 [spec.size]; each episode's share of random actions, which are uniform over
-    all actions, float32 [e], and the seed of its random numbers, uint64 [e].
-
+    Args: as `evaluate`'s; weights float32 [spec.size]; each episode's share of random actions, float32 [e], and the
+    seed of its random numbers, uint64 [e].
     Returns: (the experience, in the order of the episodes; RESULT [e]).
-    Raises: ValueError with one line if the weights or worlds do not fit.
+    Raises: ValueError if the weights or worlds do not fit.
     """
     if weights.shape != (spec.size,):
         raise ValueError(f"the weights of {spec} are [{spec.size}], not {weights.shape}")
@@ -387,27 +350,20 @@ def trajectory(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drive one genome through one episode and record all states.
 
-    Args: as `evaluate`'s; start float32 [5], target m and steps as in EPISODE, world float32 [cars, world.FIELDS].
-    Returns: (RESULT [], states float32 [steps + 1, FIELDS] before each step and at the end, with fields as in
-    `gridsim.car.ego`, and the traffic at these times, float32 [steps + 1, cars, world.FIELDS]).
+    Args: as `evaluate`'s; start, target and steps as in EPISODE, world float32 [cars, TRAFFIC_FIELDS].
+    Returns: (RESULT []; before each step and at the end, the states float32 [steps + 1, CAR_FIELDS], and the traffic
+    float32 [steps + 1, cars, TRAFFIC_FIELDS]).
     """
     simulation, cars = simulations_on([road_map], config)[0], 0 if world is None else len(world)
     workspace = make_workspace(simulation, spec.layers, steps + 1, cars)
     closing, grid_buffers = policy_buffers(spec, config)
     world = world.copy() if world is not None and cars else None
     result = np.zeros(1, dtype=RESULT)
+    packed = packed_genome(freeze(genome), spec.layers, grid_buffers)
+    setup, recorder = EpisodeSetup(freeze(start), F(target), steps), None
     run_episode(
-        simulation,
-        packed_genome(freeze(genome), spec.layers, grid_buffers),
-        spec.layers,
-        EpisodeSetup(freeze(start), _F(target), steps),
-        workspace,
-        world,
-        closing,
-        grid_buffers,
-        None,
-        result[0],
-    )
+        simulation, packed, spec.layers, setup, workspace, world, closing, grid_buffers, recorder, result[0]
+    )  # fmt: skip
     last = int(result[0]["steps"])
     workspace.ring[last] = workspace.car
     if world is not None:

@@ -10,7 +10,8 @@ import numpy as np
 from evolution.episodes.rollout import EPISODE
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map, sample_starts
-from gridsim.traffic.world import FIELDS, spawn
+from gridsim.state import TRAFFIC_FIELDS
+from gridsim.traffic.world import spawn
 
 
 class Episodes(NamedTuple):
@@ -18,16 +19,14 @@ class Episodes(NamedTuple):
 
     maps: list[int]  # seeds of the maps
     rows: np.ndarray  # EPISODE [e]; their `map` indexes `maps`
-    worlds: np.ndarray  # float32 [e, cars, world.FIELDS], the traffic that each begins with
+    worlds: np.ndarray  # float32 [e, cars, TRAFFIC_FIELDS], the traffic that each begins with
 
     def and_then(self, others: Episodes) -> Episodes:
         """Concatenate these and other episodes with the same number of cars."""
         rows = others.rows.copy()
         rows["map"] += len(self.maps)
         return Episodes(
-            self.maps + others.maps,
-            np.concatenate([self.rows, rows]),
-            np.concatenate([self.worlds, others.worlds]),
+            self.maps + others.maps, np.concatenate([self.rows, rows]), np.concatenate([self.worlds, others.worlds])
         )
 
 
@@ -41,10 +40,11 @@ def lane_starts(
     """Episodes that start at rest, uniformly over the lanes of `road_maps[maps[k]]`, with `traffic` other cars.
 
     They have the configuration's target and time limit.
-    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, world.FIELDS]).
+    Returns: (EPISODE [len(maps)], their traffic float32 [len(maps), traffic, TRAFFIC_FIELDS]).
     """
     config = config or SimConfig()
-    episodes, worlds = np.zeros(len(maps), dtype=EPISODE), np.zeros((len(maps), traffic, FIELDS), dtype=np.float32)
+    episodes = np.zeros(len(maps), dtype=EPISODE)
+    worlds = np.zeros((len(maps), traffic, TRAFFIC_FIELDS), dtype=np.float32)
     episodes["map"], episodes["target"], episodes["steps"] = maps, config.episode.target, config.episode.steps
     on_each = [(road_maps[m], np.flatnonzero(maps == m)) for m in np.unique(maps)]
     for road_map, of in on_each:

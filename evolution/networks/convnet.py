@@ -23,12 +23,10 @@ from evolution.networks.policy import (
     CnnSpec,
     greatest,
 )
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import F, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS
 
-_F = np.float32
-_CODE = _F(1.0 / 255.0)
+_CODE = F(1.0 / 255.0)
 _AREA = CELLS * CELLS
 _HALF_ROW = (SIDE_1 + 1) // 2  # two tiles cover a row of 19 and overlap in its middle
 _WIDE, _WIDEST = 2 * UNIT_MULTIPLE, 4 * UNIT_MULTIPLE
@@ -64,7 +62,7 @@ def push(grid, begun, scratch):
     for i in range(older):
         frames[i] = frames[i + _AREA]
     for i in range(_AREA):
-        frames[older + i] = _F(grid[i]) * _CODE
+        frames[older + i] = F(grid[i]) * _CODE
     if begun:
         for i in range(older):
             frames[i] = frames[older + i % _AREA]
@@ -111,7 +109,7 @@ def forward(genome, layers, speed, scratch):
             )  # fmt: skip
     start = bias + two
     inputs = SIDE_2 * SIDE_2 * two + 1
-    scratch.second[inputs - 1] = speed / SPEED_SCALE - _F(1.0)
+    scratch.second[inputs - 1] = speed / SPEED_SCALE - F(1.0)
     bias = start + inputs * units
     c = 0
     while units - c >= _WIDEST:
@@ -147,7 +145,7 @@ def act_on(spec: CnnSpec, genome: np.ndarray, observation: np.ndarray, speed: fl
 
     Args: observation uint8 [frames, 80, 80], newest last, or [n, frames, 80, 80]; speed m/s, a number or [n].
     Returns: an action, or int64 [n]; -1 if an output is NaN.
-    Raises: ValueError with one line if the observation's shape or type is wrong.
+    Raises: ValueError if the observation's shape or type is wrong.
     """
     grids = np.asarray(observation)
     many, frames = grids.ndim == 4, f"{spec.frames}, {CELLS}, {CELLS}"

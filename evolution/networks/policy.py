@@ -18,18 +18,16 @@ import numpy as np
 
 from evolution.networks.dense import tile
 from gridsim.config import SimConfig
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import F, U, freeze, leaf, njit
 from gridsim.sensing.grid import CELLS, MAX_FRAMES
 
 RAYS = 31
 INPUTS = RAYS + 1  # the rays and the speed
 ACTIONS = 8
 MAX_GENES = 1_000_000
-_F, _U = np.float32, np.uint64
-RAY_HALF = _F(8.0)  # m, the range that is encoded as 0
-SPEED_SCALE = _F(10.0)  # m/s, the speed that is encoded as 0
-STEERING_SCALE = _F(0.5)  # rad, the steering angle that is encoded as 1
+RAY_HALF = F(8.0)  # m, the range that is encoded as 0
+SPEED_SCALE = F(10.0)  # m/s, the speed that is encoded as 0
+STEERING_SCALE = F(0.5)  # rad, the steering angle that is encoded as 1
 
 
 Observation = Literal["rays", "grid"]
@@ -46,7 +44,7 @@ class PolicySpec(ABC):
 
     @staticmethod
     def parse(text: str) -> PolicySpec:
-        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises ValueError with one line otherwise."""
+        """Read `mlp:6,7`, `mlp:6,7+motion+steering` or `cnn:16,32,256@4`. Raises ValueError otherwise."""
         if match := re.fullmatch(r"mlp:(\d{1,5}(?:,\d{1,5})*)(\+motion)?(\+steering)?", text):
             sizes = tuple(int(n) for n in match[1].split(","))
             spec: PolicySpec = MlpSpec(sizes, motion=bool(match[2]), steering=bool(match[3]))
@@ -93,7 +91,7 @@ class PolicySpec(ABC):
 class MlpSpec(PolicySpec):
     """A multi-layer perceptron on rays and speed: tanh hidden layers, linear outputs.
 
-    With `motion` it also sees the closing speeds of cars hit by rays (`boxes.cast_boxes`), with `steering` its own
+    With `motion` it also sees the closing speeds of cars hit by rays (`rays.cast_boxes`), with `steering` its own
     steering angle, which a network without memory cannot infer: the wheels take half a second to turn.
     """
 
@@ -194,30 +192,30 @@ def encode(ranges, closing, speed, steering, inputs):
     """Write the network's inputs: float32 [rays + 2], or [2 * rays + 2] if closing is not None.
 
     Ranges r (m) become 2 r / (r + 8) - 1, which resolves near edges best. Closing speeds, the speed and the steering
-    angle (rad) follow. The angle is last, so that a network without it reads one input less.
+    angle (rad) follow; a network without `+steering` has one input fewer and does not read the angle.
     """
     rays = ranges.shape[0]
     for i in range(rays):
-        inputs[i] = _F(2.0) * ranges[i] / (ranges[i] + RAY_HALF) - _F(1.0)
+        inputs[i] = F(2.0) * ranges[i] / (ranges[i] + RAY_HALF) - F(1.0)
     last = rays
     if closing is not None:
         for i in range(rays):
             inputs[rays + i] = closing[i] / SPEED_SCALE
         last = 2 * rays
-    inputs[last] = speed / SPEED_SCALE - _F(1.0)
+    inputs[last] = speed / SPEED_SCALE - F(1.0)
     inputs[last + 1] = steering / STEERING_SCALE
 
 
 @leaf
 def squash(x):
     """Hyperbolic tangent by a rational function (Lambert's continued fraction), within 2e-4 everywhere."""
-    x = _F(4.97) if x > _F(4.97) else x  # this form keeps NaN
-    x = _F(-4.97) if x < _F(-4.97) else x
+    x = F(4.97) if x > F(4.97) else x  # this form keeps NaN
+    x = F(-4.97) if x < F(-4.97) else x
     s = x * x
     return (
         x
-        * (_F(135135.0) + s * (_F(17325.0) + s * (_F(378.0) + s)))
-        / (_F(135135.0) + s * (_F(62370.0) + s * (_F(3150.0) + s * _F(28.0))))
+        * (F(135135.0) + s * (F(17325.0) + s * (F(378.0) + s)))
+        / (F(135135.0) + s * (F(62370.0) + s * (F(3150.0) + s * F(28.0))))
     )
 
 
@@ -291,8 +289,8 @@ def forward(packed, layers, scratch):
             bias = at + unit
             _dense_8(scratch, source, 0, 1, 0, 1, 0, n, packed, bias + width, width, bias, scratch, target + unit, 0)
         if k < last:
-            first = _U(target)  # unsigned: a check whether an index is negative would prevent vectorisation
-            for j in range(_U(width)):
+            first = U(target)  # unsigned: a check whether an index is negative would prevent vectorisation
+            for j in range(U(width)):
                 scratch[first + j] = squash(scratch[first + j])
         at += (n + 1) * width
         source = target
@@ -342,19 +340,17 @@ def outputs_of(
 
 
 def act_on(spec: PolicySpec, genome: np.ndarray, observation: np.ndarray, config: SimConfig) -> int | np.ndarray:
-    """Actions of a genome for the environment's observations, whose scales are the configuration's.
+    """Actions of a genome for the environment's observations, float32 [inputs] or [n, inputs] (`gridsim.envs.env`).
 
-    Args: observation float32 [32] or [n, 32]: ranges / the sensor's range, then speed / speed_limit; with motion [63]
-    or [n, 63], closing speeds / speed_limit between them; with steering one more, the steering angle / steering_limit.
-    Returns: an action, or int64 [n]; -1 if an output is NaN.
+    Returns: an action, or int64 [n]; -1 if an output is NaN. Raises: ValueError for a wrong shape.
     """
     many = np.atleast_2d(np.asarray(observation, dtype=np.float32))
     if not isinstance(spec, MlpSpec) or many.ndim != 2 or many.shape[1] != spec.inputs:
         raise ValueError(f"observations of {spec} are [n, {spec.inputs}], not {many.shape}")
-    fastest = _F(config.vehicle.speed_limit)
+    fastest = F(config.vehicle.speed_limit)
     closing = many[:, RAYS : 2 * RAYS] * fastest
     speeds = many[:, 2 * RAYS if spec.motion else RAYS] * fastest
-    angles = many[:, -1] * _F(math.radians(config.vehicle.steering_limit))
-    outputs = outputs_of(spec, genome, many[:, :RAYS] * _F(config.sensors.range), closing, speeds, angles)
+    angles = many[:, -1] * F(math.radians(config.vehicle.steering_limit))
+    outputs = outputs_of(spec, genome, many[:, :RAYS] * F(config.sensors.range), closing, speeds, angles)
     actions = np.where(np.isnan(outputs).any(axis=1), -1, outputs.argmax(axis=1))
     return int(actions[0]) if np.ndim(observation) == 1 else actions

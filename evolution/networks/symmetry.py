@@ -15,7 +15,7 @@ import numpy as np
 
 from evolution.networks.policy import KERNEL_1, KERNEL_2, RAYS, SIDE_2, CnnSpec, MlpSpec, PolicySpec
 from gridsim.car.vehicle import Action
-from gridsim.maps.roads import freeze
+from gridsim.jit import freeze
 
 #: The mirror image of each action.
 MIRRORED_ACTIONS = np.array(
@@ -39,9 +39,8 @@ class Symmetry(NamedTuple):
 def symmetry(spec: PolicySpec) -> Symmetry:
     """The symmetry of a network in which hidden unit k of a layer mirrors unit k from its end.
 
-    The middle unit of an odd number mirrors itself. If a layer had no other unit, left and right would be
-    indistinguishable, so all genes of such a network are free. A `cnn` is only approximately symmetric, because its
-    second convolution leaves out the last of 19 columns.
+    With an odd width the middle unit is its own mirror image. A layer of one unit could not tell left from right, so
+    all genes of such a network are free. A `cnn` is only nearly symmetric: its second convolution leaves out a column.
     """
     images, signs, at = [], [], 0
     shapes = spec.shapes()

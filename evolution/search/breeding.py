@@ -15,8 +15,7 @@ import numpy as np
 from evolution.networks.policy import PolicySpec, gene_scales
 from evolution.networks.symmetry import symmetry
 from gridsim.counter import GOLDEN, mix
-from gridsim.jit import njit
-from gridsim.maps.roads import freeze
+from gridsim.jit import F, U, freeze, njit
 
 
 class Kind(IntEnum):
@@ -32,7 +31,6 @@ class Kind(IntEnum):
 RECIPE = np.dtype([("kind", "u1"), ("a", "<u2"), ("b", "<u2"), ("seed", "<u4")])
 
 _COPY, _NEW, _STEP, _MIRRORED = int(Kind.COPY), int(Kind.NEW), int(Kind.STEP), int(Kind.MIRRORED)
-_F, _U = np.float32, np.uint64
 _LEVELS = 1 << 12
 
 
@@ -54,7 +52,7 @@ class Mutation:
 @njit
 def _stream(key, seed):
     """The random stream of a recipe's seed."""
-    return mix(key ^ mix(_U(seed) + GOLDEN))
+    return mix(key ^ mix(U(seed) + GOLDEN))
 
 
 @njit
@@ -62,15 +60,15 @@ def _normals(quantiles, stream, scale, symmetry, out):
     """out[i] = scale[i] * N(0, 1), left-right symmetric; four numbers from each 64 random bits."""
     n = out.shape[0]
     for block in range(n // 4):
-        bits = mix(stream + _U(block + 1) * GOLDEN)
+        bits = mix(stream + U(block + 1) * GOLDEN)
         i = 4 * block
-        out[i] = scale[i] * quantiles[bits & _U(0xFFF)]
-        out[i + 1] = scale[i + 1] * quantiles[(bits >> _U(16)) & _U(0xFFF)]
-        out[i + 2] = scale[i + 2] * quantiles[(bits >> _U(32)) & _U(0xFFF)]
-        out[i + 3] = scale[i + 3] * quantiles[(bits >> _U(48)) & _U(0xFFF)]
-    bits = mix(stream + _U(n // 4 + 1) * GOLDEN)
+        out[i] = scale[i] * quantiles[bits & U(0xFFF)]
+        out[i + 1] = scale[i + 1] * quantiles[(bits >> U(16)) & U(0xFFF)]
+        out[i + 2] = scale[i + 2] * quantiles[(bits >> U(32)) & U(0xFFF)]
+        out[i + 3] = scale[i + 3] * quantiles[(bits >> U(48)) & U(0xFFF)]
+    bits = mix(stream + U(n // 4 + 1) * GOLDEN)
     for i in range(4 * (n // 4), n):
-        out[i] = scale[i] * quantiles[(bits >> _U(16 * (i & 3))) & _U(0xFFF)]
+        out[i] = scale[i] * quantiles[(bits >> U(16 * (i & 3))) & U(0xFFF)]
     for k in range(symmetry.bound.shape[0]):
         out[symmetry.bound[k]] = symmetry.factor[k] * out[symmetry.source[k]]
 
@@ -79,17 +77,17 @@ def _normals(quantiles, stream, scale, symmetry, out):
 def _cross(a, b, stream, threshold, child, marked):
     """Uniform crossover, and marks of the genes to mutate. Without branches, so that it is vectorised."""
     for i in range(child.shape[0]):
-        bits = mix(stream + _U(i + 1) * GOLDEN)
+        bits = mix(stream + U(i + 1) * GOLDEN)
         x, y = a[i], b[i]
-        child[i] = y if bits & _U(1) else x
-        marked[i] = (bits >> _U(40)) < threshold
+        child[i] = y if bits & U(1) else x
+        marked[i] = (bits >> U(40)) < threshold
 
 
 @njit(nogil=True)
 def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, children):
     """Children of recipes; scales [genes] are `policy.gene_scales`."""
     genes = children.shape[1]
-    threshold = _U(rate * _F(1 << 24))
+    threshold = U(rate * F(1 << 24))
     marked = np.empty(genes, dtype=np.uint8)
     for n in range(recipes.shape[0]):
         recipe = recipes[n]
@@ -110,8 +108,8 @@ def _breed(parents, recipes, key, scales, symmetry, quantiles, rate, sigma, chil
             _cross(a, b, stream, threshold, child, marked)
             for i in range(genes):
                 if marked[i]:
-                    bits = mix(mix(stream + _U(i + 1) * GOLDEN))
-                    child[i] += sigma * scales[i] * quantiles[bits & _U(0xFFF)]
+                    bits = mix(mix(stream + U(i + 1) * GOLDEN))
+                    child[i] += sigma * scales[i] * quantiles[bits & U(0xFFF)]
 
 
 def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, mutation: Mutation) -> np.ndarray:
@@ -129,8 +127,8 @@ def breed(parents: np.ndarray, recipes: np.ndarray, key: int, spec: PolicySpec, 
         parents = np.zeros((1, spec.size), dtype=np.float32)
     children = np.empty((len(recipes), spec.size), dtype=np.float32)
     _breed(
-        freeze(parents), freeze(recipes), _U(key), gene_scales(spec), symmetry(spec), QUANTILES,
-        _F(mutation.rate), _F(mutation.sigma), children,
+        freeze(parents), freeze(recipes), U(key), gene_scales(spec), symmetry(spec), QUANTILES,
+        F(mutation.rate), F(mutation.sigma), children,
     )  # fmt: skip
     return children
 
@@ -143,7 +141,7 @@ def _noise_sum(seeds, weights, key, quantiles, scales, symmetry, total):
         if weights[k] == 0.0:
             continue
         _normals(quantiles, _stream(key, seeds[k]), scales, symmetry, z)
-        w = _F(weights[k])
+        w = F(weights[k])
         for i in range(total.shape[0]):
             total[i] += w * z[i]
 
@@ -151,5 +149,5 @@ def _noise_sum(seeds, weights, key, quantiles, scales, symmetry, total):
 def noise_sum(seeds: np.ndarray, weights: np.ndarray, key: int, spec: PolicySpec) -> np.ndarray:
     """Sum float32 [genes] of weights [n] times the noise of Kind.STEP at sigma 1 with these seeds [n]."""
     total = np.zeros(spec.size, dtype=np.float32)
-    _noise_sum(seeds.astype(np.uint32), weights, _U(key), QUANTILES, gene_scales(spec), symmetry(spec), total)
+    _noise_sum(seeds.astype(np.uint32), weights, U(key), QUANTILES, gene_scales(spec), symmetry(spec), total)
     return total

@@ -19,8 +19,7 @@ from evolution.search.breeding import Kind, Mutation, noise_sum
 
 _CENTRE, _OTHER = 0, 1  # rows of the broadcast parents
 _ELITES = 2  # the centre, and the champion or, before the first one, the average
-# Learning rate of the mean (c_m of Hansen 2016, "The CMA Evolution Strategy: A Tutorial"), by measurement.
-_LEARNING_RATE = 2.0
+_LEARNING_RATE = 2.0  # of the mean, c_m of Hansen 2016 ("The CMA Evolution Strategy: A Tutorial"), by measurement
 _KEPT = 0.9  # decay of the average of centres in each generation
 # The largest step size, relative to the initial one. Saturated units hardly react to larger weights, so weights and
 # step size would grow without bound.
@@ -37,7 +36,7 @@ class Recombination(Search):
         self.centre = np.zeros(0)  # float64 [genes], or [0] before the first generation
         self.average = np.zeros(0)  # exponential moving average of the centres
         self._free = symmetry(spec).free
-        # The evolution path, N(0, 1) as under random selection: from 0, the step size would shrink until it has grown.
+        # The evolution path starts at its stationary N(0, I), not at 0, which would shrink sigma at first.
         self.path = self._rng(1).standard_normal(len(self._free))
         self.sigma = config.sigma  # the step size
 

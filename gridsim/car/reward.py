@@ -7,12 +7,8 @@ min(S) is the shortest ray after the step, relative to the full range.
 
 from __future__ import annotations
 
-import numpy as np
-
 from gridsim.config import CLEARANCE_SHARE, CRASH_REWARD, PROGRESS_SHARE
-from gridsim.jit import njit
-
-_F = np.float32
+from gridsim.jit import F, njit
 
 
 # Compiled without reordering sums or replacing divisions, so that it rounds the same in every kernel that inlines it.
@@ -24,10 +20,10 @@ def reward(ranges, reach, speed, progress, end, fastest, dt):
     scenario's upper speed (m/s) and the control period (s).
     """
     if end == 1:
-        return _F(CRASH_REWARD)
+        return F(CRASH_REWARD)
     shortest = reach
     for r in range(ranges.shape[0]):
         shortest = min(shortest, ranges[r])
-    distance = min(progress / (fastest * dt), _F(1.0))
-    pace = min(max(speed / fastest, _F(0.0)), _F(1.0))
-    return _F(PROGRESS_SHARE) * (distance + pace) + shortest * (_F(CLEARANCE_SHARE) / reach)
+    distance = min(progress / (fastest * dt), F(1.0))
+    pace = min(max(speed / fastest, F(0.0)), F(1.0))
+    return F(PROGRESS_SHARE) * (distance + pace) + shortest * (F(CLEARANCE_SHARE) / reach)

@@ -14,12 +14,7 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
-import numpy as np
-
-from gridsim.jit import leaf
-
-_F = np.float32
-_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+from gridsim.jit import HALF, ONE, ZERO, F, leaf
 
 
 class Action(IntEnum):
@@ -48,14 +43,14 @@ def act(constants, action, speed, steering):
     Returns: (acceleration m/s2, steering angle rad after the period). Without left or right the wheels return to the
     centre. Braking ends at standstill; reverse continues backwards.
     """
-    target = _ZERO
+    target = ZERO
     if action == 1 or action == 5:
         target = constants.steering_limit
     elif action == 2 or action == 6:
         target = -constants.steering_limit
     step = constants.steering_step
     steering = min(max(target, steering - step), steering + step)
-    acceleration = _ZERO
+    acceleration = ZERO
     if action == 0 or action == 5 or action == 6:
         acceleration = constants.acceleration
     elif action == 3:
@@ -75,10 +70,10 @@ def act_continuous(constants, pedal, wheel, speed, steering):
     Returns: (acceleration m/s2, steering angle rad after the period).
     """
     step = constants.steering_step
-    target = min(max(wheel, -_ONE), _ONE) * constants.steering_limit
+    target = min(max(wheel, -ONE), ONE) * constants.steering_limit
     steering = min(max(target, steering - step), steering + step)
-    pedal = min(max(pedal, -_ONE), _ONE)
-    if pedal < _ZERO:
+    pedal = min(max(pedal, -ONE), ONE)
+    if pedal < ZERO:
         return brake(constants, -pedal * constants.braking, speed), steering
     return pedal * constants.acceleration, steering
 
@@ -87,8 +82,8 @@ def act_continuous(constants, pedal, wheel, speed, steering):
 def path_curvature(constants, speed, steering):
     """Curvature (1/m, left positive) of the centre of mass's path: the bicycle model's, limited by lateral grip."""
     tangent = constants.rear_share * math.tan(steering)  # of the slip angle
-    curvature = tangent / (math.sqrt(_ONE + tangent * tangent) * constants.rear_axle)
-    bound = constants.grip / max(speed * speed, _F(1e-6))
+    curvature = tangent / (math.sqrt(ONE + tangent * tangent) * constants.rear_axle)
+    bound = constants.grip / max(speed * speed, F(1e-6))
     return min(max(curvature, -bound), bound)
 
 
@@ -100,7 +95,7 @@ def front_velocity(constants, speed, steering):
     """
     curvature = path_curvature(constants, speed, steering)
     sine_slip = curvature * constants.rear_axle
-    along = speed * math.sqrt(max(_ONE - sine_slip * sine_slip, _ZERO))
+    along = speed * math.sqrt(max(ONE - sine_slip * sine_slip, ZERO))
     return along, speed * curvature * (constants.rear_axle + constants.front_axle)
 
 
@@ -112,19 +107,19 @@ def advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt):
     Returns: (x, y, cosine, sine, speed, signed path length in m).
     """
     after = min(max(speed + acceleration * dt, -constants.reverse_limit), constants.speed_limit)
-    length = _HALF * (speed + after) * dt
+    length = HALF * (speed + after) * dt
     # The heading changes by `length * curvature`, called turn here; the chord points along heading + slip + turn / 2.
-    half = _HALF * length * curvature
+    half = HALF * length * curvature
     square = half * half
-    sine_half = half * (_ONE - square * (_F(1.0 / 6.0) - square * _F(1.0 / 120.0)))
-    cosine_half = _ONE - square * (_HALF - square * (_F(1.0 / 24.0) - square * _F(1.0 / 720.0)))
-    chord = length * (_ONE - square * (_F(1.0 / 6.0) - square * _F(1.0 / 120.0)))
+    sine_half = half * (ONE - square * (F(1.0 / 6.0) - square * F(1.0 / 120.0)))
+    cosine_half = ONE - square * (HALF - square * (F(1.0 / 24.0) - square * F(1.0 / 720.0)))
+    chord = length * (ONE - square * (F(1.0 / 6.0) - square * F(1.0 / 120.0)))
     sine_slip = curvature * constants.rear_axle
-    cosine_slip = math.sqrt(max(_ONE - sine_slip * sine_slip, _ZERO))
+    cosine_slip = math.sqrt(max(ONE - sine_slip * sine_slip, ZERO))
     # Unit vector along heading + turn / 2, then rotated by the slip angle.
     ch, sh = cosine * cosine_half - sine * sine_half, sine * cosine_half + cosine * sine_half
     x += chord * (ch * cosine_slip - sh * sine_slip)
     y += chord * (sh * cosine_slip + ch * sine_slip)
     c, s = ch * cosine_half - sh * sine_half, sh * cosine_half + ch * sine_half
-    norm = _F(1.5) - _HALF * (c * c + s * s)  # one Newton step of 1 / sqrt keeps the vector's length 1
+    norm = F(1.5) - HALF * (c * c + s * s)  # one Newton step of 1 / sqrt keeps the vector's length 1
     return x, y, c * norm, s * norm, after, length

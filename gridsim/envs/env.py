@@ -10,8 +10,8 @@ Observation:
 * `image`, the grid alone, uint8 [frames, 80, 80]: channels first, as convolutional policies expect.
 
 Action: `discrete`, one of `vehicle.Action`, or `continuous`, float32 [2], pedal and wheel of `vehicle.act_continuous`,
-clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling, 15 steps without progress,
-terminates the episode without a penalty: its last step is rewarded like any other.
+clipped to [-1, 1]. Reward: the paper's, within [-1, 1], see `gridsim.car.reward`. Idling (15 steps without progress)
+has no penalty: the last step is rewarded like any other.
 
 An episode depends only on its car's seed and its number: after `reset(seed=s)`, car i drives the episodes that a single
 environment drives after `reset(seed=s + i)`, whatever the other cars do.
@@ -34,16 +34,16 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from gridsim.car.ego import DISTANCE, SPEED, End
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig
 from gridsim.envs.episodes import Episodes
 from gridsim.envs.observing import Observer, row
-from gridsim.envs.simulator import Simulator
+from gridsim.jit import U
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import TRAINING_SEED, check_name, default_traffic, is_map_file
 from gridsim.sensing.grid import MAX_FRAMES
-from gridsim.traffic.world import LANE
+from gridsim.simulator import Simulator
+from gridsim.state import DISTANCE, LANE, SPEED, End
 from gridsim.view.display import has_display
 
 if TYPE_CHECKING:
@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 
 RENDER_SIZE = (640, 480)  # pixels
 
-_U = np.uint64
 _SUCCESS = int(End.SUCCESS)  # a plain number: comparing arrays with an IntEnum is slow
 #: bool [ends]: which ends terminate, and which truncate, an episode.
 TERMINATES = np.isin(list(End), [End.COLLISION, End.IDLE])
@@ -62,13 +61,12 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     """Many cars at once, each in its own episode.
 
     `autoreset_mode` says how the next episode begins. `NEXT_STEP`: in the step after the end, in which the car does not
-    drive. `SAME_STEP`: at once; info has the ended episode's last observations as `final_obs`, an array of objects, and
-    its last info as `final_info`. `DISABLED`: the caller resets the cars that have ended before the next step, by
-    `reset(options={"reset_mask": mask})`.
+    drive. `SAME_STEP`: at once; info has the last observations as `final_obs`, an array of objects, and the last info
+    as `final_info`. `DISABLED`: the caller resets cars that have ended, by `reset(options={"reset_mask": mask})`.
 
-    info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of an
-    `ego.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes on
-    and the observation shows neither.
+    info: `distance_m` (new ground of the episode so far), `speed_mps`, `is_success` and `end`, the number of a
+    `state.End`, arrays [n]. Collision and idling terminate; success and the time limit truncate, because the road goes
+    on and the observation shows neither.
     """
 
     metadata = {  # noqa: RUF012, Gymnasium's own form
@@ -98,7 +96,6 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """Maps are built when an episode first needs them; all environments of a process share a scenario's maps.
 
         Args:
-            num_envs: cars.
             scenario: name in the registry of scenarios, or a map's file (`gridsim.maps.files`), which is one map.
             maps: how many maps the episodes are drawn from, or the maps themselves.
             map_seed: seed of the first map; the others' seeds follow.
@@ -107,8 +104,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
             render_mode: `rgb_array`, or `human`, a window that follows the first car; `metadata["render_modes"]` has
                 it only where there is a display.
             max_episode_steps: time limit in control steps; None means the configuration's.
-            autoreset_mode: an `AutoresetMode` of `gymnasium.vector`, or its value, such as `SameStep`.
-        Raises: ValueError with one line for an invalid argument.
+            autoreset_mode: an `AutoresetMode`, or its value, such as `SameStep`.
+        Raises: ValueError for an invalid argument.
         """
         check_name(scenario)
         for name, value, known in (
@@ -170,12 +167,13 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
                 (m), heading (rad), speed (m/s), steering (rad); `reset_mask`, bool [n]: which cars, once all have
                 been reset. Later episodes are drawn as usual.
         Returns: (observations of all cars, info, whose masks say which cars were reset).
-        Raises: ValueError with one line for an unknown or invalid option.
+        Raises: ValueError for an unknown or invalid option.
         """
-        options = dict(options or {})
-        map_seed, start, mask = (options.pop(name, None) for name in ("map_seed", "start", "reset_mask"))
-        if options:
-            raise ValueError(f"unknown option {next(iter(options))!r}; there are: map_seed, start, reset_mask")
+        known, options = ("map_seed", "start", "reset_mask"), options or {}
+        for name in options:
+            if name not in known:
+                raise ValueError(f"unknown option {name!r}; there are: {', '.join(known)}")
+        map_seed, start, mask = map(options.get, known)
         if mask is None:
             mask = np.ones(self.num_envs, dtype=np.bool_)
         elif not (isinstance(mask, np.ndarray) and (mask.dtype, mask.shape) == (bool, (self.num_envs,)) and mask.any()):
@@ -198,8 +196,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
 
         Args: actions integers [n], `vehicle.Action`, or continuous ones [n, 2]; ignored where an episode begins.
         Returns: (observations, rewards float32 [n], terminations bool [n], truncations bool [n], info).
-        Raises: gymnasium.error.ResetNeeded before the first reset, and after the end of an episode that only the caller
-        can reset; ValueError with one line for invalid actions.
+        Raises: gymnasium.error.ResetNeeded where a reset is up to the caller; ValueError for invalid actions.
         """
         if not self._started:
             raise ResetNeeded("step() was called before reset()")
@@ -213,7 +210,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         rewards = self.simulator.step(actions)
         if begun.any():
             which = np.flatnonzero(begun)
-            self._episodes.numbers[which] += _U(1)
+            self._episodes.numbers[which] += U(1)
             self._begin(which)
         self._note(slice(None), begun)
         observations, info, ends = self._observer.look(), self._info(), self.simulator.ends
@@ -225,26 +222,21 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _seed(self, seed: int | np.integer | Sequence[int | None] | None, which: np.ndarray) -> None:
         """Seed cars `which`, or let them go on to their next episodes."""
         n, episodes = self.num_envs, self._episodes
-        seeds: list[int | None]
-        if seed is None:
-            seeds = [None] * n
-        elif _is_seed(seed):
-            seeds = [int(seed) + i for i in range(n)]
-        elif np.iterable(seed) and len(seeds := list(seed)) == n and all(s is None or _is_seed(s) for s in seeds):
-            pass
-        else:
+        seeds: list[Any] = (
+            list(seed) if np.iterable(seed) else [int(seed) + i if _is_seed(seed) else seed for i in range(n)]
+        )
+        if len(seeds) != n or not all(s is None or _is_seed(s) for s in seeds):
             raise ValueError(f"seed must be a whole number from 0, or {n} of them, not {seed!r}")
         if not np.iterable(seed):
             super().reset(seed=seeds[0])
         if self._seeded:
-            episodes.numbers[which] += _U(1)
+            episodes.numbers[which] += U(1)
         else:
-            episodes.keys[:] = _U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
+            episodes.keys[:] = U(self.np_random.integers(1 << 63)) + np.arange(n, dtype=np.uint64)
             self._seeded = True
         for i in which:
-            given = seeds[i]
-            if given is not None:
-                episodes.keys[i], episodes.numbers[i] = int(given) % (1 << 64), 0
+            if seeds[i] is not None:
+                episodes.keys[i], episodes.numbers[i] = int(seeds[i]) % (1 << 64), 0
 
     def _begin(self, which: np.ndarray, map_seed: Any = None, start: Any = None) -> None:
         """Begin the current episodes of cars `which`."""
@@ -259,7 +251,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         last = np.full(self.num_envs, None, dtype=object)
         for i in which.tolist():
             last[i] = copy.deepcopy(row(observations, i))
-        self._episodes.numbers[which] += _U(1)
+        self._episodes.numbers[which] += U(1)
         self._begin(which)
         self._note(which, over)
         seen = self._observer.look(which)
@@ -272,10 +264,7 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         return self._info() | {"final_obs": last, "_final_obs": over, "final_info": final, "_final_info": over.copy()}
 
     def _note(self, which: np.ndarray | slice, begun: np.ndarray) -> None:
-        """Record what cars `which` sense now, and for pictures all cars' positions; update the window.
-
-        Args: begun bool [n]: whose episode has just begun.
-        """
+        """Record what cars `which` sense now, for pictures where all are; update the window. Args: begun bool [n]."""
         self._observer.take(begun[which], which)
         if self.render_mode is None:
             return
@@ -296,21 +285,15 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
         """What car i's world looks like: uint8 [height, width, 3]."""
         from gridsim.view.render import Renderer  # here, because only pictures need it
 
-        car, world = self.simulator.cars[i], self.simulator.worlds[i]
-        road_map = self.simulator.maps[i]
-        view = self._views.get(road_map)
-        if view is None:
-            view = self._views[road_map] = Renderer(road_map, RENDER_SIZE, config=self.config)
-        return view.draw(
-            car,
-            boxes=world[world[:, LANE] >= 0.0],
-            ranges=self.simulator.ranges[i],
-            path=np.array(self._paths[i]),
-            text=(f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m",),
-        )
+        car, world, road_map = self.simulator.cars[i], self.simulator.worlds[i], self.simulator.maps[i]
+        if road_map not in self._views:
+            self._views[road_map] = Renderer(road_map, RENDER_SIZE, config=self.config)
+        text = f"{car[SPEED]:.1f} m/s    {car[DISTANCE]:,.0f} m"
+        boxes, path = world[world[:, LANE] >= 0.0], np.array(self._paths[i])
+        return self._views[road_map].draw(car, boxes, self.simulator.ranges[i], path, (text,))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """With `rgb_array`, a picture uint8 [height, width, 3] of each car's world; `human` is drawn by step and reset.
+        """With `rgb_array`, a picture uint8 [height, width, 3] for each car; `human` is drawn by step and reset.
 
         Raises: gymnasium.error.ResetNeeded before the first reset.
         """
@@ -332,12 +315,8 @@ class GridSimVectorEnv(VectorEnv[Any, np.ndarray, np.ndarray]):
     def _info(self) -> dict[str, Any]:
         """Distance, speed, success and end of every car; in Gymnasium's form, each with a mask of cars."""
         cars, ends = self.simulator.cars, self.simulator.ends.copy()
-        info = {
-            "distance_m": cars[:, DISTANCE].copy(),
-            "speed_mps": cars[:, SPEED].copy(),
-            "is_success": ends == _SUCCESS,
-            "end": ends,
-        }
+        info: dict[str, Any] = {"distance_m": cars[:, DISTANCE].copy(), "speed_mps": cars[:, SPEED].copy()}
+        info |= {"is_success": ends == _SUCCESS, "end": ends}
         everyone = np.ones(self.num_envs, dtype=np.bool_)
         return info | {f"_{name}": everyone for name in info}
 
@@ -350,9 +329,7 @@ def _is_seed(seed: Any) -> TypeGuard[int]:
 class GridSimEnv(gymnasium.Env[Any, Any]):
     """One car, as a `GridSimVectorEnv` of one: the same arguments, spaces, reward and info, no automatic resets."""
 
-    metadata = {  # noqa: RUF012, Gymnasium's own form
-        name: GridSimVectorEnv.metadata[name] for name in ("render_modes", "render_fps")
-    }
+    metadata = {name: GridSimVectorEnv.metadata[name] for name in ("render_modes", "render_fps")}  # noqa: RUF012
 
     def __init__(self, scenario: str = "seamless", **options: Any):
         if "autoreset_mode" in options:
@@ -394,8 +371,7 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One control period. Returns: (observation, reward, terminated, truncated, info).
 
-        Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError with one line for an
-        invalid action.
+        Raises: gymnasium.error.ResetNeeded before a reset and after an episode's end; ValueError for an invalid action.
         """
         if self.cars.simulator.ends[0] != End.RUNNING:
             raise ResetNeeded("step() was called after the episode's end; call reset() first")
@@ -403,12 +379,10 @@ class GridSimEnv(gymnasium.Env[Any, Any]):
         return row(observations, 0), float(rewards[0]), bool(terminations[0]), bool(truncations[0]), self._own(info)
 
     def render(self) -> np.ndarray | None:
-        """A picture uint8 [height, width, 3] with `rgb_array`; None with `human`, whose window step and reset draw."""
         pictures = self.cars.render()
         return pictures[0] if pictures else None
 
     def close(self) -> None:
-        """Close the window."""
         self.cars.close()
 
     @staticmethod

@@ -11,13 +11,13 @@ import numpy as np
 
 from gridsim.config import SimConfig
 from gridsim.counter import GOLDEN, mix, uniform64
-from gridsim.jit import njit
+from gridsim.jit import U, njit
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.roads import clearance
 from gridsim.maps.scenarios import build, is_map_file, seed_of_map
-from gridsim.traffic.world import FIELDS, spawn
+from gridsim.state import TRAFFIC_FIELDS
+from gridsim.traffic.world import spawn
 
-_U = np.uint64
 #: The maps of this process's environments, kept while one of them uses them.
 _SHARED: WeakValueDictionary[tuple[str, int, SimConfig], Map] = WeakValueDictionary()
 
@@ -27,10 +27,10 @@ def _draw(keys, episodes, which, numbers, drawn):
     """For the episodes of cars `which` [k]: two numbers in [0, 1), float64 [k, 2], and the traffic's key [k]."""
     for k in range(which.shape[0]):
         i = which[k]
-        episode = mix(mix(keys[i]) + _U(episodes[i]) * GOLDEN)
-        drawn[k] = mix(episode + _U(3) * GOLDEN)
+        episode = mix(mix(keys[i]) + U(episodes[i]) * GOLDEN)
+        drawn[k] = mix(episode + U(3) * GOLDEN)
         for j in range(2):
-            numbers[k, j] = uniform64(mix(episode + _U(j + 1) * GOLDEN))
+            numbers[k, j] = uniform64(mix(episode + U(j + 1) * GOLDEN))
 
 
 class Episodes:
@@ -44,18 +44,15 @@ class Episodes:
     def __init__(
         self, cars: int, scenario: str, maps: int | Sequence[Map], map_seed: int, traffic: int, config: SimConfig
     ):
-        """Episodes on these `maps`, or on that many from `map_seed` on, which are built when first needed.
-
-        Raises: ValueError with one line if there is no map.
-        """
+        """Episodes on these `maps`, or on that many from `map_seed` on, built when first needed. Raises: ValueError."""
         self.scenario, self.traffic, self.config = scenario, traffic, config
         if isinstance(maps, int) and is_map_file(scenario):
             maps = [build(scenario, map_seed, config)] * min(maps, 1)
+        given = [] if isinstance(maps, int) else maps
         self._seeds = [map_seed + k for k in range(maps)] if isinstance(maps, int) else [each.seed for each in maps]
+        self._own = {each.seed: each for each in given}  # the maps of `_seeds` that were built so far
         if not self._seeds:
             raise ValueError("an environment needs 1 map or more")
-        # The maps of `_seeds` that were built so far.
-        self._own: dict[int, Map] = {} if isinstance(maps, int) else {each.seed: each for each in maps}
         if len(set(self._seeds)) < len(self._seeds):
             raise ValueError("maps that are given need different seeds, by which episodes name them")
         self.keys = np.zeros(cars, dtype=np.uint64)
@@ -64,7 +61,7 @@ class Episodes:
     def draw(
         self, which: np.ndarray, map_seed: Any = None, start: Any = None
     ) -> tuple[list[Map], np.ndarray, np.ndarray]:
-        """Maps [k], starts [k, 5] and worlds [k, traffic, FIELDS] of the current episodes of `which`, unless given."""
+        """Maps [k], starts [k, 5] and worlds [k, traffic, TRAFFIC_FIELDS] of the episodes of cars `which` [k]."""
         numbers, keys = np.empty((len(which), 2)), np.empty(len(which), dtype=np.uint64)
         _draw(self.keys, self.numbers, which, numbers, keys)
         if map_seed is None:
@@ -79,7 +76,7 @@ class Episodes:
         starts = np.empty((len(which), 5), dtype=np.float32)
         if start is not None:
             starts[:] = self._checked_start(start, which, maps)
-        worlds = np.empty((len(which), self.traffic, FIELDS), dtype=np.float32)
+        worlds = np.empty((len(which), self.traffic, TRAFFIC_FIELDS), dtype=np.float32)
         on_each: defaultdict[Map, list[int]] = defaultdict(list)
         for k, road_map in enumerate(maps):
             on_each[road_map].append(k)
@@ -107,9 +104,8 @@ class Episodes:
         try:
             starts = np.broadcast_to(np.asarray(start, dtype=np.float32), (cars, 5))[which]
         except (TypeError, ValueError):
-            raise ValueError(
-                f"start must be x, y, heading, speed, steering, or {cars} rows of these, not {start!r}"
-            ) from None
+            form = f"x, y, heading, speed, steering, or {cars} rows of these"
+            raise ValueError(f"start must be {form}, not {start!r}") from None
         if not np.isfinite(starts).all():
             raise ValueError(f"start must be five finite numbers, not {start!r}")
         for road_map, (x, y, _, speed, steering) in zip(maps, starts, strict=True):

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from gymnasium.spaces import Box, Dict
 
-from gridsim.car.ego import SPEED, STEERING
-from gridsim.envs.simulator import Simulator
-from gridsim.jit import njit
+from gridsim.jit import F, njit
 from gridsim.sensing.grid import CELLS, grid_table, grids
+from gridsim.simulator import Simulator
+from gridsim.state import SPEED, STEERING
 
-_F = np.float32
 _ALL = slice(None)
 Seen = np.ndarray | dict[str, np.ndarray]
 
@@ -21,12 +20,12 @@ def _observe(ranges, closing, speeds, reach, slowest, limit, observations):
     rays = ranges.shape[1]
     for i in range(ranges.shape[0]):
         for r in range(rays):
-            observations[i, r] = min(ranges[i, r] / reach, _F(1.0))
+            observations[i, r] = min(ranges[i, r] / reach, F(1.0))
         if closing is not None:
             for r in range(rays):
-                observations[i, rays + r] = min(max(closing[i, r] / limit, _F(-1.0)), _F(1.0))
+                observations[i, rays + r] = min(max(closing[i, r] / limit, F(-1.0)), F(1.0))
         last = rays if closing is None else 2 * rays
-        observations[i, last] = min(max(speeds[i] / limit, slowest), _F(1.0))
+        observations[i, last] = min(max(speeds[i] / limit, slowest), F(1.0))
 
 
 def row(observations: Seen, i: int) -> Seen:
@@ -45,7 +44,7 @@ class Observer:
         self._motion, self._steering = motion, steering
         rays, vehicle = self.config.sensors.rays, self.config.vehicle
         self._width = (2 if motion else 1) * rays + 1 + steering
-        self._slowest = _F(-vehicle.reverse_limit / vehicle.speed_limit)
+        self._slowest = F(-vehicle.reverse_limit / vehicle.speed_limit)
         self._observation = observation
         shape = 0 if observation == "rays" else (len(simulator), frames, CELLS, CELLS)
         self._stack = np.zeros(shape, dtype=np.uint8)
@@ -80,7 +79,7 @@ class Observer:
         image = self._grids(which)[:, None] if one else self._stack[which].copy()
         if self._observation == "image":
             return image
-        share = np.clip(speeds / _F(self.config.vehicle.speed_limit), self._slowest, _F(1.0))
+        share = np.clip(speeds / F(self.config.vehicle.speed_limit), self._slowest, F(1.0))
         return {"grid": image, "speed": share[:, None]}
 
     def _grids(self, which: np.ndarray | slice) -> np.ndarray:
@@ -91,7 +90,7 @@ class Observer:
         vehicle, ranges = self.config.vehicle, self._simulator.ranges[which]
         observations = np.empty((len(ranges), self._width), dtype=np.float32)
         closing = self._simulator.closing[which] if self._motion else None
-        reach, limit = _F(self.config.sensors.range), _F(vehicle.speed_limit)
+        reach, limit = F(self.config.sensors.range), F(vehicle.speed_limit)
         _observe(ranges, closing, speeds, reach, self._slowest, limit, observations)
         if self._steering:
             angles = self._simulator.cars[which, STEERING]

@@ -30,7 +30,7 @@ class SB3VecEnv(VecEnv):
     def reset(self) -> Any:
         """Begin an episode of each car, with the seeds and options set since the last reset.
 
-        Returns: observations. Raises: ValueError with one line for invalid options, or if only some cars have them.
+        Returns: observations. Raises: ValueError for invalid options, or if only some cars have them.
         """
         names = self._options[0].keys()
         if any(own.keys() != names for own in self._options):
@@ -43,7 +43,6 @@ class SB3VecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take actions [n, ...]."""
         self._actions = actions
 
     def step_wait(self) -> Any:
@@ -68,19 +67,15 @@ class SB3VecEnv(VecEnv):
         return observations, rewards, dones, infos
 
     def close(self) -> None:
-        """Close a window."""
         self.cars.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Pictures of all cars."""
         return list(self.cars.render() or ())
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute, which all cars share."""
         return [getattr(self.cars, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute, which all cars share."""
         setattr(self.cars, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
@@ -91,5 +86,4 @@ class SB3VecEnv(VecEnv):
         raise NotImplementedError(f"cars are not separate environments; call .cars.{method_name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """False for each car."""
         return [False for _ in self._get_indices(indices)]

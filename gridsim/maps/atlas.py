@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.network import Network
-from gridsim.maps.roads import Road, freeze
+from gridsim.maps.roads import Road
 
 
 class Atlas(NamedTuple):

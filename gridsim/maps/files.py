@@ -1,8 +1,7 @@
 """Maps from files: a picture in which bright pixels are road, or the YAML form of ROS's map_server with a picture.
 
-A picture is thresholded at its own resolution. The signed distance to the edge between road and wall is sampled at the
-nodes of the clearance field. Unknown pixels are wall, and so is everything outside the picture. World coordinates have
-their origin at the picture's lower left corner; a file's own coordinates are shifted by its `origin`.
+Unknown pixels are wall, and so is everything outside the picture. World coordinates have their origin at the picture's
+lower left corner; a file's own coordinates are shifted by its `origin`.
 
 A file gives the same map for every seed. It has no lanes: episodes begin at `Map.starts`, which are either poses given
 in the file, or poses on the ridge of the free space, heading along it in both directions.
@@ -35,9 +34,7 @@ from gridsim.maps.roads import CELLS_PER_M
 PIXELS_PER_M = 16.0  # of a picture without a given scale
 PICTURES = {".png": "PNG", ".pgm": "PPM", ".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 YAMLS = (".yaml", ".yml")
-KEYS = (
-    "image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed",
-)  # fmt: skip
+KEYS = ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh", "mode", "starts", "speed"]
 
 MAX_YAML = 1 << 16  # bytes
 MAX_IMAGE = 1 << 27  # bytes
@@ -69,24 +66,20 @@ class MapFile:
 def load_map(name: str, config: SimConfig | None = None) -> Map:
     """The map of a file; the same object as long as the file does not change.
 
-    Warns (MapWarning) when it is built, if the road is very short or the picture seems inverted.
-    Raises: GridSimError with one line that names the problem.
+    Warns (MapWarning) when it is built, if the road is very short or the picture seems inverted. Raises: GridSimError.
     """
     return _load(os.path.abspath(name), map_digest(name), config or SimConfig())
 
 
 def map_digest(name: str) -> str:
-    """SHA-256 of a map's files. Raises: GridSimError with one line if they cannot be read."""
+    """SHA-256 of a map's files. Raises: GridSimError if they cannot be read."""
     path = Path(os.path.abspath(name))
     files = dict.fromkeys((path, read_map_file(path).image))  # a picture alone is a map, too
     return hashlib.sha256(b"".join(hashlib.sha256(_bytes(file)).digest() for file in files)).hexdigest()
 
 
 def read_map_file(path: Path) -> MapFile:
-    """Read and check a map's YAML; for a picture alone, use defaults. The picture itself is not opened.
-
-    Raises: GridSimError with one line.
-    """
+    """Read and check a map's YAML; for a picture alone, use defaults. Raises: GridSimError."""
     suffix = path.suffix.lower()
     if suffix in PICTURES:
         return MapFile(path)
@@ -116,7 +109,7 @@ def _shown(value: object) -> str:
 
 
 def _bytes(path: Path) -> bytes:
-    """A file's bytes. Raises: GridSimError with one line if it is not a file, too large or unreadable."""
+    """A file's bytes. Raises: GridSimError if it is not a file, too large or unreadable."""
     limit = MAX_YAML if path.suffix.lower() in YAMLS else MAX_IMAGE
     try:
         status = path.stat()
@@ -153,7 +146,7 @@ def _list(value: Any, what: str, length: int) -> list[Any]:
 
 
 def _checked(path: Path, values: Any) -> MapFile:
-    """The MapFile of a YAML's values. Raises: ValueError with one line, without the file's name."""
+    """The MapFile of a YAML's values. Raises: ValueError without the file's name."""
     if not isinstance(values, dict):
         raise ValueError(f"a map's YAML is a mapping with image and resolution, not {_shown(values)}")
     unknown = [key for key in values if key not in KEYS]
@@ -196,11 +189,8 @@ def _checked(path: Path, values: Any) -> MapFile:
 
 def _start(value: Any) -> tuple[float, float, float]:
     x, y, heading = _list(value, "a start", 3)
-    return (
-        _number(x, "a start's x (m)", -1e8, 1e8),
-        _number(y, "a start's y (m)", -1e8, 1e8),
-        _number(heading, "a start's heading (rad)", -2 * math.pi, 2 * math.pi),
-    )
+    x, y = _number(x, "a start's x (m)", -1e8, 1e8), _number(y, "a start's y (m)", -1e8, 1e8)
+    return x, y, _number(heading, "a start's heading (rad)", -2 * math.pi, 2 * math.pi)
 
 
 def _image_path(path: Path, image: Any) -> Path:
@@ -220,7 +210,7 @@ def _image_path(path: Path, image: Any) -> Path:
 def read_free(file: MapFile) -> np.ndarray:
     """Which pixels are road: bool [rows, columns], the lowest row first.
 
-    Raises: GridSimError with one line if the picture is unreadable, too large, all road or all wall.
+    Raises: GridSimError if the picture is unreadable, too large, all road or all wall.
     """
     data = _bytes(file.image)
     try:
@@ -284,21 +274,19 @@ def _warn(stem: str, file: MapFile, free: np.ndarray, nodes: np.ndarray, revisit
     """Warn of a road so short that a second lap counts no distance, and of a picture that seems inverted."""
     length = road_length(nodes)
     if length <= 1.05 * revisit:  # 5 % for the error of the estimate
-        warnings.warn(
+        text = (
             f"{stem} has about {length:.0f} m of road. Ground driven again within {revisit:g} m does not count: "
-            "cars end idle in their second lap. Make the road longer, or its resolution larger",
-            MapWarning,
-            stacklevel=1,
+            "cars end idle in their second lap. Make the road longer, or its resolution larger"
         )
+        warnings.warn(text, MapWarning, stacklevel=1)
     border = np.concatenate([free[0], free[-1], free[:, 0], free[:, -1]]).mean()
     if border >= MOST_BORDER:
-        warnings.warn(
+        text = (
             f"{border:.0%} of {stem}'s border is road. If the road is {'bright' if file.negate else 'dark'}, "
             f"set negate: {int(not file.negate)} in its YAML; if the cars are to stay on a track, draw its "
-            "surroundings as wall",
-            MapWarning,
-            stacklevel=1,
+            "surroundings as wall"
         )
+        warnings.warn(text, MapWarning, stacklevel=1)
 
 
 @lru_cache(maxsize=4)

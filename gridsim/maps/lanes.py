@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 
 from gridsim.config import CROSSING_GAP
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.network import Network
-from gridsim.maps.roads import Strips, freeze
+from gridsim.maps.roads import Strips
 
 Plan = tuple[Strips, Network]  # of a map: its drivable area and its lanes
 
@@ -37,10 +38,7 @@ class Path(NamedTuple):
 
 def _poses(path: Path) -> list[tuple[float, float, float]]:
     """Poses (m, m, rad) where each piece of a path begins, and where the last one ends."""
-    poses = [path[:3]]
-    for length, curvature in path.pieces:
-        poses.append(_pose_after(*poses[-1], length, curvature))
-    return poses
+    return list(accumulate(path.pieces, lambda pose, piece: _pose_after(*pose, *piece), initial=path[:3]))
 
 
 def beside(path: Path, offset: float) -> list[Path]:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.lanes import lay_lanes
 from gridsim.maps.network import Network
-from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, freeze, make_road
+from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, THICK_WALL, Road, Strips, make_road
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class Map:
         return sum(part.nbytes for part in (*self.road, *self.strips, *self.network, self.starts))
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what follows from the rest."""
+        """State without the cached arc length."""
         return {name: part for name, part in vars(self).items() if name != "mileage"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -8,11 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import TRAFFIC_PACE, SimConfig
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import Road, clearances, freeze
+from gridsim.jit import HALF, F, U, freeze, leaf, njit
+from gridsim.maps.roads import Road, clearances
 
-_F, _N = np.float32, np.uint64
-_HALF, _NEXT = _F(0.5), _N(1)
 _ALONG_SIDE = np.linspace(-1.0, 1.0, 9)  # points of a car's side that are checked, as shares of its half length
 
 
@@ -26,8 +24,7 @@ class Network(NamedTuple):
     speeds: np.ndarray  # float32 [n], m/s: top speed that allows comfortable braking before bends
     offsets: np.ndarray  # int32 [lanes + 1], where each lane's points begin
     steps: np.ndarray  # float32 [lanes], m between a lane's points; 1 m at most
-    # int32 [lanes, k], padded with -1; every lane has at least one. A successor begins where the lane ends, up to whole
-    # turns of the torus.
+    # int32 [lanes, k], padded with -1, at least one: lanes that start at its end point, modulo the torus's sides
     successors: np.ndarray
     left: np.ndarray  # int32 [lanes], lane to which a car may change, or -1; its point i is beside point i
     right: np.ndarray  # as `left`
@@ -141,22 +138,22 @@ def make_network(lanes: Network, road: Road, config: SimConfig) -> Network:
     traffic = config.traffic
     points, offsets, steps, successors = lanes.points, lanes.offsets, lanes.steps, lanes.successors
     speeds, clear = np.empty(len(points), dtype=np.float32), np.empty(len(lanes.crossings), dtype=np.float32)
-    top = _F(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
-    _speed_profile(points, offsets, steps, successors, top, _F(traffic.lateral), _F(traffic.comfort), speeds)
+    top = F(TRAFFIC_PACE) * (road.speed_low + road.speed_high)  # m/s on a straight
+    _speed_profile(points, offsets, steps, successors, top, F(traffic.lateral), F(traffic.comfort), speeds)
     crossing = lanes.crossing_offsets, lanes.crossings
-    apart = _F(config.vehicle.width + traffic.beside)
+    apart = F(config.vehicle.width + traffic.beside)
     _clear_points(points, offsets, steps, *crossing, road.width, road.height, apart, clear)
     beside = np.maximum(lanes.left, lanes.right) >= 0  # cars with a lane beside theirs do not move over
     room = _room_on_right(lanes, road, config)
     room[np.repeat(beside, np.diff(offsets))] = 0.0
-    _ease(offsets, steps, successors, _F(traffic.taper), room)
+    _ease(offsets, steps, successors, F(traffic.taper), room)
     return lanes._replace(speeds=freeze(speeds), clear=freeze(clear), room=freeze(room))
 
 
 @leaf
 def wrapped(difference, side):
     """Wrap the difference of two coordinates in [0, side) (m) to [-side / 2, side / 2]."""
-    half = _HALF * side
+    half = HALF * side
     if difference > half:
         return difference - side
     if difference < -half:
@@ -175,18 +172,18 @@ def torus_distance(difference, side):
 def wrapped_any(difference, side):
     """As `wrapped`, for any difference; needed for points of lanes, which may lie outside [0, side)."""
     # NumPy's floor, because that of `math` returns int64, whose product with float32 is float64.
-    return difference - np.floor(difference / side + _HALF) * side
+    return difference - np.floor(difference / side + HALF) * side
 
 
 @leaf
 def lane_length(network, lane):
     """Length (m) of a lane."""
-    lane = _N(lane)  # unsigned, here and elsewhere: Numba checks whether signed indices are negative
-    return _F(network.offsets[lane + _NEXT] - network.offsets[lane] - 1) * network.steps[lane]
+    lane = U(lane)  # unsigned, here and elsewhere: Numba checks whether signed indices are negative
+    return F(network.offsets[lane + U(1)] - network.offsets[lane] - 1) * network.steps[lane]
 
 
 @leaf
 def is_junction(network, lane):
     """Whether a lane is inside a junction, that is, whether other lanes cross it."""
-    lane = _N(lane)
-    return network.crossing_offsets[lane + _NEXT] > network.crossing_offsets[lane]
+    lane = U(lane)
+    return network.crossing_offsets[lane + U(1)] > network.crossing_offsets[lane]

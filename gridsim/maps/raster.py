@@ -153,7 +153,7 @@ def _spread_sample(items: np.ndarray, count: int) -> np.ndarray:
 def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
     """Start poses float64 [n, 3] (x, y, heading): along the road, in both directions, with a margin around the car.
 
-    Raises: ValueError with one line if a car fits nowhere along a road.
+    Raises: ValueError if a car fits nowhere along a road.
     """
     nodes, corner = _window(nodes)
     labels, _ = ndimage.label(nodes >= vehicle.width / 2 + _MARGIN)
@@ -183,7 +183,7 @@ def find_starts(nodes: np.ndarray, vehicle: VehicleConfig) -> np.ndarray:
 
 
 def check_starts(nodes: np.ndarray, poses: np.ndarray, vehicle: VehicleConfig) -> None:
-    """Raises: ValueError with one line if at one of the poses [n, 3] (x, y, heading) a car would be off the road."""
+    """Raises: ValueError if at one of the poses [n, 3] (x, y, heading) a car would be off the road."""
     inside = ((poses[:, :2] >= 0.0) & (poses[:, :2] < np.array(nodes.shape[::-1]) * _NODE)).all(axis=1)
     wrong = poses[~(inside & _fits(nodes, poses, vehicle, _TOUCH))]
     if len(wrong):

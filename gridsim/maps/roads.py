@@ -15,15 +15,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gridsim.jit import leaf, njit
+from gridsim.jit import F, freeze, leaf, njit
 
 CELLS_PER_M = 2  # nodes of the clearance field per metre
 FIELD_FLOOR = -2.0  # m, clearance of byte 0, also of places deeper inside a wall
 FIELD_UNITS = 32.0  # steps of the byte per metre; byte 255 is 5.97 m
 VISIT_CELL = 4  # m, side of the cells in which new ground is counted
 THICK_WALL = 3.0  # m; among walls of this thickness or more, rays need no checks
-
-_F = np.float32
 
 
 class Road(NamedTuple):
@@ -71,7 +69,7 @@ def _cut_blocks(field, blocks, widest):
                 along = abs(dx * c + dy * s) - half_length
                 across = abs(dy * c - dx * s) - half_width
                 outside = math.sqrt(max(along, 0.0) ** 2 + max(across, 0.0) ** 2)
-                distance = _F(max(outside + min(max(along, across), 0.0), FIELD_FLOOR))
+                distance = F(max(outside + min(max(along, across), 0.0), FIELD_FLOOR))
                 row, column = j % rows, i % columns
                 if distance < field[row, column]:
                     field[row, column] = distance
@@ -80,7 +78,7 @@ def _cut_blocks(field, blocks, widest):
 @njit(nogil=True)
 def _clearance_nodes(lines, arcs, columns, rows):
     """Maximum of (half width - distance) at each node, at least FIELD_FLOOR; visits only the nodes near each strip."""
-    field = np.full((rows, columns), _F(FIELD_FLOOR), dtype=np.float32)
+    field = np.full((rows, columns), F(FIELD_FLOOR), dtype=np.float32)
     node = 1.0 / CELLS_PER_M
     for k in range(lines.shape[0] + arcs.shape[0]):
         is_line = k < lines.shape[0]
@@ -115,7 +113,7 @@ def _clearance_nodes(lines, arcs, columns, rows):
                         distance = abs(norm - radius)
                     else:
                         distance = math.sqrt(min((x - e0x) ** 2 + (y - e0y) ** 2, (x - e1x) ** 2 + (y - e1y) ** 2))
-                clearance = _F(w - distance)
+                clearance = F(w - distance)
                 row, column = j % rows, i % columns
                 if clearance > field[row, column]:
                     field[row, column] = clearance
@@ -124,7 +122,7 @@ def _clearance_nodes(lines, arcs, columns, rows):
 
 def pack_field(nodes: np.ndarray) -> np.ndarray:
     """`Road.field` of the clearance (m) at the nodes [rows, columns]."""
-    units = (nodes - _F(FIELD_FLOOR)) * _F(FIELD_UNITS) + _F(0.5)
+    units = (nodes - F(FIELD_FLOOR)) * F(FIELD_UNITS) + F(0.5)
     here = np.clip(units, 0.0, 255.0).astype(np.uint8)
     right, above = np.roll(here, -1, axis=1), np.roll(here, -1, axis=0)
     return freeze(np.stack([here, right, above, np.roll(right, -1, axis=0)], axis=-1).view("<u4").ravel())
@@ -133,25 +131,25 @@ def pack_field(nodes: np.ndarray) -> np.ndarray:
 def node_clearance(road: Road) -> np.ndarray:
     """Clearance (m) at the nodes of a road's field: float32 [rows, columns]."""
     units = (road.field & np.uint32(255)).reshape(int(road.rows), int(road.columns))
-    return units.astype(np.float32) / _F(FIELD_UNITS) + _F(FIELD_FLOOR)
+    return units.astype(np.float32) / F(FIELD_UNITS) + F(FIELD_FLOOR)
 
 
 @leaf
 def clearance(road, x, y):
     """Signed distance (m) from a point to the road's edge, positive on the road; x, y in m, also outside the torus."""
-    px, py = x * _F(CELLS_PER_M), y * _F(CELLS_PER_M)
+    px, py = x * F(CELLS_PER_M), y * F(CELLS_PER_M)
     fx, fy = np.floor(px), np.floor(py)  # NumPy's floor returns float32 here, that of `math` int64
     ux, uy = px - fx, py - fy
     i = np.uint32(np.int32(fx)) & np.uint32(road.columns - np.uint32(1))
     j = np.uint32(np.int32(fy)) & np.uint32(road.rows - np.uint32(1))
     word = road.field[np.uint32(j * road.columns + i)]
-    q00 = _F(np.int32(word & np.uint32(255)))
-    q10 = _F(np.int32((word >> np.uint32(8)) & np.uint32(255)))
-    q01 = _F(np.int32((word >> np.uint32(16)) & np.uint32(255)))
-    q11 = _F(np.int32(word >> np.uint32(24)))
+    q00 = F(np.int32(word & np.uint32(255)))
+    q10 = F(np.int32((word >> np.uint32(8)) & np.uint32(255)))
+    q01 = F(np.int32((word >> np.uint32(16)) & np.uint32(255)))
+    q11 = F(np.int32(word >> np.uint32(24)))
     low = q00 + ux * (q10 - q00)
     high = q01 + ux * (q11 - q01)
-    return (low + uy * (high - low)) * _F(1.0 / FIELD_UNITS) + _F(FIELD_FLOOR)
+    return (low + uy * (high - low)) * F(1.0 / FIELD_UNITS) + F(FIELD_FLOOR)
 
 
 @njit
@@ -161,13 +159,6 @@ def clearances(road, points):
     for k in range(points.shape[0]):
         found[k] = clearance(road, points[k, 0], points[k, 1])
     return found
-
-
-def freeze(array: np.ndarray) -> np.ndarray:
-    """A C-contiguous and read-only view of the array, the one form for which kernels are compiled."""
-    view = np.ascontiguousarray(array).view()
-    view.setflags(write=False)
-    return view
 
 
 def clearance_nodes(strips: Strips, width: float, height: float) -> np.ndarray:
@@ -191,9 +182,9 @@ def make_road(nodes: np.ndarray, speed_interval: tuple[float, float], thinnest: 
         field=pack_field(nodes),
         columns=np.uint32(columns),
         rows=np.uint32(rows),
-        width=_F(columns / CELLS_PER_M),
-        height=_F(rows / CELLS_PER_M),
-        speed_low=_F(speed_interval[0]),
-        speed_high=_F(speed_interval[1]),
-        thinnest=_F(thinnest),
+        width=F(columns / CELLS_PER_M),
+        height=F(rows / CELLS_PER_M),
+        speed_low=F(speed_interval[0]),
+        speed_high=F(speed_interval[1]),
+        thinnest=F(thinnest),
     )

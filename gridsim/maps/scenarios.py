@@ -21,9 +21,8 @@ from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import THICK_WALL, clearance_nodes, make_road
 
-TRAINING_SEED = 0  # first seed of the training maps
-VALIDATION_SEED = 1_000_000  # ... of the maps on which the champion is chosen
-HELD_OUT_SEED = 2_000_000  # ... of the maps on which it is reported, used for nothing else
+# First seeds of the maps for training, for the choice of the champion, and for the final report and nothing else.
+TRAINING_SEED, VALIDATION_SEED, HELD_OUT_SEED = 0, 1_000_000, 2_000_000
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ def is_map_file(name: str) -> bool:
 
 
 def check_name(name: str) -> None:
-    """Raises: GridSimError with one line if the name is neither in the registry nor a map file's."""
+    """Raises: GridSimError if the name is neither in the registry nor a map file's."""
     if name not in REGISTRY and not is_map_file(name):
         names = ", ".join(sorted(REGISTRY))
         raise GridSimError(f"unknown scenario {name!r}; there are: {names}, and maps from files (.yaml, .png)")
@@ -80,7 +79,7 @@ def seed_of_map(name: str, seed: int) -> int:
 def build(name: str, seed: int, config: SimConfig | None = None) -> Map:
     """Build a scenario's map from a seed; the same seed gives the same map.
 
-    Raises: GridSimError with one line for an unknown scenario, a negative seed, or an invalid map file.
+    Raises: GridSimError for an unknown scenario, a negative seed, or an invalid map file.
     """
     check_name(name)
     if seed < 0:

@@ -21,17 +21,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim.config import SimConfig, constants
-from gridsim.jit import leaf, njit
-from gridsim.maps.roads import freeze
-
-_F, _N = np.float32, np.uint64
+from gridsim.jit import F, U, freeze, leaf, njit
 
 CELLS = 80  # along each side
 CELL = 0.5  # m
 MAX_FRAMES = 8  # in an observation
 #: Codes of a cell, as grey levels of a picture; networks see them divided by 255.
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(127), np.uint8(255)
-HALF_DIAGONAL = _F(CELL * math.sqrt(0.5))  # m
+HALF_DIAGONAL = F(CELL * math.sqrt(0.5))  # m
 
 
 class GridTable(NamedTuple):
@@ -75,15 +72,15 @@ def fill_grid(table, ranges, grid):
         near, far = hit - HALF_DIAGONAL, hit + HALF_DIAGONAL
         if hit >= table.reach:
             near = far = table.reach
-        k, last = _N(table.first[ray]), _N(table.first[ray + 1])
+        k, last = U(table.first[ray]), U(table.first[ray + 1])
         while k < last and table.radii[k] < near:
-            grid[_N(table.cells[k])] = FREE
-            k += _N(1)
+            grid[U(table.cells[k])] = FREE
+            k += U(1)
         if hit >= table.reach:
             continue
         while k < last and table.radii[k] <= far:
-            grid[_N(table.cells[k])] = OCCUPIED
-            k += _N(1)
+            grid[U(table.cells[k])] = OCCUPIED
+            k += U(1)
 
 
 @njit(nogil=True)

@@ -14,39 +14,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gridsim import config
+from gridsim import state as s
 from gridsim.config import Constants, SimConfig, constants
-from gridsim.jit import leaf, njit
+from gridsim.jit import HALF, ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import is_junction, lane_length, torus_distance, wrapped, wrapped_any
 from gridsim.traffic.encounters import meets_ego, shifted_right, touches_ego, way_to_ego_collision
 from gridsim.traffic.junctions import may_enter
-from gridsim.traffic.world import (
-    ACCELERATION,
-    ALONG,
-    COS,
-    GAP,
-    HORIZON,
-    JUNCTION_BEHIND,
-    LANE,
-    LANE_TIMER,
-    LEAD_SPEED,
-    NEXT,
-    PERMIT,
-    SECOND_NEXT,
-    SHIFT,
-    SIN,
-    SPEED,
-    SPEED_FACTOR,
-    SWAY,
-    X,
-    Y,
-    choose_lane,
-    lane_after,
-    point_at,
-    set_pose,
-)
-
-_F, _I, _N = np.float32, np.int32, np.uint64
-_ZERO, _HALF, _ONE = _F(0.0), _F(0.5), _F(1.0)
+from gridsim.traffic.world import choose_lane, lane_after, point_at, set_pose
 
 
 class Drivers(NamedTuple):
@@ -83,29 +57,29 @@ def idm(drivers, speed, desired, gap, leader):
     Args: own speed and desired speed, m/s; gap to the leader's rear, m; the leader's speed, m/s. Without a leader, pass
     a gap of 1e9.
     """
-    ratio = speed / max(desired, _F(0.1))
+    ratio = speed / max(desired, F(0.1))
     free = ratio * ratio
     free *= free
     wanted = drivers.jam + max(
-        _ZERO,
+        ZERO,
         speed * drivers.headway
-        + speed * (speed - leader) / (_F(2.0) * math.sqrt(drivers.acceleration * drivers.comfort)),
+        + speed * (speed - leader) / (F(2.0) * math.sqrt(drivers.acceleration * drivers.comfort)),
     )
-    near = wanted / max(gap, _F(0.01))
-    return max(drivers.acceleration * (_ONE - free - near * near), -drivers.braking)
+    near = wanted / max(gap, F(0.01))
+    return max(drivers.acceleration * (ONE - free - near * near), -drivers.braking)
 
 
 @leaf
 def _ahead(network, car, other):
     """Distance (m) along the lanes from a car to another ahead on its lane or its next two lanes; else 1e9."""
-    lane, along = other[LANE], other[ALONG]
-    if lane == car[LANE] and along > car[ALONG]:
-        return along - car[ALONG]
-    if lane == car[NEXT]:
-        return lane_length(network, _I(car[LANE])) - car[ALONG] + along
-    if lane == car[SECOND_NEXT]:
-        return lane_length(network, _I(car[LANE])) - car[ALONG] + lane_length(network, _I(car[NEXT])) + along
-    return _F(1e9)
+    lane, along = other[s.LANE], other[s.ALONG]
+    if lane == car[s.LANE] and along > car[s.ALONG]:
+        return along - car[s.ALONG]
+    if lane == car[s.NEXT]:
+        return lane_length(network, I(car[s.LANE])) - car[s.ALONG] + along
+    if lane == car[s.SECOND_NEXT]:
+        return lane_length(network, I(car[s.LANE])) - car[s.ALONG] + lane_length(network, I(car[s.NEXT])) + along
+    return F(1e9)
 
 
 @leaf
@@ -114,15 +88,15 @@ def _swerve(drivers, speed, shift, sway, place, way):
 
     The path bends no harder than SWERVE_RADIUS and the lateral acceleration of traffic in bends allow.
     """
-    bend = min(_ONE / config.SWERVE_RADIUS, drivers.lateral / max(speed * speed, _ONE))
-    steepest = min(config.STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, _ONE))
+    bend = min(ONE / config.SWERVE_RADIUS, drivers.lateral / max(speed * speed, ONE))
+    steepest = min(config.STEEPEST_SWERVE, drivers.lane_change_speed / max(speed, ONE))
     left = place - shift
     # With this slope it would end up parallel to the lane, using half the bend.
     wanted = math.copysign(min(math.sqrt(bend * abs(left)), steepest), left)
     after = min(max(wanted, sway - bend * way), sway + bend * way)
-    moved = _HALF * (sway + after) * way
-    if abs(left - moved) < _F(0.01) or (moved * left > _ZERO and abs(moved) > abs(left)):
-        return place, _ZERO
+    moved = HALF * (sway + after) * way
+    if abs(left - moved) < F(0.01) or (moved * left > ZERO and abs(moved) > abs(left)):
+        return place, ZERO
     return shift + moved, after
 
 
@@ -133,81 +107,81 @@ def _in_the_way(network, drivers, car, x, y, cosine, sine, horizon, furthest):
     Tests points of the path from the car's front up to `horizon` m. The path swerves from the car's place to `furthest`
     m right of the lane, or as far as there is room; on a road with several lanes there is none: it returns to the lane.
     """
-    shift, sway = car[SHIFT], car[SWAY]
-    aside_by = furthest > _ZERO or shift != _ZERO
-    swerved = _ZERO  # way up to which shift and sway are known
+    shift, sway = car[s.SHIFT], car[s.SWAY]
+    aside_by = furthest > ZERO or shift != ZERO
+    swerved = ZERO  # distance (m) at which shift and sway were last updated
     half_length = drivers.half_length + drivers.half_width + config.CAUTION
     half_width = drivers.half_width + drivers.half_width + config.CAUTION
-    lane = _I(car[LANE])
+    lane = I(car[s.LANE])
     travelled = drivers.half_length
-    along = car[ALONG] + travelled
+    along = car[s.ALONG] + travelled
     beside = max(abs(shift), min(furthest, drivers.give_way))  # the path's distance from the lane, at most
     reach_x = abs(cosine) * half_length + abs(sine) * half_width + beside
     reach_y = abs(sine) * half_length + abs(cosine) * half_width + beside
     while lane >= 0 and travelled <= horizon:
         length = lane_length(network, lane)
-        box = network.boxes[_N(lane)]
+        box = network.boxes[U(lane)]
         beside_x = abs(wrapped_any(box[0] - x, network.width)) - box[2]
         beside_y = abs(wrapped_any(box[1] - y, network.height)) - box[3]
         if beside_x > reach_x or beside_y > reach_y:  # the lane's bounding box is out of reach
-            travelled += max(length - along, _ZERO)
+            travelled += max(length - along, ZERO)
             along = max(along, length)
         else:
-            first, step = _N(network.offsets[_N(lane)]), network.steps[_N(lane)]
+            first, step = U(network.offsets[U(lane)]), network.steps[U(lane)]
             while along <= length:
                 if travelled > horizon:
-                    return _F(1e9)
-                k = first + _N(_I(along / step))
+                    return F(1e9)
+                k = first + U(I(along / step))
                 px, py = network.points[k, 0], network.points[k, 1]
                 if aside_by:
                     place = -min(network.room[k], furthest)
-                    shift, sway = _swerve(drivers, car[SPEED], shift, sway, place, travelled - swerved)
+                    shift, sway = _swerve(drivers, car[s.SPEED], shift, sway, place, travelled - swerved)
                     swerved = travelled
-                    px, py = shifted_right(network, k, k + _N(1) if along + step <= length else k - _N(1), -shift)
+                    px, py = shifted_right(network, k, k + U(1) if along + step <= length else k - U(1), -shift)
                 dx, dy = wrapped_any(px - x, network.width), wrapped_any(py - y, network.height)
                 forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
                 free = max(abs(forward) - half_length, abs(aside) - half_width)
-                if free < _ZERO:
+                if free < ZERO:
                     return travelled
                 hop = max(free, drivers.half_width + config.CAUTION)  # the path is free for at least this far
                 along += hop
                 travelled += hop
         along -= length
         lane = lane_after(car, lane)
-    return _F(1e9)
+    return F(1e9)
 
 
 @leaf
 def update_gap(network, drivers, car, other, is_ego):
     """Update a car's GAP and LEAD_SPEED if another car within its horizon is the nearest obstacle so far."""
-    along = max((car[COS] * other[COS] + car[SIN] * other[SIN]) * other[SPEED], _ZERO)
-    at = _F(1e9)
-    dx, dy = wrapped(other[X] - car[X], network.width), wrapped(other[Y] - car[Y], network.height)
-    forward = dx * car[COS] + dy * car[SIN]
-    done = forward < _F(-3.0) * drivers.half_length  # a car behind is no obstacle
+    along = max((car[s.COS] * other[s.COS] + car[s.SIN] * other[s.SIN]) * other[s.SPEED], ZERO)
+    at = F(1e9)
+    dx, dy = wrapped(other[s.X] - car[s.X], network.width), wrapped(other[s.Y] - car[s.Y], network.height)
+    forward = dx * car[s.COS] + dy * car[s.SIN]
+    done = forward < F(-3.0) * drivers.half_length  # a car behind is no obstacle
     if not is_ego:
-        lane = _N(_I(other[LANE]))
+        lane = U(I(other[s.LANE]))
         at = _ahead(network, car, other) - drivers.half_length
         # Nor is a car in another lane, if neither changes lanes.
-        keep = other[SHIFT] == _ZERO and car[SHIFT] == _ZERO
-        done = done or at < _F(1e8) or (keep and max(network.left[lane], network.right[lane]) >= 0)
-    right = max(-car[SHIFT], _ZERO)
+        keep = other[s.SHIFT] == ZERO and car[s.SHIFT] == ZERO
+        done = done or at < F(1e8) or (keep and max(network.left[lane], network.right[lane]) >= 0)
+    right = max(-car[s.SHIFT], ZERO)
     if not done:
-        near = min(car[HORIZON], car[GAP])  # only obstacles nearer than the nearest so far matter
-        furthest = _F(1e9) if is_ego and meets_ego(network, drivers, car, other) else right
-        at = _in_the_way(network, drivers, car, other[X], other[Y], other[COS], other[SIN], near, furthest)
-    if at < car[GAP]:
-        car[GAP], car[LEAD_SPEED] = at, along
-    if is_ego and not done and other[SPEED] > _ONE:
-        if car[COS] * other[COS] + car[SIN] * other[SIN] <= _HALF:
+        near = min(car[s.HORIZON], car[s.GAP])  # only obstacles nearer than the nearest so far matter
+        furthest = F(1e9) if is_ego and meets_ego(network, drivers, car, other) else right
+        at = _in_the_way(network, drivers, car, other[s.X], other[s.Y], other[s.COS], other[s.SIN], near, furthest)
+    if at < car[s.GAP]:
+        car[s.GAP], car[s.LEAD_SPEED] = at, along
+    if is_ego and not done and other[s.SPEED] > ONE:
+        if car[s.COS] * other[s.COS] + car[s.SIN] * other[s.SIN] <= HALF:
             at = way_to_ego_collision(network, drivers, car, other)
-        elif forward > _ZERO:
+        elif forward > ZERO:
             # The ego car's position in a second, as it may be about to cut in.
-            x, y = other[X] + other[SPEED] * other[COS], other[Y] + other[SPEED] * other[SIN]
-            near = min(car[HORIZON], car[GAP])
-            at = _in_the_way(network, drivers, car, x, y, other[COS], other[SIN], near, right)
-        if at < car[GAP]:
-            car[GAP], car[LEAD_SPEED] = at, along
+            x, y = other[s.X] + other[s.SPEED] * other[s.COS], other[s.Y] + other[s.SPEED] * other[s.SIN]
+            near = min(car[s.HORIZON], car[s.GAP])
+            at = _in_the_way(network, drivers, car, x, y, other[s.COS], other[s.SIN], near, right)
+        if at < car[s.GAP]:
+            car[s.GAP], car[s.LEAD_SPEED] = at, along
 
 
 @leaf
@@ -215,26 +189,26 @@ def _find_gaps(network, drivers, world, ego):
     """Find the nearest obstacle within each car's horizon: its GAP and LEAD_SPEED."""
     cars = world.shape[0]
     for i in range(cars):
-        speed = world[i, SPEED]
-        way = speed * (config.LOOK_AHEAD_TIME + speed / (_F(2.0) * drivers.comfort))  # to notice something and to stop
-        world[i, HORIZON] = drivers.jam + config.LOOK_AHEAD + way
-        world[i, GAP], world[i, LEAD_SPEED] = _F(1e9), _ZERO
+        speed = world[i, s.SPEED]
+        way = speed * (config.LOOK_AHEAD_TIME + speed / (F(2.0) * drivers.comfort))  # to notice something and to stop
+        world[i, s.HORIZON] = drivers.jam + config.LOOK_AHEAD + way
+        world[i, s.GAP], world[i, s.LEAD_SPEED] = F(1e9), ZERO
     # The search goes beyond a car's horizon, since positions are of cars' middles and gaps end at their rears.
-    beyond = _F(2.0) * (drivers.half_length + config.CAUTION)
+    beyond = F(2.0) * (drivers.half_length + config.CAUTION)
     for i in range(cars):
-        if world[i, LANE] < _ZERO:
+        if world[i, s.LANE] < ZERO:
             continue
-        x, y, far = world[i, X], world[i, Y], world[i, HORIZON] + beyond
+        x, y, far = world[i, s.X], world[i, s.Y], world[i, s.HORIZON] + beyond
         for j in range(i):
-            if world[j, LANE] < _ZERO:
+            if world[j, s.LANE] < ZERO:
                 continue
-            dx, dy = torus_distance(world[j, X] - x, network.width), torus_distance(world[j, Y] - y, network.height)
-            squared, other_far = dx * dx + dy * dy, world[j, HORIZON] + beyond
+            dx, dy = torus_distance(world[j, s.X] - x, network.width), torus_distance(world[j, s.Y] - y, network.height)
+            squared, other_far = dx * dx + dy * dy, world[j, s.HORIZON] + beyond
             if squared < far * far:
                 update_gap(network, drivers, world[i], world[j], False)
             if squared < other_far * other_far:
                 update_gap(network, drivers, world[j], world[i], False)
-        dx, dy = torus_distance(ego[X] - x, network.width), torus_distance(ego[Y] - y, network.height)
+        dx, dy = torus_distance(ego[s.X] - x, network.width), torus_distance(ego[s.Y] - y, network.height)
         if dx * dx + dy * dy < far * far:
             update_gap(network, drivers, world[i], ego, True)
 
@@ -242,39 +216,39 @@ def _find_gaps(network, drivers, world, ego):
 @leaf
 def _desired(network, car):
     """A car's desired speed (m/s) at its place."""
-    return car[SPEED_FACTOR] * network.speeds[point_at(network, car)]
+    return car[s.SPEED_FACTOR] * network.speeds[point_at(network, car)]
 
 
 @leaf
 def change_lanes(network, drivers, world, i, ego):
     """When its timer has run out, move car i to a neighbouring lane if that is safe and a gain."""
     car = world[i]
-    if car[LANE_TIMER] > _ZERO:
-        car[LANE_TIMER] -= _ONE
+    if car[s.LANE_TIMER] > ZERO:
+        car[s.LANE_TIMER] -= ONE
         return
-    car[LANE_TIMER] = config.LANE_CHANGE_PERIOD - _ONE
-    lane = _I(car[LANE])
-    if car[SHIFT] == _ZERO and max(network.left[lane], network.right[lane]) >= 0:
+    car[s.LANE_TIMER] = config.LANE_CHANGE_PERIOD - ONE
+    lane = I(car[s.LANE])
+    if car[s.SHIFT] == ZERO and max(network.left[lane], network.right[lane]) >= 0:
         _choose_neighbour(network, drivers, world, i, ego)
 
 
 @leaf
 def _way_between(network, lane, along, other):
     """Distance (m) from a place on a lane to a car on it, or on the lane after or before it; else 1e9."""
-    there, place = _I(other[LANE]), other[ALONG]
+    there, place = I(other[s.LANE]), other[s.ALONG]
     if there == lane:
         return place - along
     if network.successors[lane, 0] == there:
         return lane_length(network, lane) - along + place
     if network.successors[there, 0] == lane:
         return place - along - lane_length(network, there)
-    return _F(1e9)
+    return F(1e9)
 
 
 @leaf
 def _lanes_apart(network, lane, along, target):
     """Distance (m) between a lane and its neighbour."""
-    k = _I(along / network.steps[lane])
+    k = I(along / network.steps[lane])
     one, other = network.offsets[lane] + k, network.offsets[target] + k
     dx = wrapped_any(network.points[other, 0] - network.points[one, 0], network.width)
     dy = wrapped_any(network.points[other, 1] - network.points[one, 1], network.height)
@@ -285,145 +259,147 @@ def _lanes_apart(network, lane, along, target):
 def _choose_neighbour(network, drivers, world, i, ego):
     """MOBIL (Kesting et al. 2007, equations 1 and 2). Not inlined: calls are expensive but rare."""
     car = world[i]
-    lane = _I(car[LANE])
-    own_length = _F(2.0) * drivers.half_length
+    lane = I(car[s.LANE])
+    own_length = F(2.0) * drivers.half_length
     desired = _desired(network, car)
-    best, gain = _I(-1), drivers.threshold
+    best, gain = I(-1), drivers.threshold
     for side in range(2):
         target = network.left[lane] if side == 0 else network.right[lane]
         if target < 0:
             continue
-        along = car[ALONG] / network.steps[lane] * network.steps[target]
-        apart = _lanes_apart(network, lane, car[ALONG], target)
+        along = car[s.ALONG] / network.steps[lane] * network.steps[target]
+        apart = _lanes_apart(network, lane, car[s.ALONG], target)
         # The gaps to the next cars ahead and behind in the target lane, and to the one behind in its own.
-        front, front_speed, rear, rear_speed, rear_desired = _F(1e9), _ZERO, _F(1e9), _ZERO, _ONE
-        left_behind, left_speed, left_desired = _F(1e9), _ZERO, _ONE
+        front, front_speed, rear, rear_speed, rear_desired = F(1e9), ZERO, F(1e9), ZERO, ONE
+        left_behind, left_speed, left_desired = F(1e9), ZERO, ONE
         free = True
         for j in range(world.shape[0] + 1):
             if j == i:
                 continue
             other = world[j] if j < world.shape[0] else ego
-            if j < world.shape[0] and other[LANE] < _ZERO:
+            if j < world.shape[0] and other[s.LANE] < ZERO:
                 continue
-            dx, dy = other[X] - car[X], other[Y] - car[Y]
+            dx, dy = other[s.X] - car[s.X], other[s.Y] - car[s.Y]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             if dx * dx + dy * dy > config.LANE_CHANGE_SIGHT * config.LANE_CHANGE_SIGHT:
                 continue
             if j < world.shape[0]:
                 ahead = _way_between(network, target, along, other)
-                behind = -_way_between(network, lane, car[ALONG], other)
-                changes = ahead > _F(1e8) and behind < _F(-1e8) and other[SHIFT] != _ZERO
+                behind = -_way_between(network, lane, car[s.ALONG], other)
+                changes = ahead > F(1e8) and behind < F(-1e8) and other[s.SHIFT] != ZERO
                 if changes and dx * dx + dy * dy < config.LANE_CHANGE_ALONE * config.LANE_CHANGE_ALONE:
                     free = False  # another car is changing lanes, to or from the target lane
                 wish = _desired(network, other)
             else:
-                forward = dx * car[COS] + dy * car[SIN]  # the ego car is on no lane
-                aside = dy * car[COS] - dx * car[SIN]
-                reach = _HALF * apart + drivers.half_width + config.NEIGHBOUR_WIDENING * forward * forward
+                forward = dx * car[s.COS] + dy * car[s.SIN]  # the ego car is on no lane
+                aside = dy * car[s.COS] - dx * car[s.SIN]
+                reach = HALF * apart + drivers.half_width + config.NEIGHBOUR_WIDENING * forward * forward
                 sideways = apart if side == 0 else -apart
-                ahead = forward if abs(aside - sideways) <= reach else _F(1e9)
-                behind = -forward if abs(aside) <= reach else _F(-1e9)
-                wish = other[SPEED]
+                ahead = forward if abs(aside - sideways) <= reach else F(1e9)
+                behind = -forward if abs(aside) <= reach else F(-1e9)
+                wish = other[s.SPEED]
             if abs(ahead) < own_length + drivers.jam:
                 free = False
-            if _ZERO <= ahead < front:
-                front, front_speed = ahead, other[SPEED]
-            if ahead < _ZERO and -ahead < rear:
-                rear, rear_speed, rear_desired = -ahead, other[SPEED], wish
-            if _ZERO < behind < left_behind:
-                left_behind, left_speed, left_desired = behind, other[SPEED], wish
+            if ZERO <= ahead < front:
+                front, front_speed = ahead, other[s.SPEED]
+            if ahead < ZERO and -ahead < rear:
+                rear, rear_speed, rear_desired = -ahead, other[s.SPEED], wish
+            if ZERO < behind < left_behind:
+                left_behind, left_speed, left_desired = behind, other[s.SPEED], wish
         if not free:
             continue
-        there = idm(drivers, car[SPEED], desired, front - own_length, front_speed)
-        others = _ZERO  # m/s2 that the followers gain
-        new_follower = _ZERO
-        if rear < _F(1e8):
-            new_follower = idm(drivers, rear_speed, rear_desired, rear - own_length, car[SPEED])
+        there = idm(drivers, car[s.SPEED], desired, front - own_length, front_speed)
+        others = ZERO  # m/s2 that the followers gain
+        new_follower = ZERO
+        if rear < F(1e8):
+            new_follower = idm(drivers, rear_speed, rear_desired, rear - own_length, car[s.SPEED])
             others += new_follower - idm(drivers, rear_speed, rear_desired, rear + front - own_length, front_speed)
-        if left_behind < _F(1e8):
-            gap = left_behind - drivers.half_length + car[GAP]
-            others += idm(drivers, left_speed, left_desired, gap, car[LEAD_SPEED])
-            others -= idm(drivers, left_speed, left_desired, left_behind - own_length, car[SPEED])
+        if left_behind < F(1e8):
+            gap = left_behind - drivers.half_length + car[s.GAP]
+            others += idm(drivers, left_speed, left_desired, gap, car[s.LEAD_SPEED])
+            others -= idm(drivers, left_speed, left_desired, left_behind - own_length, car[s.SPEED])
         if new_follower < -drivers.safe_braking or there < -drivers.safe_braking:
             continue
-        advantage = there - car[ACCELERATION] + drivers.politeness * others
+        advantage = there - car[s.ACCELERATION] + drivers.politeness * others
         if advantage > gain:
-            best, gain = _I(target), advantage
+            best, gain = I(target), advantage
     if best >= 0:
-        along, onward, beyond = car[ALONG], car[NEXT], car[SECOND_NEXT]
-        nearest, lead_speed = car[GAP], car[LEAD_SPEED]
+        along, onward, beyond = car[s.ALONG], car[s.NEXT], car[s.SECOND_NEXT]
+        nearest, lead_speed = car[s.GAP], car[s.LEAD_SPEED]
         apart = _lanes_apart(network, lane, along, best)
-        car[SHIFT] = -apart if best == network.left[lane] else apart
-        car[ALONG] = along / network.steps[lane] * network.steps[best]
-        car[LANE] = _F(best)
-        car[NEXT] = _F(choose_lane(network, best, car))
-        car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
+        car[s.SHIFT] = -apart if best == network.left[lane] else apart
+        car[s.ALONG] = along / network.steps[lane] * network.steps[best]
+        car[s.LANE] = F(best)
+        car[s.NEXT] = F(choose_lane(network, best, car))
+        car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
         # While it moves over, it must not touch the car ahead in its old lane.
-        car[GAP], car[LEAD_SPEED] = _F(1e9), _ZERO
+        car[s.GAP], car[s.LEAD_SPEED] = F(1e9), ZERO
         for j in range(world.shape[0]):
-            if j != i and world[j, LANE] >= _ZERO:
+            if j != i and world[j, s.LANE] >= ZERO:
                 update_gap(network, drivers, car, world[j], False)
         update_gap(network, drivers, car, ego, True)
-        if idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED]) < -drivers.safe_braking:
-            car[LANE], car[ALONG], car[NEXT], car[SECOND_NEXT], car[SHIFT] = _F(lane), along, onward, beyond, _ZERO
-            car[GAP], car[LEAD_SPEED] = nearest, lead_speed
+        gap = car[s.GAP] - drivers.half_length
+        if idm(drivers, car[s.SPEED], desired, gap, car[s.LEAD_SPEED]) < -drivers.safe_braking:
+            car[s.LANE], car[s.ALONG], car[s.SHIFT] = F(lane), along, ZERO
+            car[s.NEXT], car[s.SECOND_NEXT] = onward, beyond
+            car[s.GAP], car[s.LEAD_SPEED] = nearest, lead_speed
 
 
 @leaf
 def _move(network, drivers, car, ego):
     """Move one car for a control period along its lane, and sideways: to the right for the ego car, or back."""
-    before, after = car[SPEED], max(car[SPEED] + car[ACCELERATION] * drivers.dt, _ZERO)
-    car[ALONG] += _HALF * (before + after) * drivers.dt
-    car[SPEED] = after
-    place = -network.room[point_at(network, car)] if meets_ego(network, drivers, car, ego) else _ZERO
-    shift = car[SHIFT]
-    if shift != place or car[SWAY] != _ZERO:
-        way = _HALF * (before + after) * drivers.dt
-        car[SHIFT], car[SWAY] = _swerve(drivers, after, shift, car[SWAY], place, way)
-    length = lane_length(network, _I(car[LANE]))
-    if car[ALONG] >= length:
-        lane = _I(car[LANE])
-        car[ALONG] -= length
-        car[JUNCTION_BEHIND] = car[LANE] if is_junction(network, lane) else -_ONE
-        car[LANE], car[NEXT] = car[NEXT], car[SECOND_NEXT]
-        car[PERMIT] = -_ONE
-        car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
-    elif car[JUNCTION_BEHIND] >= _ZERO and car[ALONG] > drivers.half_length + _ONE:
-        car[JUNCTION_BEHIND] = -_ONE
+    before, after = car[s.SPEED], max(car[s.SPEED] + car[s.ACCELERATION] * drivers.dt, ZERO)
+    car[s.ALONG] += HALF * (before + after) * drivers.dt
+    car[s.SPEED] = after
+    place = -network.room[point_at(network, car)] if meets_ego(network, drivers, car, ego) else ZERO
+    shift = car[s.SHIFT]
+    if shift != place or car[s.SWAY] != ZERO:
+        way = HALF * (before + after) * drivers.dt
+        car[s.SHIFT], car[s.SWAY] = _swerve(drivers, after, shift, car[s.SWAY], place, way)
+    length = lane_length(network, I(car[s.LANE]))
+    if car[s.ALONG] >= length:
+        lane = I(car[s.LANE])
+        car[s.ALONG] -= length
+        car[s.JUNCTION_BEHIND] = car[s.LANE] if is_junction(network, lane) else -ONE
+        car[s.LANE], car[s.NEXT] = car[s.NEXT], car[s.SECOND_NEXT]
+        car[s.PERMIT] = -ONE
+        car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
+    elif car[s.JUNCTION_BEHIND] >= ZERO and car[s.ALONG] > drivers.half_length + ONE:
+        car[s.JUNCTION_BEHIND] = -ONE
     set_pose(network, car)
-    if car[SHIFT] != shift and touches_ego(network, drivers, car, ego):
-        car[SHIFT], car[SWAY] = shift, _ZERO  # beside the ego car it stays where it is
+    if car[s.SHIFT] != shift and touches_ego(network, drivers, car, ego):
+        car[s.SHIFT], car[s.SWAY] = shift, ZERO  # beside the ego car it stays where it is
         set_pose(network, car)
 
 
 @leaf
-def flow(network, drivers, world, ego):
+def step_traffic(network, drivers, world, ego):
     """One control period of a world's traffic. The ego car must not have moved yet.
 
-    Args: world [cars, FIELDS], changed; ego, a car's state of which X to STEERING are read.
+    Args: world [cars, TRAFFIC_FIELDS], changed; ego, a car's state of which X to STEERING are read.
     """
     cars = world.shape[0]
     _find_gaps(network, drivers, world, ego)
     for i in range(cars):
         car = world[i]
-        if car[LANE] < _ZERO:
+        if car[s.LANE] < ZERO:
             continue
-        lane, onward = _I(car[LANE]), _I(car[NEXT])
+        lane, onward = I(car[s.LANE]), I(car[s.NEXT])
         desired = _desired(network, car)
-        pace = idm(drivers, car[SPEED], desired, car[GAP] - drivers.half_length, car[LEAD_SPEED])
-        if is_junction(network, onward) and car[PERMIT] != car[NEXT]:
+        pace = idm(drivers, car[s.SPEED], desired, car[s.GAP] - drivers.half_length, car[s.LEAD_SPEED])
+        if is_junction(network, onward) and car[s.PERMIT] != car[s.NEXT]:
             # Without a permit, stop at the line of the junction ahead.
-            line = lane_length(network, lane) - car[ALONG] - drivers.half_length
-            if line < car[HORIZON]:
+            line = lane_length(network, lane) - car[s.ALONG] - drivers.half_length
+            if line < car[s.HORIZON]:
                 if may_enter(network, drivers, world, i, ego):
-                    car[PERMIT] = car[NEXT]
+                    car[s.PERMIT] = car[s.NEXT]
                 else:
                     gap = line + drivers.jam - config.STOP_LINE_GAP
-                    pace = min(pace, idm(drivers, car[SPEED], desired, gap, _ZERO))
-        car[ACCELERATION] = pace
+                    pace = min(pace, idm(drivers, car[s.SPEED], desired, gap, ZERO))
+        car[s.ACCELERATION] = pace
     for i in range(cars):
-        if world[i, LANE] >= _ZERO:
+        if world[i, s.LANE] >= ZERO:
             change_lanes(network, drivers, world, i, ego)
     for i in range(cars):
-        if world[i, LANE] >= _ZERO:
+        if world[i, s.LANE] >= ZERO:
             _move(network, drivers, world[i], ego)

@@ -4,35 +4,33 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from gridsim.car.ego import STEERING
+from gridsim import state as s
+from gridsim.car.collision import boxes_touch
 from gridsim.car.vehicle import advance, path_curvature
 from gridsim.config import EMERGENCY_BRAKING, FORESIGHT, FORESIGHT_STEP, MEETING_DISTANCE, SAME_WAY_COSINE
-from gridsim.jit import leaf, njit
+from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import lane_length, wrapped, wrapped_any
-from gridsim.sensing.boxes import boxes_touch
-from gridsim.traffic.world import ALONG, COS, LANE, SHIFT, SIN, SPEED, X, Y, lane_after
-
-_F, _I, _N = np.float32, np.int32, np.uint64
-_ZERO, _ONE = _F(0.0), _F(1.0)
+from gridsim.traffic.world import lane_after
 
 
 @leaf
 def meets_ego(network, drivers, car, ego):
-    """Whether the ego car is near, a length behind at most, and oncoming or crossing, or was when the car shifted."""
-    if car[COS] * ego[COS] + car[SIN] * ego[SIN] > SAME_WAY_COSINE and car[SHIFT] >= _ZERO:
+    """Whether to keep right for the ego car: it is near, a length behind at most, and oncoming or crossing.
+
+    A car that has already moved to the right stays there until the ego car has passed.
+    """
+    if car[s.COS] * ego[s.COS] + car[s.SIN] * ego[s.SIN] > SAME_WAY_COSINE and car[s.SHIFT] >= ZERO:
         return False  # they go the same way
-    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
-    behind = _F(-2.0) * drivers.half_length
-    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[COS] + dy * car[SIN] > behind
+    dx, dy = wrapped(ego[s.X] - car[s.X], network.width), wrapped(ego[s.Y] - car[s.Y], network.height)
+    behind = F(-2.0) * drivers.half_length
+    return dx * dx + dy * dy < MEETING_DISTANCE * MEETING_DISTANCE and dx * car[s.COS] + dy * car[s.SIN] > behind
 
 
 @leaf
 def touches_ego(network, drivers, car, ego):
     """Whether a car touches the ego car."""
-    dx, dy = wrapped(ego[X] - car[X], network.width), wrapped(ego[Y] - car[Y], network.height)
-    return boxes_touch(drivers, dx, dy, car[COS], car[SIN], ego[COS], ego[SIN])
+    dx, dy = wrapped(ego[s.X] - car[s.X], network.width), wrapped(ego[s.Y] - car[s.Y], network.height)
+    return boxes_touch(drivers, dx, dy, car[s.COS], car[s.SIN], ego[s.COS], ego[s.SIN])
 
 
 @leaf
@@ -41,7 +39,7 @@ def shifted_right(network, k, other, right):
     one, two = max(k, other), min(k, other)
     x, y = network.points[k, 0], network.points[k, 1]
     ux, uy = network.points[one, 0] - network.points[two, 0], network.points[one, 1] - network.points[two, 1]
-    by = right / max(math.sqrt(ux * ux + uy * uy), _F(1e-6))
+    by = right / max(math.sqrt(ux * ux + uy * uy), F(1e-6))
     return x + by * uy, y - by * ux
 
 
@@ -54,40 +52,40 @@ def way_to_ego_collision(network, drivers, car, ego):
     longer stop in time.
     Not inlined: calls, with all the network's arguments, are expensive but rare.
     """
-    lane = _I(car[LANE])
-    length, begin = lane_length(network, lane), -car[ALONG]  # length of the lane, distance to its beginning (m)
-    contact = _F(2.0) * math.sqrt(drivers.half_length * drivers.half_length + drivers.half_width * drivers.half_width)
-    x, y, cosine, sine, speed = ego[X], ego[Y], ego[COS], ego[SIN], ego[SPEED]
-    curvature = path_curvature(drivers.ego, speed, ego[STEERING])
-    dx, dy = wrapped(x - car[X], network.width), wrapped(y - car[Y], network.height)
-    t = _ZERO
+    lane = I(car[s.LANE])
+    length, begin = lane_length(network, lane), -car[s.ALONG]  # length of the lane, distance to its beginning (m)
+    contact = F(2.0) * math.sqrt(drivers.half_length * drivers.half_length + drivers.half_width * drivers.half_width)
+    x, y, cosine, sine, speed = ego[s.X], ego[s.Y], ego[s.COS], ego[s.SIN], ego[s.SPEED]
+    curvature = path_curvature(drivers.ego, speed, ego[s.STEERING])
+    dx, dy = wrapped(x - car[s.X], network.width), wrapped(y - car[s.Y], network.height)
+    t = ZERO
     while True:
         # The earliest time at which they can touch.
-        hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[SPEED] + abs(speed)), FORESIGHT_STEP)
+        hop = max((math.sqrt(dx * dx + dy * dy) - contact) / (car[s.SPEED] + abs(speed)), FORESIGHT_STEP)
         t += hop
         if t > FORESIGHT:
-            return _F(1e9)
-        way = car[SPEED] * t
+            return F(1e9)
+        way = car[s.SPEED] * t
         while way - begin >= length:
             begin += length
             lane = lane_after(car, lane)
             if lane < 0:
-                return _F(1e9)
+                return F(1e9)
             length = lane_length(network, lane)
-        k = _N(network.offsets[_N(lane)]) + _N(_I((way - begin) / network.steps[_N(lane)]))
-        k = min(k, _N(network.offsets[_N(lane) + _N(1)]) - _N(2))
-        right = min(network.room[k], drivers.lane_change_speed * t - car[SHIFT])
-        px, py = shifted_right(network, k, k + _N(1), right)
-        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, _ZERO, curvature, hop)
+        k = U(network.offsets[U(lane)]) + U(I((way - begin) / network.steps[U(lane)]))
+        k = min(k, U(network.offsets[U(lane) + U(1)]) - U(2))
+        right = min(network.room[k], drivers.lane_change_speed * t - car[s.SHIFT])
+        px, py = shifted_right(network, k, k + U(1), right)
+        x, y, cosine, sine, speed, _ = advance(drivers.ego, x, y, cosine, sine, speed, ZERO, curvature, hop)
         dx, dy = wrapped_any(x - px, network.width), wrapped_any(y - py, network.height)
         if dx * dx + dy * dy > contact * contact:
             continue
-        ux, uy = network.points[k + _N(1), 0], network.points[k + _N(1), 1]
+        ux, uy = network.points[k + U(1), 0], network.points[k + U(1), 1]
         ux, uy = ux - network.points[k, 0], uy - network.points[k, 1]
-        norm = _ONE / math.sqrt(max(ux * ux + uy * uy, _F(1e-12)))
+        norm = ONE / math.sqrt(max(ux * ux + uy * uy, F(1e-12)))
         ux, uy = ux * norm, uy * norm
         if boxes_touch(drivers, dx, dy, ux, uy, cosine, sine):
             ahead = dx * ux + dy * uy
             at = way + ahead - drivers.half_width
-            stops = at - drivers.half_length > car[SPEED] * car[SPEED] / (_F(2.0) * EMERGENCY_BRAKING)
-            return max(at, _ZERO) if ahead >= _ZERO or stops else _F(1e9)
+            stops = at - drivers.half_length > car[s.SPEED] * car[s.SPEED] / (F(2.0) * EMERGENCY_BRAKING)
+            return max(at, ZERO) if ahead >= ZERO or stops else F(1e9)

@@ -7,36 +7,18 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from gridsim import config
-from gridsim.jit import leaf
+from gridsim import state as s
+from gridsim.jit import HALF, ZERO, F, I, leaf
 from gridsim.maps.network import is_junction, lane_length, wrapped, wrapped_any
-from gridsim.traffic.world import (
-    ALONG,
-    COS,
-    HORIZON,
-    JUNCTION_BEHIND,
-    LANE,
-    NEXT,
-    PERMIT,
-    SECOND_NEXT,
-    SIN,
-    SPEED,
-    X,
-    Y,
-)
-
-_F, _I = np.float32, np.int32
-_ZERO, _HALF = _F(0.0), _F(0.5)
 
 
 @leaf
 def _blocked_by_waiting_car(network, drivers, lane, other):
     """Whether the rear of a car that waits at the end of `other` blocks a lane with the same beginning."""
     step = network.steps[other]
-    q = network.offsets[other + 1] - 1 - _I((_F(2.0) * drivers.half_length + drivers.jam) / step)
-    reach = _F(2.0) * drivers.half_width + _F(2.0) * config.CAUTION
+    q = network.offsets[other + 1] - 1 - I((F(2.0) * drivers.half_length + drivers.jam) / step)
+    reach = F(2.0) * drivers.half_width + F(2.0) * config.CAUTION
     for p in range(network.offsets[lane], network.offsets[lane + 1]):
         dx = wrapped_any(network.points[p, 0] - network.points[q, 0], network.width)
         dy = wrapped_any(network.points[p, 1] - network.points[q, 1], network.height)
@@ -54,22 +36,22 @@ def _way_to_point(network, lane, x, y, within):
         dy = wrapped_any(network.points[k, 1] - y, network.height)
         apart = math.sqrt(dx * dx + dy * dy)
         if apart < within:
-            return _F(k - first) * network.steps[lane]
-        k += max(_I((apart - within) / network.steps[lane]), _I(1))
-    return _F(1e9)
+            return F(k - first) * network.steps[lane]
+        k += max(I((apart - within) / network.steps[lane]), I(1))
+    return F(1e9)
 
 
 @leaf
 def _in_ego_path(network, lane, ego, way):
     """Whether a lane passes through the sector `way` m ahead of the ego car, or close to the ego car."""
     for p in range(network.offsets[lane], network.offsets[lane + 1], 2):
-        dx = wrapped_any(network.points[p, 0] - ego[X], network.width)
-        dy = wrapped_any(network.points[p, 1] - ego[Y], network.height)
+        dx = wrapped_any(network.points[p, 0] - ego[s.X], network.width)
+        dy = wrapped_any(network.points[p, 1] - ego[s.Y], network.height)
         squared = dx * dx + dy * dy
         if squared < way * way:
-            forward = dx * ego[COS] + dy * ego[SIN]
+            forward = dx * ego[s.COS] + dy * ego[s.SIN]
             if squared < config.EGO_CLEARANCE * config.EGO_CLEARANCE or (
-                forward > _ZERO and forward * forward > config.EGO_SECTOR_COSINE * config.EGO_SECTOR_COSINE * squared
+                forward > ZERO and forward * forward > config.EGO_SECTOR_COSINE * config.EGO_SECTOR_COSINE * squared
             ):
                 return True
     return False
@@ -79,34 +61,33 @@ def _in_ego_path(network, lane, ego, way):
 def may_enter(network, drivers, world, i, ego):
     """Whether car i may enter its next lane, in a junction: no car conflicts, and there is room beyond."""
     car = world[i]
-    here, lane, beyond = _I(car[LANE]), _I(car[NEXT]), _I(car[SECOND_NEXT])
+    here, lane, beyond = I(car[s.LANE]), I(car[s.NEXT]), I(car[s.SECOND_NEXT])
     first, last = network.crossing_offsets[lane], network.crossing_offsets[lane + 1]
-    # A car that enters must be able to leave, or junctions would block each other. If another junction follows at once,
-    # there is room for one car, else for as many as the lane beyond holds.
+    # Enter only if the exit has room, for one car if it is itself a junction, or junctions would block each other.
     chained = is_junction(network, beyond)
-    place = _F(2.0) * drivers.half_length + drivers.jam
+    place = F(2.0) * drivers.half_length + drivers.jam
     room, needed = max(lane_length(network, beyond), place), place
     for j in range(world.shape[0]):
-        if j == i or world[j, LANE] < _ZERO:
+        if j == i or world[j, s.LANE] < ZERO:
             continue
-        there, past, permit = _I(world[j, LANE]), _I(world[j, JUNCTION_BEHIND]), _I(world[j, PERMIT])
-        onward = _I(world[j, NEXT])
+        there, past, permit = I(world[j, s.LANE]), I(world[j, s.JUNCTION_BEHIND]), I(world[j, s.PERMIT])
+        onward = I(world[j, s.NEXT])
         # Most cars are not near a junction and need no check.
         for c in range(first, last if permit >= 0 or past >= 0 or is_junction(network, there) else first):
             other = network.crossings[c]
             if permit == other:
                 return False
-            if there == other and world[j, ALONG] - drivers.half_length < network.clear[c] + config.JUNCTION_MARGIN:
+            if there == other and world[j, s.ALONG] - drivers.half_length < network.clear[c] + config.JUNCTION_MARGIN:
                 return False
-            if past == other and lane_length(network, other) + world[j, ALONG] - drivers.half_length < (
+            if past == other and lane_length(network, other) + world[j, s.ALONG] - drivers.half_length < (
                 network.clear[c] + config.JUNCTION_MARGIN
             ):
                 return False
-        waits = _I(-1)  # lane of this junction at whose end the other car may have to wait
-        if there == here and world[j, ALONG] > car[ALONG]:
+        waits = I(-1)  # lane of this junction at whose end the other car may have to wait
+        if there == here and world[j, s.ALONG] > car[s.ALONG]:
             if permit != onward:
-                return False  # the car in front waits for others, which would then wait for this one
-            if is_junction(network, _I(world[j, SECOND_NEXT])):
+                return False  # the leader has no permit yet; granting one here could deadlock
+            if is_junction(network, I(world[j, s.SECOND_NEXT])):
                 waits = permit
         elif permit != onward and is_junction(network, there) and is_junction(network, onward):
             for k in range(network.successors.shape[1]):
@@ -118,28 +99,28 @@ def may_enter(network, drivers, world, i, ego):
             if there == lane or permit == lane:
                 return False
             for k in range(network.successors.shape[1]):
-                slow = there == network.successors[lane, k] and world[j, SPEED] < config.WALKING_PACE
-                if slow and world[j, ALONG] < place + drivers.half_length:
+                slow = there == network.successors[lane, k] and world[j, s.SPEED] < config.WALKING_PACE
+                if slow and world[j, s.ALONG] < place + drivers.half_length:
                     return False
         elif there == beyond:
-            rear = world[j, ALONG] - drivers.half_length
-            room = min(room, rear + world[j, SPEED] * world[j, SPEED] / (_F(2.0) * drivers.comfort))
-        elif (permit >= 0 and _I(world[j, SECOND_NEXT]) == beyond) or (
+            rear = world[j, s.ALONG] - drivers.half_length
+            room = min(room, rear + world[j, s.SPEED] * world[j, s.SPEED] / (F(2.0) * drivers.comfort))
+        elif (permit >= 0 and I(world[j, s.SECOND_NEXT]) == beyond) or (
             onward == beyond and is_junction(network, there)
         ):
             needed += place
     # The ego car goes first, unless it is behind this car. Its turn is unknown, so all the ground ahead of it is kept
     # free. A car that is already in a junction, as in a roundabout, drives on.
-    dx, dy = ego[X] - car[X], ego[Y] - car[Y]
+    dx, dy = ego[s.X] - car[s.X], ego[s.Y] - car[s.Y]
     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
-    forward, aside = dx * car[COS] + dy * car[SIN], dy * car[COS] - dx * car[SIN]
-    same_way = ego[COS] * car[COS] + ego[SIN] * car[SIN] > _HALF
-    way = config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[SPEED], _ZERO)
-    far = car[HORIZON] + lane_length(network, lane) + way + _F(2.0) * place
-    if dx * dx + dy * dy < far * far and not (forward < _ZERO and (same_way or abs(aside) < config.EGO_BEHIND)):
+    forward, aside = dx * car[s.COS] + dy * car[s.SIN], dy * car[s.COS] - dx * car[s.SIN]
+    same_way = ego[s.COS] * car[s.COS] + ego[s.SIN] * car[s.SIN] > HALF
+    way = config.EGO_CLEARANCE + config.CROSSING_TIME * max(ego[s.SPEED], ZERO)
+    far = car[s.HORIZON] + lane_length(network, lane) + way + F(2.0) * place
+    if dx * dx + dy * dy < far * far and not (forward < ZERO and (same_way or abs(aside) < config.EGO_BEHIND)):
         if not is_junction(network, here) and _in_ego_path(network, lane, ego, way):
             return False
         within = drivers.half_width + config.EGO_INSIDE
-        rear = _way_to_point(network, beyond, ego[X], ego[Y], within) - drivers.half_length
-        room = min(room, rear + ego[SPEED] * ego[SPEED] / (_F(2.0) * drivers.comfort))
+        rear = _way_to_point(network, beyond, ego[s.X], ego[s.Y], within) - drivers.half_length
+        room = min(room, rear + ego[s.SPEED] * ego[s.SPEED] / (F(2.0) * drivers.comfort))
     return room >= needed

@@ -1,7 +1,8 @@
 """Worlds: the state of the other cars around one ego car, and where they are spawned.
 
-A world is float32 [cars, FIELDS], with the fields below. Its evolution depends only on that array and on the ego car. A
-car's centre of mass lies on its lane, shifted sideways while it changes lanes or meets the ego car.
+A world is float32 [cars, TRAFFIC_FIELDS] with the columns of `gridsim.state`. Its evolution depends only on that array
+and on the ego car. A car's centre of mass lies on its lane, shifted sideways while it changes lanes or meets the ego
+car.
 """
 
 from __future__ import annotations
@@ -10,46 +11,23 @@ import math
 
 import numpy as np
 
+from gridsim import state as s
 from gridsim.config import DRIVER_SPREAD, LANE_CHANGE_PERIOD, SLOWEST_DRIVER, SPAWN_SPEED, STOP_LINE_GAP, SimConfig
 from gridsim.counter import GOLDEN, mix, uniform, uniform64
-from gridsim.jit import leaf, njit
+from gridsim.jit import ONE, ZERO, F, I, U, leaf, njit
 from gridsim.maps.network import Network, wrapped
-
-_F, _I, _U = np.float32, np.int32, np.uint64
-_ZERO, _ONE = _F(0.0), _F(1.0)
-
-# Fields of a traffic car's state; X to SPEED have the same indices as the ego car's.
-X, Y = 0, 1  # m, centre of mass
-COS, SIN = 2, 3  # heading
-SPEED = 4  # m/s
-LANE = 5  # index of its lane; -1 for an absent car, which is ignored
-ALONG = 6  # m along it
-NEXT, SECOND_NEXT = 7, 8  # its next two lanes
-JUNCTION_BEHIND = 9  # junction lane on which its rear may still be, or -1
-PERMIT = 10  # junction lane that it may enter next, or -1
-SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
-SPEED_FACTOR = 12  # its desired speed, relative to the lane's
-SEED = 13  # of its random turns, below 2 ** 24
-DRAWS = 14  # random numbers drawn so far, one a lane
-ACCELERATION = 15  # m/s2, its acceleration in this step
-HORIZON = 16  # m ahead that it looks in this step
-GAP = 17  # m from its middle to the nearest obstacle
-LEAD_SPEED = 18  # m/s, of that obstacle along its heading
-LANE_TIMER = 19  # control steps until its next decision on a change of lanes
-SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
-FIELDS = 21
 
 
 @leaf
 def set_pose(network, car):
     """Set a car's pose from LANE, ALONG, SHIFT and SWAY."""
-    one, two = _U(1), _U(2)
-    lane = _U(_I(car[LANE]))
-    first = _U(network.offsets[lane])
-    last = _U(network.offsets[lane + one]) - first - two
-    at = car[ALONG] / network.steps[lane]
-    k = min(_U(max(_I(at), _I(0))), last)
-    part = at - _F(_I(k))
+    one, two = U(1), U(2)
+    lane = U(I(car[s.LANE]))
+    first = U(network.offsets[lane])
+    last = U(network.offsets[lane + one]) - first - two
+    at = car[s.ALONG] / network.steps[lane]
+    k = min(U(max(I(at), I(0))), last)
+    part = at - F(I(k))
     x0, y0 = network.points[first + k, 0], network.points[first + k, 1]
     dx, dy = network.points[first + k + one, 0] - x0, network.points[first + k + one, 1] - y0
     # The heading is interpolated between the pieces before and after, so that the car does not jerk at each point.
@@ -57,40 +35,40 @@ def set_pose(network, car):
     ax, ay = x0 + dx - network.points[first + before, 0], y0 + dy - network.points[first + before, 1]
     bx, by = network.points[first + after, 0] - x0, network.points[first + after, 1] - y0
     tx, ty = ax + part * (bx - ax), ay + part * (by - ay)
-    norm = _ONE / math.sqrt(max(tx * tx + ty * ty, _F(1e-12)))
+    norm = ONE / math.sqrt(max(tx * tx + ty * ty, F(1e-12)))
     tx, ty = tx * norm, ty * norm
-    x, y = x0 + part * dx - car[SHIFT] * ty, y0 + part * dy + car[SHIFT] * tx
+    x, y = x0 + part * dx - car[s.SHIFT] * ty, y0 + part * dy + car[s.SHIFT] * tx
     # NumPy's floor, because that of `math` returns int64, whose product with float32 is float64.
-    car[X] = x - np.floor(x / network.width) * network.width
-    car[Y] = y - np.floor(y / network.height) * network.height
-    sway = car[SWAY]
-    if sway != _ZERO:
-        norm = _ONE / math.sqrt(_ONE + sway * sway)
+    car[s.X] = x - np.floor(x / network.width) * network.width
+    car[s.Y] = y - np.floor(y / network.height) * network.height
+    sway = car[s.SWAY]
+    if sway != ZERO:
+        norm = ONE / math.sqrt(ONE + sway * sway)
         tx, ty = (tx - sway * ty) * norm, (ty + sway * tx) * norm
-    car[COS], car[SIN] = tx, ty
+    car[s.COS], car[s.SIN] = tx, ty
 
 
 @leaf
 def point_at(network, car):
     """Index of the point of its lane that a car has passed last."""
-    lane = _U(_I(car[LANE]))
-    at = network.offsets[lane] + _I(car[ALONG] / network.steps[lane])
-    return _U(min(at, _I(network.offsets[lane + _U(1)] - 1)))
+    lane = U(I(car[s.LANE]))
+    at = network.offsets[lane] + I(car[s.ALONG] / network.steps[lane])
+    return U(min(at, I(network.offsets[lane + U(1)] - 1)))
 
 
 @leaf
 def lane_after(car, lane):
     """The lane after `lane` on a car's way, which is known for its next two lanes; else -1."""
-    if lane == _I(car[LANE]):
-        return _I(car[NEXT])
-    return _I(car[SECOND_NEXT]) if lane == _I(car[NEXT]) else _I(-1)
+    if lane == I(car[s.LANE]):
+        return I(car[s.NEXT])
+    return I(car[s.SECOND_NEXT]) if lane == I(car[s.NEXT]) else I(-1)
 
 
 @leaf
 def _draw(car):
     """A car's next random number in [0, 1)."""
-    car[DRAWS] += _ONE
-    return uniform(mix(mix(_U(car[SEED])) + _U(car[DRAWS]) * GOLDEN))
+    car[s.DRAWS] += ONE
+    return uniform(mix(mix(U(car[s.SEED])) + U(car[s.DRAWS]) * GOLDEN))
 
 
 @leaf
@@ -100,7 +78,7 @@ def choose_lane(network, lane, car):
     for k in range(network.successors.shape[1]):
         if network.successors[lane, k] >= 0:
             count += 1
-    return network.successors[lane, min(_I(_draw(car) * _F(count)), _I(count - 1))]
+    return network.successors[lane, min(I(_draw(car) * F(count)), I(count - 1))]
 
 
 @njit(nogil=True)
@@ -109,41 +87,41 @@ def _spawn(network, mileage, first, start, key, gap, ego_gap, world):
     draws = 0
     for i in range(world.shape[0]):
         car = world[i]
-        car[JUNCTION_BEHIND], car[PERMIT] = -_ONE, -_ONE
-        car[LANE_TIMER] = _F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
+        car[s.JUNCTION_BEHIND], car[s.PERMIT] = -ONE, -ONE
+        car[s.LANE_TIMER] = F(i) % LANE_CHANGE_PERIOD  # spreads the decisions over the control steps
         for _ in range(60):
             draws += 1
-            bits = mix(key + _U(draws) * GOLDEN)
+            bits = mix(key + U(draws) * GOLDEN)
             metres = uniform64(bits) * mileage[-1]
             lane = np.searchsorted(mileage, metres, side="right") - 1
             lane = min(lane, len(mileage) - 2)
-            car[LANE], car[ALONG] = _F(lane), _F(first[lane] + metres - mileage[lane])
+            car[s.LANE], car[s.ALONG] = F(lane), F(first[lane] + metres - mileage[lane])
             set_pose(network, car)
-            dx, dy = car[X] - start[0], car[Y] - start[1]
+            dx, dy = car[s.X] - start[0], car[s.Y] - start[1]
             dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
             free = dx * dx + dy * dy >= ego_gap * ego_gap
             for j in range(i):
-                if world[j, LANE] >= _ZERO:
-                    dx, dy = world[j, X] - car[X], world[j, Y] - car[Y]
+                if world[j, s.LANE] >= ZERO:
+                    dx, dy = world[j, s.X] - car[s.X], world[j, s.Y] - car[s.Y]
                     dx, dy = wrapped(dx, network.width), wrapped(dy, network.height)
                     free &= dx * dx + dy * dy >= gap * gap
             if free:
-                car[SEED] = _F(mix(bits) >> _U(40))
-                car[SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
-                car[NEXT] = _F(choose_lane(network, lane, car))
-                car[SECOND_NEXT] = _F(choose_lane(network, _I(car[NEXT]), car))
-                car[SPEED] = SPAWN_SPEED * car[SPEED_FACTOR] * network.speeds[point_at(network, car)]
+                car[s.SEED] = F(mix(bits) >> U(40))
+                car[s.SPEED_FACTOR] = SLOWEST_DRIVER + DRIVER_SPREAD * uniform(mix(bits + GOLDEN))
+                car[s.NEXT] = F(choose_lane(network, lane, car))
+                car[s.SECOND_NEXT] = F(choose_lane(network, I(car[s.NEXT]), car))
+                car[s.SPEED] = SPAWN_SPEED * car[s.SPEED_FACTOR] * network.speeds[point_at(network, car)]
                 break
-            car[LANE] = -_ONE
+            car[s.LANE] = -ONE
 
 
 def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, config: SimConfig) -> np.ndarray:
-    """Worlds float32 [n, cars, FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
+    """Worlds float32 [n, cars, TRAFFIC_FIELDS] around ego cars at `starts` [n, 5], from keys uint64 [n].
 
     Cars are uniform over the lanes outside junctions. A car for which there is no room is absent (LANE is -1).
     """
-    worlds, traffic = np.zeros((len(starts), cars, FIELDS), dtype=np.float32), config.traffic
-    worlds[:, :, LANE] = -1.0
+    worlds, traffic = np.zeros((len(starts), cars, s.TRAFFIC_FIELDS), dtype=np.float32), config.traffic
+    worlds[:, :, s.LANE] = -1.0
     if cars and len(network.offsets) > 1:
         half = config.vehicle.length / 2
         lengths = (np.diff(network.offsets) - 1) * network.steps.astype(np.float64)
@@ -153,7 +131,7 @@ def spawn(network: Network, starts: np.ndarray, cars: int, keys: np.ndarray, con
         first = np.where(behind, half, 0.0)
         last = lengths - np.where(before, half + float(STOP_LINE_GAP), 0.0)
         mileage = np.concatenate([[0.0], np.cumsum(np.where(junction, 0.0, np.maximum(last - first, 0.0)))])
-        gaps = _F(traffic.spawn_gap), _F(traffic.spawn_gap_ego)
+        gaps = F(traffic.spawn_gap), F(traffic.spawn_gap_ego)
         for world, start, key in zip(worlds, np.asarray(starts, dtype=np.float32), keys, strict=True):
-            _spawn(network, mileage, first, start, _U(key), *gaps, world)
+            _spawn(network, mileage, first, start, U(key), *gaps, world)
     return worlds

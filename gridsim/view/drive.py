@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gridsim.car.ego import COS, DISTANCE, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import check_name
-from gridsim.traffic.world import LANE, spawn
+from gridsim.simulator import Simulator
+from gridsim.state import DISTANCE, LANE, SPEED, STEPS, End, X, Y, poses_of
+from gridsim.traffic.world import spawn
 from gridsim.view.render import Renderer, Window, interpolate
 
 COLUMNS = (
@@ -74,13 +74,6 @@ def _begin(simulator: Simulator, road_map: Map, start: np.ndarray, episode: int)
     simulator.reset(road_map, start[None], worlds=worlds)
 
 
-def poses_of(states: np.ndarray) -> np.ndarray:
-    """Poses float32 [..., 5] of states [..., FIELDS]: x, y (m), heading (rad), speed (m/s), steering (rad)."""
-    poses = states[..., [X, Y, SIN, SPEED, STEERING]]
-    poses[..., 2] = np.arctan2(states[..., SIN], states[..., COS])
-    return poses
-
-
 def action_for(keys: set[str], speed: float) -> Action:
     """The action for the held keys (named as in "up"), at a speed in m/s.
 
@@ -97,10 +90,10 @@ def action_for(keys: set[str], speed: float) -> Action:
 
 
 class Recorder:
-    """Writes a drive to a new file row by row, so that an interrupted drive is kept too."""
+    """Writes a drive to a new file row by row, so that an interrupted drive is kept, too."""
 
     def __init__(self, path: str | os.PathLike[str], road_map: Map, traffic: int = 0):
-        """Create the file. Raises: GridSimError with one line if it exists or cannot be created."""
+        """Create the file. Raises: GridSimError if it exists or cannot be created."""
         self._map = (traffic, road_map.name, road_map.seed)
         self.path, self.rows = Path(path), 0
         try:
@@ -130,7 +123,7 @@ class Recorder:
 def read_drive(path: str | os.PathLike[str]) -> Drive:
     """Read a drive that `gridsim-drive --record` wrote.
 
-    Raises: GridSimError with one line that names the first problem and its place.
+    Raises: GridSimError that names the first problem and its place.
     """
     try:
         if os.stat(path).st_size > MAX_BYTES:
@@ -185,14 +178,12 @@ def _drive_of(reader: csv.DictReader[str]) -> Drive:
 def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
     """Replay a recorded drive by its actions.
 
-    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, FIELDS]; ranges float32 [n, rays] in m; the
-    traffic float32 [n, others, world.FIELDS]).
-    Raises: GridSimError with one line if an episode ends too early, which means that the map is another one.
+    Returns: (poses float32 [n, 5], as in `drive.poses`; states float32 [n, CAR_FIELDS]; ranges float32 [n, rays] in m;
+    the traffic float32 [n, others, TRAFFIC_FIELDS]).
+    Raises: GridSimError if an episode ends too early, which means that the map is another one.
     """
-    simulator = manual(drive.traffic)
-    n = len(drive)
+    simulator, n, rows = manual(drive.traffic), len(drive), []
     begins = np.diff(drive.episodes, prepend=-1) != 0
-    rows = []
     for k in range(n):
         if begins[k]:
             _begin(simulator, road_map, drive.poses[k], int(drive.episodes[k]))
@@ -206,7 +197,7 @@ def replay(drive: Drive, road_map: Map) -> tuple[np.ndarray, ...]:
 
 
 def _present(world: np.ndarray) -> np.ndarray:
-    """The cars [n, world.FIELDS] of a world that are on a lane: a copy."""
+    """The cars [n, TRAFFIC_FIELDS] of a world that are on a lane: a copy."""
     return world[world[:, LANE] >= 0.0]
 
 
@@ -222,8 +213,7 @@ def drive(
     """Let a person drive in real time until the window is closed, or for `seconds` of simulated time.
 
     Args: start float32 [5]: x, y (m), heading (rad), speed (m/s), steering (rad).
-    Returns: seconds driven, episodes, and distance_m of new ground in the best of them.
-    Raises: GridSimError with one line if the recording cannot be written.
+    Returns: seconds driven, episodes, and distance_m of new ground in the best of them. Raises: GridSimError.
     """
     simulator = manual(traffic)
     pictures = round(PERIOD * FPS)  # a control step

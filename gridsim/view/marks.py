@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gridsim.jit import freeze
 from gridsim.maps.map import Map
-from gridsim.maps.roads import freeze
 
 BESIDE, SLACK = 3.4, 1.2  # m between the centre lines of neighbours, and the greatest difference from it
 PARALLEL = 0.985  # cosine of the angle within which neighbours are parallel: 10 degrees

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-from gridsim.jit import njit
+from gridsim.jit import F, njit
 from gridsim.maps.roads import CELLS_PER_M, FIELD_FLOOR, Road, clearance, node_clearance, pack_field
 
 GROUND = (226, 231, 218)
@@ -30,7 +30,6 @@ EDGE_AT, EDGE_HALF = 0.3, 0.08  # m from the road's edge to its white line, and 
 VERGE_WIDTH = 0.7  # m
 DIP = 1.0  # m from the edge beyond which dips of the clearance are removed
 
-_F = np.float32
 _COLOURS = np.array([GROUND, GROUND_OTHER, VERGE, ASPHALT, EDGE_LINE], dtype=np.float32)
 SHAPE = 11  # numbers of a shape: centre, direction, half length, half width, corner radius, red, green, blue, opacity
 
@@ -43,27 +42,27 @@ def draw_ground(road, repeats, origin, step_x, step_y, pixels_per_m, image):
     and steps to the next pixel to the right and below, float64 [2] in m.
     Writes: image uint8 [h, w, 3].
     """
-    zero, half, one = _F(0.0), _F(0.5), _F(1.0)
-    scale = _F(pixels_per_m)
-    line_at, line_half = _F(EDGE_AT) * scale, _F(EDGE_HALF) * scale
-    inner = _F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge beyond which there is only asphalt
-    outer = -max(_F(VERGE_WIDTH), one / scale)  # ... and only ground
+    zero, half, one = F(0.0), F(0.5), F(1.0)
+    scale = F(pixels_per_m)
+    line_at, line_half = F(EDGE_AT) * scale, F(EDGE_HALF) * scale
+    inner = F(EDGE_AT + EDGE_HALF) + one / scale  # m from the edge beyond which there is only asphalt
+    outer = -max(F(VERGE_WIDTH), one / scale)  # ... and only ground
     for j in range(image.shape[0]):
         for i in range(image.shape[1]):
-            x = _F(origin[0] + i * step_x[0] + j * step_y[0])
-            y = _F(origin[1] + i * step_x[1] + j * step_y[1])
+            x = F(origin[0] + i * step_x[0] + j * step_y[0])
+            y = F(origin[1] + i * step_x[1] + j * step_y[1])
             inside = zero <= x and x < road.width and zero <= y and y < road.height
-            clear = clearance(road, x, y) if repeats or inside else _F(FIELD_FLOOR)
-            ground = (np.int32(np.floor(x / _F(SQUARE))) + np.int32(np.floor(y / _F(SQUARE)))) & 1
+            clear = clearance(road, x, y) if repeats or inside else F(FIELD_FLOOR)
+            ground = (np.int32(np.floor(x / F(SQUARE))) + np.int32(np.floor(y / F(SQUARE)))) & 1
             if clear > inner or clear < outer:
                 for c in range(3):
                     image[j, i, c] = np.uint8(_COLOURS[3 if clear > inner else ground, c])
                 continue
             edge = clear * scale  # pixels from the road's edge, positive on it
             off = abs(edge - line_at)
-            verge = min(max(one + clear * _F(1.0 / VERGE_WIDTH), zero), one)
+            verge = min(max(one + clear * F(1.0 / VERGE_WIDTH), zero), one)
             asphalt = min(max(edge + half, zero), one)
-            line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * _F(0.85)
+            line = max(min(off + half, line_half) - max(off - half, -line_half), zero) * F(0.85)
             for c in range(3):
                 value = _COLOURS[ground, c]
                 value += verge * (_COLOURS[2, c] - value)
@@ -86,7 +85,7 @@ def smoothed(road: Road) -> Road:
 def draw_shapes(shapes, image):
     """Blend rounded boxes float32 [n, 11] in pixels, in this order, into image uint8 [h, w, 3]."""
     height, width = image.shape[0], image.shape[1]
-    half, zero, one = _F(0.5), _F(0.0), _F(1.0)
+    half, zero, one = F(0.5), F(0.0), F(1.0)
     for k in range(shapes.shape[0]):
         x0, y0, dx, dy, length, across, radius = shapes[k, :7]
         opacity = shapes[k, 10]
@@ -96,20 +95,20 @@ def draw_shapes(shapes, image):
             continue
         top, bottom = max(int(y0 - tall) - 1, 0), min(int(y0 + tall) + 2, height)
         for j in range(top, bottom):
-            y = _F(j) - y0
+            y = F(j) - y0
             first, last = x0 - wide, x0 + wide
-            if abs(dy) > _F(0.01):  # only the part of a slanted shape that crosses this row
+            if abs(dy) > F(0.01):  # only the part of a slanted shape that crosses this row
                 middle, reach = x0 + y * dx / dy, (across + one) / abs(dy)
                 first, last = max(first, middle - reach), min(last, middle + reach)
             for i in range(max(int(first) - 1, 0), min(int(last) + 2, width)):
-                x = _F(i) - x0
+                x = F(i) - x0
                 u = abs(x * dx + y * dy) - length + radius
                 v = abs(y * dx - x * dy) - across + radius
                 outside = math.sqrt(max(u, zero) ** 2 + max(v, zero) ** 2) + min(max(u, v), zero) - radius
                 cover = min(max(half - outside, zero), one) * opacity
                 if cover > zero:
                     for c in range(3):
-                        under = _F(image[j, i, c])
+                        under = F(image[j, i, c])
                         image[j, i, c] = np.uint8(under + cover * (shapes[k, 7 + c] - under) + half)
 
 

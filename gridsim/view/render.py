@@ -17,11 +17,11 @@ from typing import Any, ClassVar
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gridsim.car.ego import COS, SIN, STEERING, X, Y
 from gridsim.config import SimConfig, constants
 from gridsim.errors import GridSimError
+from gridsim.jit import freeze
 from gridsim.maps.map import Map
-from gridsim.maps.roads import freeze
+from gridsim.state import COS, SIN, STEERING, X, Y
 from gridsim.view import paint
 from gridsim.view.display import has_display
 from gridsim.view.marks import lane_marks
@@ -81,7 +81,7 @@ class Renderer:
         """Draw a state: uint8 [h, w, 3].
 
         Args:
-            car: the car's state float32 [FIELDS] (`gridsim.car.ego`).
+            car: the car's state float32 [CAR_FIELDS] (`gridsim.state`).
             boxes: other cars [n, 4 or more]: x, y (m), heading (cosine, sine).
             ranges: ranges of the car's rays [rays], m.
             path: the car's past positions [n, 2], m.
@@ -212,7 +212,7 @@ def _font(pixels: int) -> Any:
 
 
 def interpolate(before: np.ndarray, after: np.ndarray, part: float, road_map: Map) -> np.ndarray:
-    """Interpolate states float32 [FIELDS] or boxes [n, 4 or more] (x, y, cosine, sine) linearly, for pictures.
+    """Interpolate states float32 [CAR_FIELDS] or boxes [n, 4 or more] (x, y, cosine, sine) linearly, for pictures.
 
     Args: part in [0, 1] of the way from `before` to `after`, across the torus's edge if that is shorter.
     """
@@ -231,7 +231,7 @@ class Window:
     _open: ClassVar[dict[Any, Window]] = {}  # by pygame's windows, which events name
 
     def __init__(self, size: tuple[int, int], caption: str = "GridSim"):
-        """Open it. Raises: NoDisplayError with one line that says what to do."""
+        """Open it. Raises: NoDisplayError that says what to do."""
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         import pygame
 

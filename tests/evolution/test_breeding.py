@@ -96,11 +96,6 @@ def test_mutation_is_gaussian_at_its_rate(rate, sigma):
     assert is_normal(children[changed][:20_000].astype(float) / sigma)
 
 
-def test_mutation_has_the_scale_of_each_gene():
-    children = breed(np.zeros((1, CNN.size), F), many(Kind.CROSS, 0, 0, 100), 4, CNN, Mutation(rate=1.0, sigma=0.5))
-    assert is_normal((children / gene_scales(CNN) / 0.5)[:, :: CNN.size // 100])
-
-
 @settings(max_examples=30, derandomize=True)
 @given(data=st.data())
 def test_the_same_recipe_is_the_same_child_in_any_chunk_and_order(parents, data):

@@ -13,11 +13,11 @@ from evolution.dqn.experience import NO_ACTION, Experience, ages, join, unpack
 from evolution.episodes.rollout import collect, evaluate
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, encode
-from gridsim.car.ego import SPEED, STEERING, End
 from gridsim.config import SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.scenarios import build
 from gridsim.sensing.grid import grid_table, grids
+from gridsim.simulator import Simulator
+from gridsim.state import SPEED, STEERING, End
 
 F = np.float32
 CONFIG = SimConfig()
@@ -149,16 +149,3 @@ def test_an_episode_depends_on_itself_alone(ask):
     assert not changed[0], "nothing is drawn for epsilon 0"
     assert all(changed[3:])
     assert [len(array) for array in (*collect(*only(of, []))[0], collect(*only(of, []))[1])] == [0] * 5
-
-
-def test_what_does_not_fit_is_refused(ask):
-    of = ask("mlp:6,7", 4, 0.5, 0)
-    endless = of.episodes.copy()
-    endless["steps"][1] = 65_536
-    for change, text in (
-        ({"weights": of.weights[:-1]}, r"weights of mlp:6,7 are \[311\], not \(310,\)"),
-        ({"worlds": of.worlds[:3]}, "traffic of 4 episodes is"),
-        ({"episodes": endless}, "1 to 65535 steps, not 65536"),
-    ):
-        with pytest.raises(ValueError, match=text):
-            collect(*of._replace(**change))

@@ -11,7 +11,7 @@ from scipy import stats
 from evolution.dqn.experience import NO_ACTION, Experience, empty, join
 from evolution.dqn.replay import Replay
 from evolution.networks.policy import PolicySpec
-from gridsim.car.ego import End
+from gridsim.state import End
 
 RAYS, GRID, FRAME = (PolicySpec.parse(text) for text in ("mlp:3", "cnn:8,8,8@4", "cnn:8,8,8@1"))
 TERMINAL = (End.COLLISION, End.IDLE, End.SUCCESS)

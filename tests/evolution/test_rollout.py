@@ -11,12 +11,10 @@ from evolution.episodes.rollout import RESULT, evaluate, trajectory
 from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, outputs_of
 from evolution.search.breeding import RECIPE, Mutation
-from gridsim.car.ego import COS, SIN, SPEED, STEERING, End, X, Y
 from gridsim.config import SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import ALONG, LANE, SHIFT
-from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.simulator import Simulator
+from gridsim.state import ALONG, COS, LANE, SHIFT, SIN, SPEED, STEERING, TRAFFIC_FIELDS, End, X, Y
 
 F = np.float32
 CONFIG = SimConfig()

@@ -7,18 +7,17 @@ import oracle
 import pytest
 from pictures import cars_on, straight_road
 
-from gridsim.car.ego import DISTANCE, IDLE, End
+from gridsim.car.collision import hits_box, stands_ahead, top_speed_near
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig, TrafficConfig, VehicleConfig, constants
-from gridsim.envs.simulator import Simulator
 from gridsim.jit import njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import Map
 from gridsim.maps.network import make_network
 from gridsim.maps.roads import Strips, clearance_nodes, make_road
-from gridsim.sensing.boxes import cast_boxes, hits_box, stands_ahead, top_speed_near
-from gridsim.sensing.rays import fan
-from gridsim.traffic.world import COS, FIELDS, LANE, SIN, SPEED, X, Y
+from gridsim.sensing.rays import cast_boxes, fan
+from gridsim.simulator import Simulator
+from gridsim.state import COS, DISTANCE, IDLE, LANE, SIN, SPEED, TRAFFIC_FIELDS, End, X, Y
 
 F = np.float32
 CONFIG = SimConfig()
@@ -30,7 +29,7 @@ SIDE = 256.0
 
 def parked(*poses):
     """A world with cars at poses (x, y, heading)."""
-    world = np.zeros((len(poses), FIELDS), dtype=F)
+    world = np.zeros((len(poses), TRAFFIC_FIELDS), dtype=F)
     world[:, [X, Y, COS, SIN]] = directed(np.array(poses, dtype=float))
     return world
 

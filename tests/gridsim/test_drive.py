@@ -18,12 +18,11 @@ from commands import finish, refused, running, wait_until
 from pictures import record_drive
 
 from cluster.commands.watch import drive_main
-from gridsim.car.ego import X, Y
 from gridsim.car.vehicle import Action
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import LANE
+from gridsim.state import LANE, X, Y
 from gridsim.view.drive import COLUMNS, Recorder, action_for, drive, read_drive, replay
 
 

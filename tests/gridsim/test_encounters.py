@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from pictures import cars_on, straight_road
 
-from gridsim.car.ego import COS, FIELDS, SIN, SPEED, X, Y
 from gridsim.config import SimConfig
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.network import make_network
+from gridsim.state import CAR_FIELDS, COS, SIN, SPEED, X, Y
 from gridsim.traffic.behaviour import drivers
 from gridsim.traffic.encounters import way_to_ego_collision
 
@@ -20,7 +20,7 @@ def test_a_collision_is_predicted_where_both_will_be_at_once(late, meet):
     lanes = lay_lanes([Path(0.0, 64.0, 0.0, ((128.0, 0.0),))], 128.0, 128.0, 1)
     network = make_network(lanes, straight_road(128.0, 128.0, 12.0), CONFIG)
     car = cars_on(network, (0, 52.0, 6.0, 1.0))[0]
-    ego = np.zeros(FIELDS, dtype=np.float32)
+    ego = np.zeros(CAR_FIELDS, dtype=np.float32)
     ego[[X, Y, COS, SIN, SPEED]] = 64.0, 64.0 - 6.0 * (2.0 + late), 0.0, 1.0, 6.0
     way = 12.0 - CONFIG.vehicle.width / 2 if meet else 1e9  # m to the ego car's side; the lane has a point each metre
     assert way_to_ego_collision(network, drivers(CONFIG), car, ego) == pytest.approx(way, abs=1.0)

@@ -18,16 +18,15 @@ from gymnasium.wrappers import TimeAwareObservation
 
 import gridsim
 from gridsim import ENVIRONMENTS
-from gridsim.car.ego import DISTANCE, SPEED, STEERING, End
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
 from gridsim.envs.env import GridSimEnv, GridSimVectorEnv
 from gridsim.envs.episodes import Episodes
-from gridsim.envs.simulator import Simulator, views
 from gridsim.maps.map import Map, starts_at
 from gridsim.maps.scenarios import REGISTRY
-from gridsim.sensing.grid import CELLS, grid_table, grids
-from gridsim.traffic.world import LANE
+from gridsim.sensing.grid import grid_table, grids
+from gridsim.simulator import Simulator, views
+from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End
 
 IDS = list(ENVIRONMENTS)
 Maps = dict[str, list[Map]]
@@ -77,24 +76,6 @@ SEES += [{"observation": observation, "frames": frames} for observation in ("gri
 def test_gymnasiums_checker_passes_without_a_display(maps: Maps, name: str, sees: dict[str, Any], actions: str) -> None:
     env = gymnasium.make(name, maps=maps[ENVIRONMENTS[name]][:1], actions=actions, render_mode="rgb_array", **sees)
     check_env(env.unwrapped)
-
-
-@pytest.mark.parametrize(("observation", "frames"), SENSING)
-@pytest.mark.parametrize("name", IDS)
-def test_spaces_and_traffic_are_those_of_the_options(name: str, observation: str, frames: int) -> None:
-    options: Any = {"observation": observation, "frames": frames, "actions": "continuous", "maps": 1}
-    env: Any = gymnasium.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point", **options)
-    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    space: Any = env.single_observation_space
-    if observation == "grid":
-        assert set(space.spaces) == {"grid", "speed"}
-        assert (space["speed"].shape, space["speed"].dtype) == ((1,), np.float32)
-        space = space["grid"]
-    assert space.shape == ((32,) if observation == "rays" else (frames, CELLS, CELLS))
-    assert space.dtype == (np.float32 if observation == "rays" else np.uint8)
-    assert env.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
-    assert env.unwrapped.simulator.worlds.shape[1] == REGISTRY[ENVIRONMENTS[name]].traffic
-    assert GridSimVectorEnv(1, scenario="city", maps=1, traffic=2).simulator.worlds.shape[1] == 2
 
 
 # --- seeds
@@ -478,3 +459,11 @@ def test_a_wrong_argument_is_refused(arguments: dict[str, Any], text: str) -> No
 def test_a_single_environment_has_no_autoreset_mode() -> None:
     with pytest.raises(ValueError, match=r"^autoreset_mode is for vector environments[^\n]*$"):
         gymnasium.make(IDS[2], autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_traffic_is_the_scenarios_unless_given(name: str) -> None:
+    options: Any = ({}, REGISTRY[ENVIRONMENTS[name]].traffic), ({"traffic": 2}, 2)
+    for given, traffic in options:
+        env: Any = gymnasium.make_vec(name, num_envs=2, maps=1, **given)
+        assert env.simulator.worlds.shape[1] == traffic

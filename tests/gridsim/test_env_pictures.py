@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
 
+from gridsim import simulator
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SensorConfig, SimConfig
-from gridsim.envs import episodes, observing, simulator
+from gridsim.envs import episodes, observing
 from gridsim.envs.env import RENDER_SIZE, GridSimEnv, GridSimVectorEnv
 from gridsim.maps import map
 from gridsim.maps.map import Map
@@ -73,16 +74,6 @@ def test_a_window_that_is_closed_leaves_the_others_open_with_their_own_keys() ->
         np.testing.assert_array_equal(pygame.surfarray.array3d(other.get_surface()).swapaxes(0, 1), picture)
         assert second.keys() == ({"n"}, {"n"})
     assert not pygame.display.get_init()
-
-
-def test_pictures_show_each_cars_world(maps: dict[str, list[Map]]) -> None:
-    options: Any = {"scenario": "highway", "maps": maps["highway"], "observation": "grid"}
-    env: Any = GridSimVectorEnv(3, render_mode="rgb_array", **options)
-    env.reset(seed=0)
-    pictures = env.render()
-    assert len(pictures) == 3
-    assert len({p.tobytes() for p in pictures}) == 3
-    np.testing.assert_array_equal(pictures, env.render())
 
 
 def test_record_video_films_in_real_time(tmp_path: Path) -> None:

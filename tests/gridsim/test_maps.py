@@ -21,11 +21,11 @@ from cluster.store.folder import RunError, new_run, open_run, read_config
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 from gridsim.envs.env import GridSimEnv
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.files import MapFile, MapWarning, load_map, map_digest, read_free, read_map_file
 from gridsim.maps.map import starts_at
 from gridsim.maps.raster import signed_clearance
 from gridsim.maps.scenarios import build, label
+from gridsim.simulator import Simulator
 
 pytestmark = pytest.mark.filterwarnings("ignore::gridsim.maps.files.MapWarning")  # most are small, or all road
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gridsim.config import VehicleConfig
-from gridsim.reference.profile import ACCELERATION, BRAKING, arc_length, profile, top_speed
+from gridsim.reference import ACCELERATION, BRAKING, arc_length, profile, top_speed
 
 INTERVAL = (5.0, 12.0)
 TOP = top_speed(INTERVAL)

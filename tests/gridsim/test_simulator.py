@@ -8,13 +8,13 @@ import oracle
 import pytest
 from pictures import crashes, small_map
 
-from gridsim.car.ego import COS, DISTANCE, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y
 from gridsim.car.vehicle import Action
 from gridsim.config import EpisodeConfig, SimConfig
-from gridsim.envs.simulator import Simulator
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import LANE, spawn
+from gridsim.simulator import Simulator
+from gridsim.state import COS, DISTANCE, IDLE, LANE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, End, X, Y
+from gridsim.traffic.world import spawn
 
 F = np.float32
 CONFIG = SimConfig()
@@ -26,7 +26,7 @@ TARGET, MAX_STEPS = 150.0, 200  # of the episodes that are driven at random and 
 def run(road_map, start, choose, target=2000.0, max_steps=4000, config=CONFIG):
     """Drive until the episode ends; `choose` is called with (step, ranges, car) and returns an action.
 
-    Returns: the start, the actions [n], the states after each [n, FIELDS], and how it ended.
+    Returns: the start, the actions [n], the states after each [n, CAR_FIELDS], and how it ended.
     """
     start = np.asarray(start, dtype=F)
     simulator = Simulator(1, config, target, max_steps)

@@ -11,30 +11,34 @@ from hypothesis import strategies as st
 from pictures import cars_on, crashes, straight_road
 from scipy import stats
 
-from gridsim.car.ego import COS, SIN, SPEED, STEERING, X, Y
+from gridsim.car.collision import boxes_touch, hits_box
 from gridsim.car.vehicle import path_curvature
 from gridsim.config import SimConfig, VehicleConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.lanes import Path, lay_lanes
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import lane_length, make_network, wrapped
-from gridsim.maps.roads import clearances, freeze
+from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.sensing.boxes import boxes_touch, hits_box
-from gridsim.traffic.behaviour import drivers, flow, idm
-from gridsim.traffic.world import (
+from gridsim.state import (
     ALONG,
+    COS,
     DRAWS,
-    FIELDS,
     LANE,
     LANE_TIMER,
     NEXT,
     PERMIT,
     SECOND_NEXT,
-    SEED,
+    SIN,
+    SPEED,
     SPEED_FACTOR,
-    spawn,
+    STEERING,
+    TRAFFIC_FIELDS,
+    X,
+    Y,
 )
+from gridsim.traffic.behaviour import drivers, idm, step_traffic
+from gridsim.traffic.world import spawn
 
 F = np.float32
 CONFIG = SimConfig()
@@ -84,10 +88,10 @@ def ego(x, y, heading=0.0, speed=0.0):
 
 @njit(nogil=True)
 def _watch(network, drivers, constants, world, ego, history):
-    """Let traffic flow, kept in history [steps, cars, FIELDS]; returns how often a car overlapped another."""
+    """Let traffic flow, kept in history [steps, cars, TRAFFIC_FIELDS]; returns how often a car overlapped another."""
     overlaps, width, height = 0, network.width, network.height
     for step in range(len(history)):
-        flow(network, drivers, world, ego)
+        step_traffic(network, drivers, world, ego)
         history[step] = world
         for i in range(len(world)):
             x, y, cosine, sine = world[i, X], world[i, Y], world[i, COS], world[i, SIN]
@@ -97,7 +101,7 @@ def _watch(network, drivers, constants, world, ego, history):
 
 
 def watch(network, world, seconds, ego=NOBODY, config=CONFIG):
-    """States [steps, cars, FIELDS] of a world after each step; no two cars overlap in any of them."""
+    """States [steps, cars, TRAFFIC_FIELDS] of a world after each step; no two cars overlap in any of them."""
     history = np.zeros((round(seconds / DT), *world.shape), dtype=F)
     assert _watch(network, drivers(config), constants(config), world.copy(), ego, history) == 0
     return history
@@ -140,14 +144,6 @@ def test_spawned_cars_keep_their_distance(scenario):
         assert np.hypot(*road_map.shortest(here - start[:2]).T).min() >= CONFIG.traffic.spawn_gap_ego - 1e-3
         for k in range(1, len(here)):
             assert np.hypot(*road_map.shortest(here[:k] - here[k]).T).min() >= CONFIG.traffic.spawn_gap - 1e-3
-
-
-def test_cars_of_other_episodes_and_of_one_turn_elsewhere():
-    road_map = build("city", 2)
-    starts, keys = np.tile(FAR, (8, 1)), np.arange(8, dtype=np.uint64)
-    worlds = spawn(road_map.network, starts, 6, keys, CONFIG)
-    assert len(np.unique(worlds[..., SEED])) == worlds[..., SEED].size
-    assert spawn(road_map.network, starts, 6, keys, CONFIG).tobytes() == worlds.tobytes()
 
 
 def test_no_car_keeps_further_right_than_there_is_room():
@@ -215,7 +211,7 @@ def test_the_ego_car_in_the_lane_is_followed_and_waited_for(ring):
     car = ego(440.0, 32.7, 0.05, 4.0)
     for _ in range(600):
         car[X] = (car[X] + 0.4) % 1024
-        flow(ring, D, world, car)
+        step_traffic(ring, D, world, car)
         assert (car[X] - world[0, ALONG]) % 1024 > LENGTH
     assert world[:, SPEED] == pytest.approx(4.0, abs=0.1)
     assert (car[X] - world[0, ALONG]) % 1024 < LENGTH + oracle.equilibrium_gap(CONFIG, 4.0, 12.0) + 3.0
@@ -256,7 +252,7 @@ def test_who_meets_the_ego_car_keeps_to_the_right_and_passes(narrow, lane, lengt
     car = ego(world[0, X] + 80.0 * ahead, 32.0, math.pi * (1 - lane), 6.0)
     right, speeds = [], []
     for _ in range(300):
-        flow(narrow, others, world, car)
+        step_traffic(narrow, others, world, car)
         car[X] -= 6.0 * DT * ahead
         dx = wrapped(F(car[X] - world[0, X]), narrow.width)
         assert not boxes_touch(k, dx, car[Y] - world[0, Y], world[0, COS], world[0, SIN], car[COS], car[SIN])
@@ -289,7 +285,7 @@ def test_a_car_in_a_junction_foresees_the_ego_car(crossing, turn, late):
                 heading += angle
             car = ego(x, y, heading, 6.0)
             car[STEERING] = turn
-            flow(crossing, D, world, car if foresees else NOBODY)
+            step_traffic(crossing, D, world, car if foresees else NOBODY)
             dx, dy = car[X] - world[0, X], car[Y] - world[0, Y]
             touched |= boxes_touch(K, dx, dy, world[0, COS], world[0, SIN], car[COS], car[SIN])
         return touched
@@ -327,23 +323,6 @@ def test_a_lane_is_blocked_until_a_crossing_car_of_any_width_is_past(width):
     assert (network.clear == 8.0 + math.floor(width + CONFIG.traffic.beside)).all()
 
 
-def test_a_car_waits_while_the_crossing_car_has_a_permit(crossing):
-    """It has one and does not come: the ego car stands before it. When that goes, both get through."""
-    world = cars_on(crossing, (0, 100.0, 5.0, 1.0), (3, 80.0, 5.0, 1.0))
-    world[0, PERMIT] = 1
-    stuck = watch(crossing, world, 60, ego(115.0, 128.0))
-    assert 120.0 - 3.0 < front(stuck[-1], 1) <= 120.0
-    world = cars_on(crossing, (0, 60.0, 9.0, 1.0), (3, 90.0, 9.0, 1.0))
-    waits = watch(crossing, world, 60, ego(128.0, 128.0, 0.8))  # as both do for the ego car in the junction
-    assert max(front(waits, 0).max(), front(waits, 1).max()) <= 120.0
-    for last in (stuck[-1], waits[-1]):
-        assert (last[:, SPEED] < 0.02).all()
-        assert (last[:, LANE] == [0, 3]).all()
-        after = watch(crossing, last, 30)
-        assert {1, 2} <= set(after[:, 0, LANE])
-        assert {4, 5} <= set(after[:, 1, LANE])
-
-
 @pytest.mark.parametrize("speed", [4.0, 8.0, 15.0])
 @pytest.mark.parametrize("phase", np.arange(0.0, 15.0, 2.5))
 def test_the_ego_car_that_comes_crosswise_goes_first(crossing, speed, phase):
@@ -352,7 +331,7 @@ def test_the_ego_car_that_comes_crosswise_goes_first(crossing, speed, phase):
     world = cars_on(crossing, (0, 105.0, 6.0, 1.0))
     car = ego(128.0, 128.0 - 2.0 * speed - phase * speed / 15.0, math.pi / 2, speed)
     while car[Y] < 132.0:
-        flow(crossing, D, world, car)
+        step_traffic(crossing, D, world, car)
         assert world[0, LANE] == 0
         car[Y] += speed * DT
     car[Y] = 150.0
@@ -411,7 +390,7 @@ def test_a_car_changes_lanes_for_a_faster_one_behind(abreast, behind, gives_way)
     """Equation 2 of Kesting et al. 2007: a car that gains nothing itself moves over for what its follower gains."""
     world = cars_on(abreast, (1, 200.0, 8.0, 0.4), (1, 200.0 - behind, 8.0, 1.0))
     world[1, LANE_TIMER] = 9.0
-    flow(abreast, D, world, NOBODY)
+    step_traffic(abreast, D, world, NOBODY)
     assert (world[0, LANE] == 0) == gives_way
 
 
@@ -420,7 +399,7 @@ def test_what_holds_up_the_new_follower_anyway_is_not_counted(abreast):
     ahead, follower = (1, 214.8, 8.0, 0.4), (0, 186.0, 8.0, 2.0)
     world = cars_on(abreast, ahead, (1, 200.0, 8.0, 0.8), follower, (0, 222.0, 8.0, 0.4))
     world[[0, 2, 3], LANE_TIMER] = 9.0
-    flow(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
+    step_traffic(abreast, D._replace(politeness=F(0.5)), world, NOBODY)
     assert world[1, LANE] == 0
 
 
@@ -431,7 +410,7 @@ def test_no_car_cuts_in_where_its_new_follower_would_have_to_brake_hard(abreast,
     world[[0, 2], LANE_TIMER] = 9.0
     brakes = -oracle.idm(CONFIG, 16.0, 24.0, behind - LENGTH, 8.0)
     assert (brakes <= CONFIG.traffic.safe_braking) == changes
-    flow(abreast, D._replace(politeness=F(0.0)), world, NOBODY)
+    step_traffic(abreast, D._replace(politeness=F(0.0)), world, NOBODY)
     assert (world[1, LANE] == 0) == changes
 
 
@@ -441,10 +420,10 @@ def test_a_change_that_is_refused_leaves_no_trace(abreast):
     world[:, LANE_TIMER] = 9.0
     asked = world.copy()
     asked[1, LANE_TIMER] = 0.0
-    flow(abreast, D, world, NOBODY)
-    flow(abreast, D, asked, NOBODY)
+    step_traffic(abreast, D, world, NOBODY)
+    step_traffic(abreast, D, asked, NOBODY)
     assert asked[1, DRAWS] == world[1, DRAWS] + 2  # it was about to change
-    same = np.setdiff1d(np.arange(FIELDS), [DRAWS, LANE_TIMER])
+    same = np.setdiff1d(np.arange(TRAFFIC_FIELDS), [DRAWS, LANE_TIMER])
     np.testing.assert_array_equal(asked[:, same], world[:, same])
 
 

@@ -8,13 +8,14 @@ import oracle
 import yaml
 from PIL import Image
 
-from gridsim.car.ego import End, collides
+from gridsim import state
+from gridsim.car.collision import collides
 from gridsim.config import SimConfig, constants
-from gridsim.jit import njit
+from gridsim.jit import freeze, njit
 from gridsim.maps.map import without_lanes
-from gridsim.maps.roads import Strips, clearance_nodes, clearances, freeze, make_road
-from gridsim.traffic import world as traffic
-from gridsim.view.drive import Recorder, manual, poses_of
+from gridsim.maps.roads import Strips, clearance_nodes, clearances, make_road
+from gridsim.state import End, poses_of
+from gridsim.view.drive import Recorder, manual
 
 PPM = 16
 W, H = 100.0, 72.0  # m
@@ -82,17 +83,17 @@ def straight_road(width, height, limit, half_width=0.0):
 
 def cars_on(network, *rows):
     """A world of cars (lane, m along it, m/s, factor), placed by one look at where they are."""
-    world = np.zeros((len(rows), traffic.FIELDS), dtype=np.float32)
+    world = np.zeros((len(rows), state.TRAFFIC_FIELDS), dtype=np.float32)
     for car, (lane, along, speed, factor) in zip(world, rows, strict=True):
-        car[[traffic.LANE, traffic.ALONG, traffic.SPEED, traffic.SPEED_FACTOR]] = lane, along, speed, factor
-        car[[traffic.JUNCTION_BEHIND, traffic.PERMIT]] = -1.0
-        car[traffic.NEXT] = network.successors[lane, 0]
-        car[traffic.SECOND_NEXT] = network.successors[int(car[traffic.NEXT]), 0]
+        car[[state.LANE, state.ALONG, state.SPEED, state.SPEED_FACTOR]] = lane, along, speed, factor
+        car[[state.JUNCTION_BEHIND, state.PERMIT]] = -1.0
+        car[state.NEXT] = network.successors[lane, 0]
+        car[state.SECOND_NEXT] = network.successors[int(car[state.NEXT]), 0]
         at = along / float(network.steps[lane])
         first = network.offsets[lane] + int(at)
         a, b = network.points[first], network.points[first + 1]
-        car[[traffic.X, traffic.Y]] = (a + (at - int(at)) * (b - a)) % [network.width, network.height]
-        car[[traffic.COS, traffic.SIN]] = (b - a) / np.hypot(*(b - a))
+        car[[state.X, state.Y]] = (a + (at - int(at)) * (b - a)) % [network.width, network.height]
+        car[[state.COS, state.SIN]] = (b - a) / np.hypot(*(b - a))
     return world
 
 

@@ -69,7 +69,7 @@ class Layout:
     def join(self, x: float, y: float, half: float, arms: list[int]) -> None:
         """Roads between the middles of some sides of a square (side 2 * half) centred on (x, y)."""
         if len(arms) == 3:
-            # This area is already covered, but near the seams of the other three strips their clearance is too small.
+            # Not needed for coverage: it fills the dip of the clearance where the other three strips meet.
             dx, dy = next(DIRECTIONS[a] for a in arms if (a + 2) % 4 not in arms)
             self.line(dx * half + x, dy * half + y, x, y)
         for a, b in combinations(arms, 2):

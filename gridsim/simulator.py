@@ -1,4 +1,4 @@
-"""Batches of cars; what one car does in a control period is in `car.ego`."""
+"""Batches of cars; what one car does in a control period is in `gridsim.step`."""
 
 from __future__ import annotations
 
@@ -7,22 +7,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gridsim.car.ego import DISTANCE, FIELDS, SPEED, STEERING, End, control, look, place, visit_cells
 from gridsim.car.reward import reward
 from gridsim.car.vehicle import Action, act, act_continuous
 from gridsim.config import Constants, SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.atlas import Atlas, make_atlas, network_of, road_of
 from gridsim.maps.map import Map
-from gridsim.sensing.rays import fan
-from gridsim.traffic.behaviour import Drivers, drivers, flow
-from gridsim.traffic.world import FIELDS as TRAFFIC_FIELDS
+from gridsim.state import CAR_FIELDS, DISTANCE, SPEED, STEERING, TRAFFIC_FIELDS, End
+from gridsim.step import Simulation, look, parameters, place, simulations_on, step, visit_cells
+from gridsim.traffic.behaviour import Drivers
 
 MOST_MAPS = 256  # in the atlas; above that, maps without cars are removed. A map has some 2 MB, at most 8.
 
 
 class Physics(NamedTuple):
-    """What all cars share, as kernels read it; arrays are read-only."""
+    """A `step.Simulation` of several maps."""
 
     atlas: Atlas
     constants: Constants
@@ -30,29 +29,37 @@ class Physics(NamedTuple):
     fan: np.ndarray
 
 
+@njit
+def _on_map(physics, row):
+    """The Simulation of a map of the atlas."""
+    road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
+    return Simulation(road, network, physics.constants, physics.drivers, physics.fan)
+
+
 @njit(nogil=True)
 def _place_all(physics, order, runs, which, starts, cars, visits, worlds, ranges, closing):
     """Put cars `which` [k] at `starts` [k, 5], grouped by map as in `_control_all`; they look around."""
     for row, first, last in runs:
-        road = road_of(physics.atlas, row)
+        simulation = _on_map(physics, row)
         for k in order[first:last]:
             i = which[k]
             world = None if worlds is None else worlds[i]
-            place(road, starts[k], cars[i], visits[i])
-            look(road, physics.constants, physics.fan, cars[i], world, ranges[i], closing[i])
+            place(simulation, starts[k], cars[i], visits[i])
+            look(simulation, cars[i], world, ranges[i], closing[i])
 
 
 @njit(nogil=True)
 def _control_all(physics, order, runs, actions, target, max_steps, cars, visits, worlds, ends, seen):
     """One control period of every car; one whose episode has ended stands still.
 
-    `order` lists the cars map by map; runs int64 [maps, 3]: a map's row in the atlas, and its cars' range in `order`.
-    seen: ranges and closing speeds [n, rays] and rewards [n], to be filled.
+    Args: cars `order` map by map; runs int64 [maps, 3], a map's row in the atlas and its cars' range in `order`; seen,
+    ranges and closing speeds [n, rays] and rewards [n], to be filled.
     """
-    constants, drivers = physics.constants, physics.drivers
+    constants = physics.constants
     ranges, closing, rewards = seen
     for row, first, last in runs:
-        road, network = road_of(physics.atlas, row), network_of(physics.atlas, row)
+        simulation = _on_map(physics, row)
+        fastest = simulation.road.speed_high
         for i in order[first:last]:
             car = cars[i]
             world = None if worlds is None else worlds[i]
@@ -64,12 +71,10 @@ def _control_all(physics, order, runs, actions, target, max_steps, cars, visits,
                 else:
                     pedal, wheel = actions[i, 0], actions[i, 1]
                     acceleration, steering = act_continuous(constants, pedal, wheel, car[SPEED], car[STEERING])
-                if world is not None:
-                    flow(network, drivers, world, car)
-                ends[i] = control(road, constants, car, visits[i], world, acceleration, steering, target, max_steps)
-            look(road, constants, physics.fan, car, world, ranges[i], closing[i])
+                ends[i] = step(simulation, car, visits[i], world, acceleration, steering, target, max_steps)
+            look(simulation, car, world, ranges[i], closing[i])
             if runs_on:
-                gained, fastest = car[DISTANCE] - before, road.speed_high
+                gained = car[DISTANCE] - before
                 rewards[i] = reward(ranges[i], constants.ray_range, car[SPEED], gained, ends[i], fastest, constants.dt)
 
 
@@ -83,15 +88,13 @@ def _by_map(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class Simulator:
     """A batch of cars, each on a map and in an episode of its own: arrays in, arrays out.
 
-    A car's behaviour depends only on its own map, start and actions, not on the batch it is in.
-
-    Attributes, which steps and resets change:
-        cars: float32 [n, ego.FIELDS].
+    A car's behaviour depends only on its own map, start and actions. Attributes, which steps and resets change:
+        cars: float32 [n, CAR_FIELDS].
         visits: float32 [n, cells], odometer (m) when the car was last in each visit cell of its map.
         ends: uint8 [n], End.
-        worlds: float32 [n, traffic, world.FIELDS], the other cars around each.
+        worlds: float32 [n, traffic, TRAFFIC_FIELDS], the other cars around each.
         ranges: float32 [n, rays], m, after the last step or reset.
-        closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `boxes.cast_boxes`.
+        closing: float32 [n, rays], m/s, the closing speeds that go with them, as in `rays.cast_boxes`.
     """
 
     def __init__(
@@ -102,10 +105,9 @@ class Simulator:
         max_steps: int | None = None,
         traffic: int = 0,
     ):
-        """Make room for `cars` cars, each with a world of `traffic` other cars.
+        """Make room for `cars` cars, each with a world of `traffic` other cars. Raises: ValueError.
 
         `target` (m) and `max_steps` (control steps) are the configuration's unless given.
-        Raises: ValueError with one line for an invalid number.
         """
         self.config = config or SimConfig()
         episode = self.config.episode
@@ -118,7 +120,7 @@ class Simulator:
         if not self.target > 0.0 or self.max_steps < 1:
             raise ValueError(f"an episode needs a target above 0 m and 1 step, not {self.target} and {self.max_steps}")
         constants(self.config)  # raises for a wrong configuration
-        self.cars = np.zeros((cars, FIELDS), dtype=np.float32)
+        self.cars = np.zeros((cars, CAR_FIELDS), dtype=np.float32)
         self.visits = np.zeros((cars, 0), dtype=np.float32)
         self.ends = np.zeros(cars, dtype=np.uint8)
         self.worlds = np.full((cars, traffic, TRAFFIC_FIELDS), -1.0, dtype=np.float32)  # all are absent
@@ -150,9 +152,8 @@ class Simulator:
             maps: the map of each car [k], or one for all.
             starts: float32 [k, 5]: x, y (m), heading (rad), speed (m/s), steering (rad).
             cars: indices [k] of the cars that begin; None is all of them.
-            worlds: float32 [k, traffic, world.FIELDS], the traffic around each car (`world.spawn`); None is no cars.
-
-        Raises: ValueError with one line for a wrong shape or a start that is not finite.
+            worlds: float32 [k, traffic, TRAFFIC_FIELDS], the traffic around each car (`world.spawn`); None is no cars.
+        Raises: ValueError for a wrong shape or a start that is not finite.
         """
         cars = np.arange(len(self)) if cars is None else cars
         maps = [maps] * len(cars) if isinstance(maps, Map) else maps
@@ -170,23 +171,19 @@ class Simulator:
         if cells > self.visits.shape[1]:
             more = ((0, 0), (0, cells - self.visits.shape[1]))
             self.visits = np.pad(self.visits, more, constant_values=-1e6)
-        physics, around = self._kernel_physics(), self._kernel_worlds()
-        groups = _by_map(self._rows[cars])
-        _place_all(physics, *groups, cars, starts, self.cars, self.visits, around, self.ranges, self.closing)
+        (physics, worlds), groups = self._for_kernels(), _by_map(self._rows[cars])
+        _place_all(physics, *groups, cars, starts, self.cars, self.visits, worlds, self.ranges, self.closing)
 
     def forget_maps(self) -> None:
         """Have the next reset keep only maps on which there are cars."""
         self._row_of = {}
 
-    def _kernel_worlds(self) -> np.ndarray | None:
-        return self.worlds if self.worlds.shape[1] else None
-
-    def _kernel_physics(self) -> Physics:
+    def _for_kernels(self) -> tuple[Physics, np.ndarray | None]:
+        """What all cars share, and the worlds, or None without traffic."""
         if self._physics is None:
-            k, rays = constants(self.config), self.config.sensors.rays
             atlas = make_atlas([each.road for each in self._row_of], [each.network for each in self._row_of])
-            self._physics = Physics(atlas, k, drivers(self.config), fan(rays, k.ray_first, k.ray_step))
-        return self._physics
+            self._physics = Physics(atlas, *parameters(self.config))
+        return self._physics, self.worlds if self.worlds.shape[1] else None
 
     def _put_on(self, cars: np.ndarray, maps: Sequence[Map]) -> None:
         """Put cars [k] on maps [k]. New maps are added to the atlas; if it has many, maps without cars are removed."""
@@ -207,7 +204,7 @@ class Simulator:
 
         Args: actions integers [n], 0 to 7 (`vehicle.Action`), or numbers [n, 2], clipped to [-1, 1] (`act_continuous`).
         Returns: the rewards float32 [n], 0 where no episode was going on.
-        Raises: ValueError with one line for invalid actions; RuntimeError before the first reset.
+        Raises: ValueError for invalid actions; RuntimeError before the first reset.
         """
         if self._rows.min() < 0:
             raise RuntimeError("step() was called before every car was reset; call reset() first")
@@ -215,30 +212,29 @@ class Simulator:
             raise ValueError(f"there are {len(self)} cars, not actions of shape {np.shape(actions)}")
         actions = checked_actions(actions)
         rewards = np.zeros(len(self), dtype=np.float32)
-        physics, around, target = self._kernel_physics(), self._kernel_worlds(), np.float32(self.target)
-        arrays = self.cars, self.visits, around, self.ends, (self.ranges, self.closing, rewards)
-        _control_all(physics, *self._groups, actions, target, self.max_steps, *arrays)
+        physics, worlds = self._for_kernels()
+        arrays = self.cars, self.visits, worlds, self.ends, (self.ranges, self.closing, rewards)
+        _control_all(physics, *self._groups, actions, np.float32(self.target), self.max_steps, *arrays)
         return rewards
 
 
 def views(scenario: Map, cars: np.ndarray, worlds: np.ndarray, config: SimConfig) -> tuple[np.ndarray, np.ndarray]:
-    """What cars in states [n, FIELDS] see among traffic [n, others, world.FIELDS].
+    """What cars in states [n, CAR_FIELDS] see among traffic [n, others, TRAFFIC_FIELDS].
 
     Returns: ranges (m) and closing speeds (m/s) of the rays, each float32 [n, rays].
     """
-    k = constants(config)
-    rays = fan(config.sensors.rays, k.ray_first, k.ray_step)
+    simulation = simulations_on([scenario], config)[0]
     ranges = np.empty((len(cars), config.sensors.rays), dtype=np.float32)
     closing = np.zeros_like(ranges)
     for car, world, seen, speeds in zip(cars, worlds, ranges, closing, strict=True):
-        look(scenario.road, k, rays, car, world, seen, speeds)
+        look(simulation, car, world, seen, speeds)
     return ranges, closing
 
 
 def checked_actions(actions: np.ndarray) -> np.ndarray:
     """Actions [n] as int64, or continuous ones [n, 2] as float32 clipped to [-1, 1]; C-contiguous.
 
-    Raises: ValueError with one line unless they are whole numbers that name actions, or pairs of numbers.
+    Raises: ValueError unless they are whole numbers that name actions, or pairs of numbers.
     """
     array = np.asarray(actions)
     if array.ndim == 2:

@@ -1,0 +1,95 @@
+"""Collisions: with the edge of the road and with other cars, and how close these are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gridsim.jit import HALF, ONE, ZERO, F, leaf
+from gridsim.maps.network import wrapped
+from gridsim.maps.roads import clearance
+from gridsim.state import COS, LANE, SIN, SPEED, X, Y
+
+# Points on the outline that are checked against the edge, as shares of half length and half width: corners first.
+_OUTLINE = np.array(
+    [[1, 1], [1, -1], [-1, 1], [-1, -1], [0.5, 1], [0.5, -1], [0, 1], [0, -1], [-0.5, 1], [-0.5, -1], [1, 0], [-1, 0]],
+    dtype=np.float32,
+)
+_OUTLINE.setflags(write=False)
+
+
+@leaf
+def collides(road, constants, x, y, cosine, sine):
+    """Whether any part of the car's outline is off the road."""
+    length, width = constants.half_length, constants.half_width
+    # Two circles cover the car, one each half. If both are clear of the edge, the outline need not be checked.
+    half = HALF * length
+    radius = math.sqrt(half * half + width * width)
+    front = clearance(road, x + half * cosine, y + half * sine)
+    rear = clearance(road, x - half * cosine, y - half * sine)
+    if min(front, rear) > radius + F(0.02):
+        return False
+    if min(front, rear) < ZERO:
+        return True
+    for k in range(_OUTLINE.shape[0]):
+        along, across = _OUTLINE[k, 0] * length, _OUTLINE[k, 1] * width
+        if clearance(road, x + along * cosine - across * sine, y + along * sine + across * cosine) < ZERO:
+            return True
+    return False
+
+
+@leaf
+def boxes_touch(constants, dx, dy, cosine, sine, other_cosine, other_sine):
+    """Whether two cars overlap, the other (dx, dy) m away: separating axes (Gottschalk et al. 1996)."""
+    length, breadth = constants.half_length, constants.half_width
+    along = abs(cosine * other_cosine + sine * other_sine)
+    across = abs(cosine * other_sine - sine * other_cosine)
+    long_side = length + length * along + breadth * across
+    short_side = breadth + length * across + breadth * along
+    return (
+        abs(dx * cosine + dy * sine) <= long_side
+        and abs(dy * cosine - dx * sine) <= short_side
+        and abs(dx * other_cosine + dy * other_sine) <= long_side
+        and abs(dy * other_cosine - dx * other_sine) <= short_side
+    )
+
+
+@leaf
+def top_speed_near(world, reach, width, height, x, y):
+    """Top speed (m/s) of the boxes whose middles are within `reach` m of a point; -1 if there are none."""
+    fastest = -ONE
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= ZERO:
+            dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+            if dx * dx + dy * dy < reach * reach:
+                fastest = max(fastest, abs(world[j, SPEED]))
+    return fastest
+
+
+@leaf
+def hits_box(constants, world, back, dt, width, height, x, y, cosine, sine):
+    """Whether a car overlaps a box of a world, moved back by `back` (a share) of a control period."""
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= ZERO:
+            behind = back * dt * world[j, SPEED]
+            dx = wrapped(world[j, X] - behind * world[j, COS] - x, width)
+            dy = wrapped(world[j, Y] - behind * world[j, SIN] - y, height)
+            if dx * dx + dy * dy < constants.contact * constants.contact and boxes_touch(
+                constants, dx, dy, cosine, sine, world[j, COS], world[j, SIN]
+            ):
+                return True
+    return False
+
+
+@leaf
+def stands_ahead(constants, world, width, height, x, y, cosine, sine):
+    """Whether a standing box blocks the way close ahead of a car's front."""
+    for j in range(world.shape[0]):
+        if world[j, LANE] >= ZERO and world[j, SPEED] < HALF:
+            dx, dy = wrapped(world[j, X] - x, width), wrapped(world[j, Y] - y, height)
+            forward, aside = dx * cosine + dy * sine, dy * cosine - dx * sine
+            limit = constants.courtesy + F(2.0) * constants.half_length
+            if ZERO < forward < limit and abs(aside) < F(2.0) * constants.half_width:
+                return True
+    return False

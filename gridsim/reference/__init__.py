@@ -1,1 +1,0 @@
-"""The reference driver's speed and steering, and the errors of drives relative to it."""

@@ -1,0 +1,59 @@
+"""States of cars as float32 rows: what each column means, for the ego car and for the other cars."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+# Columns of every car.
+X, Y = 0, 1  # m, centre of mass
+COS, SIN = 2, 3  # heading
+SPEED = 4  # m/s, negative backwards
+
+# Further columns of the ego car.
+STEERING = 5  # rad, left positive
+DISTANCE = 6  # m of new ground
+PACED = 7  # m of new ground at a speed within the scenario's interval
+ODOMETER = 8  # m driven, either way
+DEBT = 9  # m reversed that must be driven forward again before distance counts
+IDLE = 10  # control steps in a row without progress
+STEPS = 11  # control steps
+CELL = 12  # index of the visit cell the car is in
+FRESH = 13  # 1 if this cell's ground is new
+CAR_FIELDS = 14
+
+# Further columns of a car of the traffic.
+LANE = 5  # index of its lane; -1 for an absent car, which is ignored
+ALONG = 6  # m along it
+NEXT, SECOND_NEXT = 7, 8  # its next two lanes
+JUNCTION_BEHIND = 9  # junction lane on which its rear may still be, or -1
+PERMIT = 10  # junction lane that it may enter next, or -1
+SHIFT = 11  # m to the left of its lane, while it changes lanes or keeps to the right
+SPEED_FACTOR = 12  # its desired speed, relative to the lane's
+SEED = 13  # of its random turns, below 2 ** 24
+DRAWS = 14  # random numbers drawn so far, one a lane
+ACCELERATION = 15  # m/s2, its acceleration in this step
+HORIZON = 16  # m ahead that it looks in this step
+GAP = 17  # m from its middle to the nearest obstacle
+LEAD_SPEED = 18  # m/s, of that obstacle along its heading
+LANE_TIMER = 19  # control steps until its next decision on a change of lanes
+SWAY = 20  # m to the left of its lane per m driven, while SHIFT changes
+TRAFFIC_FIELDS = 21
+
+
+class End(IntEnum):
+    """How an episode ended."""
+
+    RUNNING = 0
+    COLLISION = 1  # off the road or into a car
+    IDLE = 2  # too many steps without progress
+    SUCCESS = 3  # the target distance is reached
+    TIME = 4  # the time limit (truncation)
+
+
+def poses_of(states: np.ndarray) -> np.ndarray:
+    """Poses float32 [..., 5] of the ego car's states: x, y (m), heading (rad), speed (m/s), steering (rad)."""
+    poses = states[..., [X, Y, SIN, SPEED, STEERING]]
+    poses[..., 2] = np.arctan2(states[..., SIN], states[..., COS])
+    return poses

@@ -1,0 +1,188 @@
+"""A control step: traffic moves, the ego car drives, collides, gains new ground or ends its episode, and looks around.
+
+Everything that drives cars is a loop over `step` and `look`: `gridsim.simulator` and `evolution.episodes.rollout`.
+In kernels, a world of None means no traffic: Numba then compiles that branch away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gridsim.car.collision import collides, hits_box, stands_ahead, top_speed_near
+from gridsim.car.vehicle import advance, front_velocity, path_curvature
+from gridsim.config import REENTRY, SUBSTEP, Constants, SimConfig, constants
+from gridsim.jit import ONE, ZERO, F, I, leaf, njit
+from gridsim.maps.map import Map
+from gridsim.maps.network import Network
+from gridsim.maps.roads import VISIT_CELL, Road
+from gridsim.sensing.rays import cast_boxes, fan, sense
+from gridsim.state import CELL, COS, DEBT, DISTANCE, FRESH, IDLE, ODOMETER, PACED, SIN, SPEED, STEERING, STEPS, X, Y
+from gridsim.traffic.behaviour import Drivers, drivers, step_traffic
+
+_VISIT_SCALE = F(1.0 / VISIT_CELL)
+
+
+class Simulation(NamedTuple):
+    """A map and the simulator's parameters as kernels read them."""
+
+    road: Road
+    network: Network
+    constants: Constants
+    drivers: Drivers
+    fan: np.ndarray  # of `rays.fan`
+
+
+def parameters(config: SimConfig) -> tuple[Constants, Drivers, np.ndarray]:
+    """What a Simulation holds besides its map. Raises: ValueError for an invalid configuration."""
+    k = constants(config)
+    return k, drivers(config), fan(config.sensors.rays, k.ray_first, k.ray_step)
+
+
+def simulations_on(road_maps: Sequence[Map], config: SimConfig) -> list[Simulation]:
+    """A Simulation for each map. Raises: ValueError for an invalid configuration."""
+    shared = parameters(config)
+    return [Simulation(each.road, each.network, *shared) for each in road_maps]
+
+
+@njit
+def visit_cells(road: Road) -> int:
+    """Number of visit cells of a map."""
+    return int(road.width) // VISIT_CELL * (int(road.height) // VISIT_CELL)
+
+
+@leaf
+def visit_cell(road, x, y):
+    """Index of the visit cell that contains a point of the torus."""
+    columns = I(road.width * _VISIT_SCALE)
+    rows = I(road.height * _VISIT_SCALE)
+    column = min(max(I(x * _VISIT_SCALE), I(0)), columns - I(1))
+    row = min(max(I(y * _VISIT_SCALE), I(0)), rows - I(1))
+    return row * columns + column
+
+
+@leaf
+def place(simulation, start, car, visits):
+    """Put a car at the start of an episode: start float32 [5] is x, y, heading, speed, steering."""
+    road = simulation.road
+    car[:] = ZERO
+    car[X] = start[0] - math.floor(start[0] / road.width) * road.width
+    car[Y] = start[1] - math.floor(start[1] / road.height) * road.height
+    car[COS], car[SIN] = math.cos(start[2]), math.sin(start[2])
+    car[SPEED], car[STEERING] = start[3], start[4]
+    visits[:] = F(-1e6)
+    cell = visit_cell(road, car[X], car[Y])
+    car[CELL], car[FRESH] = F(cell), ONE
+    visits[cell] = ZERO
+
+
+@leaf
+def start_from(car, start):
+    """The inverse of `place`: write a car's pose to start float32 [5]."""
+    start[0], start[1] = car[X], car[Y]
+    start[2] = math.atan2(car[SIN], car[COS])
+    start[3], start[4] = car[SPEED], car[STEERING]
+
+
+@leaf
+def look(simulation, car, world, ranges, closing):
+    """Ranges (m) of the car's sensor, from the middle of its front axle, to the road's edge or another car.
+
+    Writes: ranges float32 [rays]; with traffic also closing float32 [rays], if not None, as in `rays.cast_boxes`.
+    """
+    road, constants, fan = simulation.road, simulation.constants, simulation.fan
+    x = car[X] + constants.front_axle * car[COS]
+    y = car[Y] + constants.front_axle * car[SIN]
+    sense(road, fan, constants.ray_range, x, y, car[COS], car[SIN], ranges)
+    if world is not None:
+        velocity = (ZERO, ZERO)
+        if closing is not None:
+            velocity = front_velocity(constants, car[SPEED], car[STEERING])
+        cast_boxes(constants, fan, road.width, road.height, x, y, car[COS], car[SIN], velocity, world, ranges, closing)
+
+
+@leaf
+def step(simulation, car, visits, world, acceleration, steering, target, max_steps):
+    """One control step: advance in sub-steps with collision checks, count new ground, check for the end.
+
+    Args: acceleration m/s2 and steering rad of `vehicle.act`; the episode's limits, m of new ground and control steps.
+    Returns: an End as a number.
+    """
+    road, constants = simulation.road, simulation.constants
+    if world is not None:
+        step_traffic(simulation.network, simulation.drivers, world, car)
+    car[STEERING] = steering
+    x, y, cosine, sine, speed = car[X], car[Y], car[COS], car[SIN], car[SPEED]
+    curvature = path_curvature(constants, speed, car[STEERING])
+    fastest = max(abs(speed), abs(speed + acceleration * constants.dt))
+    near = False
+    if world is not None:
+        closing = top_speed_near(world, constants.near, road.width, road.height, x, y)
+        near = closing >= ZERO
+        if near:
+            fastest += closing
+    parts = I(1) + I(fastest * constants.dt / SUBSTEP)
+    dt = constants.dt / F(parts)
+    moved = ZERO
+    crashed = False
+    for part in range(parts):
+        x, y, cosine, sine, speed, length = advance(constants, x, y, cosine, sine, speed, acceleration, curvature, dt)
+        moved += length
+        if collides(road, constants, x, y, cosine, sine):
+            crashed = True
+            break
+        if world is not None and near:
+            back = ONE - F(part + 1) / F(parts)
+            if hits_box(constants, world, back, constants.dt, road.width, road.height, x, y, cosine, sine):
+                crashed = True
+                break
+    if x < ZERO:
+        x += road.width
+    elif x >= road.width:
+        x -= road.width
+    if y < ZERO:
+        y += road.height
+    elif y >= road.height:
+        y -= road.height
+    car[X], car[Y], car[COS], car[SIN], car[SPEED] = x, y, cosine, sine, speed
+    car[STEPS] += ONE
+    odometer = car[ODOMETER] + abs(moved)
+    car[ODOMETER] = odometer
+    cell = visit_cell(road, x, y)
+    if F(cell) != car[CELL]:
+        gap = odometer - visits[cell]
+        car[CELL] = F(cell)
+        if gap > REENTRY:
+            car[FRESH] = ONE if gap > constants.revisit else ZERO
+    visits[cell] = odometer
+    gained = ZERO
+    if moved < ZERO:
+        car[DEBT] -= moved
+    else:
+        paid = min(car[DEBT], moved)
+        car[DEBT] -= paid
+        gained = (moved - paid) * car[FRESH]
+    car[DISTANCE] += gained
+    if road.speed_low <= speed and speed <= road.speed_high:
+        car[PACED] += gained
+    if gained < constants.progress:
+        # Waiting behind a standing car is not idleness.
+        waits = False
+        if world is not None and near:
+            waits = stands_ahead(constants, world, road.width, road.height, car[X], car[Y], cosine, sine)
+        if not waits:
+            car[IDLE] += ONE
+    else:
+        car[IDLE] = ZERO
+    if crashed:
+        return 1
+    if car[IDLE] >= F(constants.patience):
+        return 2
+    if car[DISTANCE] >= target:
+        return 3
+    if car[STEPS] >= max_steps:
+        return 4
+    return 0
