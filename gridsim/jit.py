@@ -21,9 +21,21 @@ import numpy as np
 from numba.core.caching import FunctionCache, UserProvidedCacheLocator
 
 from gridsim.cache import cache_folder
+from gridsim.errors import GridSimError
+from gridsim.packages import package_folder
 
 # Packages that may contain kernels. All their files enter the digest, so that no list of files has to be maintained.
 KERNEL_PACKAGES = ("gridsim", "evolution")
+
+
+def _sources() -> list[Path]:
+    """Folders of the packages that may contain kernels. Ray unpacks each package into a folder of its own."""
+    own = Path(__file__).parent
+    try:
+        evolution = package_folder("evolution")
+    except GridSimError:  # The simulator also works beside a user's file of that name, with the same kernels.
+        evolution = own.parent / "evolution"
+    return [own] if evolution is None else [own, evolution]
 
 
 def kernel_digest() -> str:
@@ -32,8 +44,7 @@ def kernel_digest() -> str:
     for name in ("numba", "llvmlite", "numpy"):
         digest.update(f"{name}=={version(name)}\n".encode())
     digest.update(platform.python_version().encode())
-    for package in KERNEL_PACKAGES:
-        folder = Path(__file__).parents[1] / package
+    for folder in _sources():
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

@@ -11,11 +11,23 @@ from gridsim.errors import GridSimError
 _FILES = {"cluster": "api.py", "evolution": "episodes/rollout.py"}
 
 
+def package_folder(name: str) -> Path | None:
+    """The folder of GridSim's package `cluster` or `evolution`, which is not imported; None where there is none.
+
+    Raises: GridSimError, which names what hides it.
+    """
+    spec = find_spec(name)
+    if spec is None:
+        return None
+    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    for folder in folders:
+        if (folder / _FILES[name]).is_file():
+            return folder
+    hiding = Path(spec.origin) if spec.origin and not folders else folders[0]
+    raise GridSimError(f"{hiding} hides GridSim's package {name}: rename it, or move it to another folder")
+
+
 def check_packages() -> None:
-    """Raise GridSimError if a user's file or folder hides one of GridSim's packages. They are not imported."""
-    for name, file in _FILES.items():
-        spec = find_spec(name)
-        folders = [Path(folder) for folder in spec.submodule_search_locations or ()] if spec else []
-        if spec and not any((folder / file).is_file() for folder in folders):
-            hiding = Path(spec.origin) if spec.origin and not folders else folders[0]
-            raise GridSimError(f"{hiding} hides GridSim's package {name}: rename it, or move it to another folder")
+    """Raise GridSimError if a user's file or folder hides one of GridSim's packages."""
+    for name in _FILES:
+        package_folder(name)
