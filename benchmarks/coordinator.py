@@ -37,11 +37,11 @@ from evolution.search import fitness
 from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed, noise_sum
 from evolution.search.recombination import Recombination
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import FIELDS
+from gridsim.state import TRAFFIC_FIELDS as FIELDS
+from gridsim.state import End
 
 POLICY = "mlp:6,7"  # 311 genes
 CHILDREN = 100_000  # members that the coordinator alone is timed with

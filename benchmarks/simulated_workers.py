@@ -26,7 +26,7 @@ from cluster.workers.worker import Task
 from evolution.episodes.rollout import EPISODE, RESULT
 from evolution.search.breeding import RECIPE, Mutation
 from gridsim.config import SimConfig
-from gridsim.traffic.world import FIELDS
+from gridsim.state import TRAFFIC_FIELDS as FIELDS
 
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000)
 POPULATION = 10_000

@@ -42,10 +42,10 @@ from evolution.episodes.starts import lane_starts
 from evolution.networks.policy import PolicySpec, decide, encode, pack, scratch_size
 from evolution.search.base import recipes as some_recipes
 from evolution.search.breeding import Kind, Mutation, breed
-from gridsim.car.ego import DISTANCE
 from gridsim.jit import njit
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
+from gridsim.state import DISTANCE
 
 MAPS = 8
 EPISODES = 16  # of the rollout, over all maps

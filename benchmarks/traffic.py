@@ -31,16 +31,18 @@ import time
 
 import numpy as np
 
-from gridsim.car.ego import FIELDS, collides
+from gridsim.car.collision import boxes_touch, collides
 from gridsim.config import SimConfig, constants
 from gridsim.jit import njit
 from gridsim.maps.map import sample_starts
 from gridsim.maps.network import Network, wrapped
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.sensing.boxes import boxes_touch
-from gridsim.traffic.behaviour import drivers, flow
+from gridsim.state import CAR_FIELDS as FIELDS
+from gridsim.state import COS, LANE, SIN, SPEED, X, Y
+from gridsim.traffic.behaviour import drivers
+from gridsim.traffic.behaviour import step_traffic as flow
 from gridsim.traffic.encounters import touches_ego
-from gridsim.traffic.world import COS, LANE, SIN, SPEED, X, Y, spawn
+from gridsim.traffic.world import spawn
 
 CARS = 6  # where the scenario's default is none
 CARS_AROUND, SECONDS_AROUND = 24, 120.0  # an ego car that stands

@@ -51,7 +51,7 @@ from cluster.workers.address import cluster_address
 from evolution.networks.policy import PolicySpec
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import is_map_file, label
-from gridsim.reference.errors import errors
+from gridsim.reference import errors
 
 
 @dataclass(frozen=True)

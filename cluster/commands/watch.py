@@ -28,11 +28,11 @@ from cluster.store.champion import Champion, UnfinishedError, load_champion
 from cluster.store.checkpoint import CHAMPION, CheckpointError
 from cluster.store.folder import CHECKPOINT, CONFIG, RunError, read_config
 from cluster.store.steps import read_elites
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.map import Map, sample_starts
 from gridsim.maps.scenarios import build, check_name, default_traffic, is_map_file, label
+from gridsim.state import End
 from gridsim.traffic.world import spawn
 from gridsim.view.drive import Recorder, drive, read_drive, replay
 from gridsim.view.render import NoDisplayError, Renderer, Window

@@ -23,8 +23,8 @@ from evolution.networks.policy import PolicySpec
 from gridsim.config import VehicleConfig
 from gridsim.errors import GridSimError
 from gridsim.maps.scenarios import HELD_OUT_SEED
-from gridsim.reference.errors import Series, error_series, errors
-from gridsim.view.drive import poses_of
+from gridsim.reference import Series, error_series, errors
+from gridsim.state import poses_of
 
 Learner = Literal["evolution", "two-parents", "dqn", "random"]
 LEARNERS: tuple[Learner, ...] = get_args(Learner)
@@ -37,7 +37,7 @@ ERROR_FIGURES = {
     "steering_error_max_deg": "steering_max_deg",
     "compared_m": "metres",
 }
-"""A champion's errors against the reference, by their names in `gridsim.reference.errors.errors`."""
+"""A champion's errors against the reference, by their names in `gridsim.reference.errors`."""
 RUN_FIGURES = (
     "success_rate", "distance_m", "speed_mps", "collision_rate", "car_steps", "wall_s", "training_s", "best_car_steps",
     "best_wall_s",
@@ -81,7 +81,7 @@ def measured(run: Run) -> Run:
 
 
 def series(champion: Champion, scenario: str, episodes: int, seed: int, traffic: int) -> list[Series]:
-    """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference.errors`.
+    """A champion beside the reference along each route, in the order of the episodes; see `gridsim.reference`.
 
     Episodes in which it does not drive a metre forward are left out.
 

@@ -16,10 +16,9 @@ from cluster.store.champion import Champion
 from cluster.store.checkpoint import WriteError
 from evolution.episodes.rollout import trajectory
 from evolution.networks.policy import MlpSpec, PolicySpec, outputs_of
-from gridsim.car.ego import DISTANCE, SPEED, STEERING, End, X, Y
-from gridsim.envs.simulator import views
 from gridsim.maps.map import Map
-from gridsim.traffic.world import LANE
+from gridsim.simulator import views
+from gridsim.state import DISTANCE, LANE, SPEED, STEERING, End, X, Y
 from gridsim.view.render import Renderer, interpolate
 
 CODING = {
@@ -39,7 +38,7 @@ class Recording:
     """A drive, state by state, from its start on."""
 
     scenario: Map
-    cars: np.ndarray  # float32 [steps + 1, FIELDS], the car's states (`gridsim.car.ego`)
+    cars: np.ndarray  # float32 [steps + 1, FIELDS], the car's states (`gridsim.state`)
     ranges: np.ndarray  # float32 [steps + 1, rays], the lengths of its rays, m
     boxes: np.ndarray  # float32 [steps + 1, others, 4 or more], other cars: x, y (m), heading (cosine, sine)
     end: End  # how it ended; RUNNING if only the recording did

@@ -22,11 +22,12 @@ import numpy as np
 from cluster.report.film import Recording
 from cluster.report.pictures import bounds, plain_style
 from cluster.store.checkpoint import write_atomic
-from gridsim.car.ego import DISTANCE, SPEED
 from gridsim.car.vehicle import Action
 from gridsim.config import SimConfig, constants
+from gridsim.jit import freeze
 from gridsim.maps.map import Map
-from gridsim.maps.roads import clearances, freeze
+from gridsim.maps.roads import clearances
+from gridsim.state import DISTANCE, SPEED
 from gridsim.view.marks import lane_marks
 
 TURN = 1 << 16

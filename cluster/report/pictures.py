@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from gridsim.car.ego import SPEED, X, Y
 from gridsim.maps.map import Map
 from gridsim.maps.roads import node_clearance
+from gridsim.state import SPEED, X, Y
 
 _BEST, _MEAN, _OTHER = "#0b7285", "#868e96", "#f08c00"
 _ROAD, _WALL = "#4a4e57", "#e9efe6"

@@ -12,9 +12,9 @@ from cluster.report import film, page, pictures
 from cluster.store.champion import Champion
 from cluster.store.folder import CURVES, PAGE, TRAJECTORY, RunFolder
 from evolution.episodes.starts import Episodes
-from gridsim.car.ego import DISTANCE
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import is_map_file, label
+from gridsim.state import DISTANCE
 
 ELITES_SHOWN = 24  # on the page beside the champion, at most; most of them early ones, which show the learning
 

@@ -26,11 +26,11 @@ from evolution.networks.policy import Observation, PolicySpec
 from evolution.search.base import recipes
 from evolution.search.breeding import Kind, Mutation
 from gridsim.config import SimConfig
-from gridsim.envs.simulator import views
-from gridsim.jit import CACHE_FOLDER, CONFIG
+from gridsim.jit import CACHE_FOLDER, CONFIG, freeze
 from gridsim.maps.map import Map, blank, sample_starts
-from gridsim.maps.roads import clearances, freeze
+from gridsim.maps.roads import clearances
 from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
+from gridsim.simulator import views
 from gridsim.traffic.world import spawn
 
 LOOK_S = 0.1

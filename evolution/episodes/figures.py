@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridsim.car.ego import End
+from gridsim.state import End
 
 
 def summarise(results: np.ndarray, period_s: float) -> dict[str, float]:

@@ -16,10 +16,10 @@ from cluster.store.folder import RunFolder
 from evolution.episodes.rollout import trajectory
 from evolution.networks import convnet
 from evolution.networks.policy import PolicySpec
-from gridsim.car.ego import STEERING
 from gridsim.errors import GridSimError
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.state import STEERING
 
 SMALL = EvolveSettings(scenario="curved", population=32, generations=2, seed=3)
 ON_THE_GRID = dataclasses.replace(SMALL, observation="grid", policy="cnn:8,8,8@2", population=24)

@@ -13,9 +13,8 @@ from cluster.compare.results import series
 from cluster.store.champion import load_champion
 from gridsim.config import VehicleConfig
 from gridsim.maps.scenarios import HELD_OUT_SEED, REGISTRY, build
-from gridsim.reference.errors import Series, error_series
-from gridsim.reference.errors import errors as errors_of
-from gridsim.reference.profile import BRAKING, LATERAL, top_speed
+from gridsim.reference import BRAKING, LATERAL, Series, error_series, top_speed
+from gridsim.reference import errors as errors_of
 
 TOP = top_speed(REGISTRY["seamless"].speed_interval)
 CAR = VehicleConfig()

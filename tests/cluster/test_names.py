@@ -21,7 +21,7 @@ from cluster.commands.compare import compare_main
 from cluster.commands.watch import watch_main
 from cluster.compare import results
 from cluster.report import pictures
-from gridsim.car.ego import FIELDS
+from gridsim.state import CAR_FIELDS as FIELDS
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
 ODD = "a  b ?#%;&'\"[b] $x (c)"

@@ -16,11 +16,12 @@ from cluster.report import pictures
 from cluster.report.film import record
 from cluster.report.page import Shown, write_page
 from cluster.store.champion import load_champion
-from gridsim.car.ego import COS, DISTANCE, FIELDS, SIN, SPEED, STEERING, X, Y
 from gridsim.car.vehicle import act
 from gridsim.config import constants
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.state import CAR_FIELDS as FIELDS
+from gridsim.state import COS, DISTANCE, SIN, SPEED, STEERING, X, Y
 from gridsim.traffic.world import spawn
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion_traffic.npz"

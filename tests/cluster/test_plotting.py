@@ -12,7 +12,7 @@ from pictures import small_map
 from cluster.compare import picture
 from cluster.compare.tables import group
 from cluster.report import page, pictures
-from gridsim.car.ego import FIELDS
+from gridsim.state import CAR_FIELDS as FIELDS
 
 
 @pytest.mark.e2e

@@ -35,7 +35,7 @@ from evolution.search.breeding import RECIPE, Kind, Mutation, _breed
 from gridsim.config import SimConfig
 from gridsim.maps.map import Map
 from gridsim.maps.scenarios import build
-from gridsim.traffic.world import FIELDS
+from gridsim.state import TRAFFIC_FIELDS as FIELDS
 
 MAPS = (("seamless", 0), ("seamless", 1))
 GROUPS = [Chunk(slice(64 * g, 64 * g + 64), slice(2 * g, 2 * g + 2)) for g in range(8)]

@@ -17,9 +17,9 @@ from evolution.episodes.starts import Episodes
 from evolution.networks.policy import PolicySpec
 from evolution.search.recombination import Recombination
 from evolution.search.two_parents import TwoParents
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
-from gridsim.traffic.world import FIELDS, LANE
+from gridsim.state import LANE, End
+from gridsim.state import TRAFFIC_FIELDS as FIELDS
 
 SETTINGS = EvolveSettings(traffic=3, population=32, generations=3, policy="mlp:6,7", seed=9)
 TWO = dataclasses.replace(SETTINGS, recombination="two", sigma=0.5, elites=2)

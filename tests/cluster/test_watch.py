@@ -25,10 +25,10 @@ from cluster.store.champion import load_champion
 from cluster.store.folder import RunFolder
 from cluster.store.steps import Steps, read_elites
 from evolution.networks.policy import PolicySpec
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps.map import sample_starts
 from gridsim.maps.scenarios import build
+from gridsim.state import End
 from gridsim.view.render import Renderer
 
 CHAMPION = Path(__file__).parents[2] / "benchmarks/champion.npz"
