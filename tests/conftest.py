@@ -95,7 +95,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sync, "SYNC_S", 0.05)
     monkeypatch.setattr(sync, "RETRY_S", 0.1)
     monkeypatch.setattr(sync, "LAST_RETRY_S", 0.1)
-    monkeypatch.setattr(address, "PROBE_S", 0.3)
+    monkeypatch.setattr(address, "PROBE_S", 1.0)
 
 
 @pytest.fixture(scope="session")

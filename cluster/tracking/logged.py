@@ -74,9 +74,10 @@ class LoggedRun:
         """Send what MLflow lacks; what fails does not hold up the rest. Returns: the last failure, in one line."""
         error = None
         try:
+            link = {} if self.run_id else self._identify(content)
             self._check_reachable()
-            if not self.run_id:
-                self._open(content)
+            if link:
+                self._open(content, link)
             for part in (self._send_rows, self._send_files, self._send_model, self._end):
                 try:
                     part(content, status)
@@ -92,16 +93,21 @@ class LoggedRun:
         if problem := unreachable(self._uri):
             raise TrackingError(problem)
 
-    def _open(self, content: Content) -> None:
-        """Find the run or create it; mlflow.json is written first, so that a killed run finds it again."""
-        from mlflow.tracking import MlflowClient
-
-        link, uri = read_link(self._folder), self._uri
-        if link.get("uri") != redacted(uri):
-            link |= {"uri": redacted(uri), "experiment": self._experiment or EXPERIMENT, "run_id": ""}
+    def _identify(self, content: Content) -> dict[str, Any]:
+        """Write and return mlflow.json, by which a run is found again that was killed, or had no server."""
+        link = read_link(self._folder)
+        if link.get("uri") != redacted(self._uri):
+            link |= {"uri": redacted(self._uri), "experiment": self._experiment or EXPERIMENT, "run_id": ""}
         link.setdefault("key", uuid.uuid4().hex)
         link.setdefault("started", time.time() - content.wall_s)
         _write_link(self._folder, link)
+        return link
+
+    def _open(self, content: Content, link: dict[str, Any]) -> None:
+        """Find the run or create it, and ask what MLflow has of it."""
+        from mlflow.tracking import MlflowClient
+
+        uri = self._uri
         path, name = sqlite_path(uri), self._experiment or link["experiment"]
         if path and not path.exists():
             create_database(path)

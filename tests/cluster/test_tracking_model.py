@@ -1,157 +1,104 @@
-"""The champion as a torch model: written without pickle, read back by MLflow, registered once."""
-
-import contextlib
-import dataclasses
-import os
-import subprocess
+"""The champion in MLflow's registry: an ONNX model that MLflow loads without GridSim, registered once."""
 
 import numpy as np
 import pytest
-from commands import finish
-from tracked import client, steps, tracker
+from tracked import MODEL, client, runs, send, tracking, write_run
 
-from cluster.settings import EvolveSettings
-from cluster.store.champion import Champion
-from cluster.tracking.description import torch_model
-from cluster.tracking.mlflow_run import write_model
+from cluster.store.champion import load_champion
+from cluster.tracking.address import check_uri
+from cluster.tracking.description import read_run
+from cluster.tracking.sync import sync
 from evolution.networks.export import example
 from evolution.networks.policy import PolicySpec
 from gridsim.config import SimConfig
 
-torch = pytest.importorskip("torch")
-# Of torch's and MLflow's own making; what users see is held against silence in fresh processes.
-pytestmark = pytest.mark.filterwarnings("ignore")
-
-HELD_OUT = {"episodes": 64, "success_rate": 0.5, "distance_m": 1000.0, "speed_mps": 7.0, "collision_rate": 0.5}
-NAME = "gridsim-curved-evolution"
-
-
-def champion_model(seed=1, success_rate=0.5, policy="mlp:6,7"):
-    genome = 0.3 * np.random.default_rng(seed).standard_normal(PolicySpec.parse(policy).size).astype(np.float32)
-    settings = EvolveSettings("curved", seed=seed)
-    held_out = HELD_OUT | {"success_rate": success_rate}
-    return torch_model(Champion(genome, policy, "curved", SimConfig()), settings, held_out)
-
 
 @pytest.mark.e2e
+@pytest.mark.filterwarnings("ignore")  # of MLflow's and its libraries' own making
 @pytest.mark.parametrize("policy", ["mlp:6,7+motion+steering", "cnn:8,8,8@2"])
-def test_what_is_written_is_the_module(tmp_path, policy, monkeypatch):
-    import mlflow.pytorch
-    from mlflow.models import Model
+def test_mlflow_loads_the_champion(uri, tmp_path, policy, monkeypatch):
+    import mlflow
 
     monkeypatch.setenv("MLFLOW_ALLOW_PICKLE_DESERIALIZATION", "false")
-    folder, inputs = tmp_path / "model", PolicySpec.parse(policy).inputs
-    model = champion_model(policy=policy)
-    module, _ = model.build()
-    write_model(folder, model)
-    assert os.listdir(tmp_path) == ["model"]
-
-    loaded = mlflow.pytorch.load_model(str(folder))
-    for n in (1, 2, 7):
-        x = torch.rand((n, inputs), generator=torch.Generator().manual_seed(n))
-        assert torch.allclose(loaded(x), module(x), atol=1e-5)
-    about = Model.load(str(folder))
-    assert about.signature.inputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, inputs)}
+    spec = PolicySpec.parse(policy)
+    folder = write_run(tmp_path / "a", 1, success_rate=0.5, policy=policy, observation=spec.observation)
+    _, run_id = send(folder, uri)
+    mlflow.set_tracking_uri(uri)
+    champion, shown = load_champion(folder), example(spec, SimConfig())
+    for address in (f"models:/{MODEL}@best", f"runs:/{run_id}/model"):
+        loaded = mlflow.pyfunc.load_model(address)
+        outputs = loaded.predict(shown)["outputs"]
+        assert outputs.shape == (2, 8)
+        if spec.observation == "rays":
+            assert (outputs.argmax(axis=1) == champion.act(shown)).all()
+        assert np.array_equal(loaded.predict({"observation": shown})["outputs"], outputs)
+    about = loaded.metadata
+    assert about.signature.inputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, spec.inputs)}
     assert about.signature.outputs.to_dict()[0]["tensor-spec"] == {"dtype": "float32", "shape": (-1, 8)}
-    shown = np.asarray(about.load_input_example(str(folder)), dtype=np.float32)
-    assert shown == pytest.approx(example(PolicySpec.parse(policy), SimConfig()))
-
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    assert files >= {"MLmodel", "data/model.pt2", "requirements.txt", "input_example.json"}
-    assert not [name for name in files if "pickle" in name or name.endswith((".pth", ".pkl"))]
-    assert "cloudpickle" not in (folder / "requirements.txt").read_text()
-
-
-def logged(uri, folder, model, key="the-key"):
-    """A run that logs a row and a champion; returns its id."""
-    begun = tracker(uri, 1, key=key)
-    begun.log_model(folder, model)
-    assert begun.close("FINISHED", timeout_s=120) is None
-    return begun.run_id
+    assert about.metadata["champion_sha256"] == champion.sha256
+    assert np.array_equal(loaded.input_example["observation"], shown)
+    stored = tmp_path / "store/mlartifacts" / run_id / "artifacts/model"
+    needed = [line.partition("==")[0] for line in (stored / "requirements.txt").read_text().splitlines()]
+    assert needed == ["mlflow", "onnx", "onnxruntime"]
+    assert (stored / "model.onnx").read_bytes() == (folder / "champion.onnx").read_bytes()
 
 
 def test_a_champion_is_registered_once_and_the_best_has_an_alias(uri, tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    run_id = logged(uri, folder, champion_model(1))
-    (version,) = client(uri).search_model_versions(f"name = '{NAME}'")
+    folder = write_run(tmp_path / "a", 1, success_rate=0.5, seed=1)
+    _, run_id = send(folder, uri)
+    (version,) = client(uri).search_model_versions(f"name = '{MODEL}'")
     assert version.run_id == run_id
-    stored = tmp_path / "store/mlartifacts" / run_id / "artifacts"
-    assert version.source == (stored / "model").as_uri()
-    assert version.tags.items() >= {"seed": "1", "policy": "mlp:6,7", "held_out/success_rate": "0.5"}.items()
-    assert version.tags["champion_sha256"] == champion_model(1).champion_sha256
+    assert version.source == (tmp_path / "store/mlartifacts" / run_id / "artifacts/model").as_uri()
+    tags = {"seed": "1", "policy": "mlp:64+steering", "held_out/success_rate": "0.5"}
+    assert version.tags.items() >= {**tags, "champion_sha256": load_champion(folder).sha256}.items()
     assert "seed 1" in version.description
-    for path in ("model/MLmodel", "model/data/model.pt2"):
-        assert (stored / path).read_bytes() == (folder / path).read_bytes()
 
-    before = (folder / "model/data/model.pt2").stat().st_mtime_ns
-    assert logged(uri, folder, champion_model(1)) == run_id  # a killed run goes on, and ends again
-    assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
-    assert (folder / "model/data/model.pt2").stat().st_mtime_ns == before
-    assert client(uri).get_model_version_by_alias(NAME, "best").version == 1
-    assert logged(uri, folder, champion_model(2, 0.75)) == run_id  # it was extended, and has a better champion
-    assert {v.version for v in client(uri).search_model_versions(f"name = '{NAME}'")} == {1, 2}
-    assert (folder / "model/data/model.pt2").stat().st_mtime_ns != before
-    assert champion_model(2).champion_sha256 in (stored / "model/MLmodel").read_text()
-    logged(uri, tmp_path, champion_model(3, 0.75), key="another")  # no better
-    assert client(uri).get_model_version_by_alias(NAME, "best").version == 2
+    def ended(name, seed, success_rate):
+        """The run goes on, and ends again."""
+        run = tracking(write_run(tmp_path / name, 1, seed=seed), uri)
+        assert run.wait_id(30)
+        write_run(tmp_path / name, 1, success_rate, seed=seed)
+        assert run.close("FINISHED") is None
+        return run.sent["model"]
 
+    def best():
+        return client(uri).get_model_version_by_alias(MODEL, "best").version
 
-def test_without_torch_everything_else_is_logged(uri, tmp_path):
-    def build():
-        raise ModuleNotFoundError("No module named 'torch'")
-
-    begun = tracker(uri, 1)
-    begun.log_model(tmp_path, dataclasses.replace(champion_model(), build=build))
-    (tmp_path / "a.png").write_bytes(b"png")
-    begun.log_files([tmp_path / "a.png"])
-    assert begun.close("FINISHED") == f"not logged to MLflow at {uri}: the model: No module named 'torch'"
-    assert steps(uri, begun.run_id) == [0]
-    assert client(uri).get_run(begun.run_id).info.status == "FINISHED"
-    assert [each.path for each in client(uri).list_artifacts(begun.run_id)] == ["a.png"]
+    assert ended("a", 1, 0.5) == 0  # the same champion
+    assert best() == 1
+    assert ended("a", 2, 0.75) == 1  # a better one
+    assert best() == 2
+    assert ended("another", 3, 0.75) == 1  # no better
+    assert best() == 2
+    assert {each.version for each in client(uri).search_model_versions(f"name = '{MODEL}'")} == {1, 2, 3}
 
 
 def test_a_run_that_is_stopped_registers_nothing(uri, tmp_path):
-    begun = tracker(uri)
-    begun.wait_ready()
-    begun.log_model(tmp_path, champion_model(1))
-    assert begun.close("KILLED", timeout_s=120) is None
+    assert tracking(write_run(tmp_path / "a", 1), uri).close("KILLED") is None
     assert client(uri).search_model_versions() == []
+    assert read_run(tmp_path / "a").files == []
 
 
 def test_a_registry_that_is_elsewhere_and_away_is_named(uri, tmp_path, monkeypatch, impatient):
+    folder = write_run(tmp_path / "a", 1, success_rate=0.5)
     monkeypatch.setenv("MLFLOW_REGISTRY_URI", "http://someone:secret@127.0.0.1:1")
-    run_id = None
-    for _ in range(2):  # a run, and the command that sends what is missing
-        begun = tracker(uri, 1)
-        begun.log_model(tmp_path, champion_model())
-        said = begun.close("FINISHED", timeout_s=120)
-        assert said == (
+    for expected in ("2 rows, 6 files", ""):  # a run, and the command that sends what is missing
+        assert sync(folder, uri, "driving", read_run) == (
+            expected,
             f"not logged to MLflow at {uri}: the registration of the model, whose files are stored: "
-            "the registry http://127.0.0.1:1 (MLFLOW_REGISTRY_URI): Connection refused"
+            "the registry http://127.0.0.1:1 (MLFLOW_REGISTRY_URI): Connection refused",
         )
-        assert run_id in (None, begun.run_id)
-        run_id = begun.run_id
-    assert {each.path for each in client(uri).list_artifacts(run_id, "model")} >= {"model/MLmodel"}
-    monkeypatch.delenv("MLFLOW_REGISTRY_URI")
-    assert logged(uri, tmp_path, champion_model()) == run_id
-    assert len(client(uri).search_model_versions(f"name = '{NAME}'")) == 1
+    (run,) = runs(uri)
+    assert {each.path for each in client(uri).list_artifacts(run.info.run_id, "model")} >= {"model/MLmodel"}
+    other = check_uri(f"sqlite:///{tmp_path}/registry.db")
+    send(write_run(tmp_path / "b", 1), other)
+    monkeypatch.setenv("MLFLOW_REGISTRY_URI", other)
+    assert send(folder, uri) == ("1 model", run.info.run_id)
+    assert client(uri).get_model_version_by_alias(MODEL, "best").run_id == run.info.run_id
 
 
-@pytest.mark.e2e
-@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small file system")
-def test_a_full_temporary_folder_costs_the_model_only_which_is_sent_later(tmp_path, database):
-    (tmp_path / "small").mkdir()
-    flags = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--generations", "2", "--workers", "0")
-    with contextlib.ExitStack() as stack:
-        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=32k", "small", tmp_path / "small"], check=True)
-        stack.callback(subprocess.run, ["umount", "-l", tmp_path / "small"], check=True)
-        done = finish("gridsim-evolve", *flags, "--name", "a", cwd=tmp_path, TMPDIR=str(tmp_path / "small"))
-        full = f"the temporary folder, {tmp_path}/small, has no 3 MB left: No space left on device"
-        assert f"the model: {full}; make room, or set TMPDIR; send it later with: " in done.stderr
-        assert done.stderr.count("\n") == 1
-        run = tmp_path / "runs/a"
-        assert {"summary.json", "drive.html", "curves.png", "trajectory.png"} <= {path.name for path in run.iterdir()}
-    again = finish("gridsim-evolve", "--resume", "runs/a", cwd=tmp_path)
-    assert again.stderr == ""
-    assert "sent to MLflow: 1 model" in again.stdout
+def test_without_room_for_temporary_files_everything_else_is_sent(uri, tmp_path, monkeypatch, impatient):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "no such folder"))
+    sent, report = sync(write_run(tmp_path / "a", 1, success_rate=0.5), uri, "driving", read_run)
+    assert sent == "2 rows, 6 files"
+    assert report == f"not logged to MLflow at {uri}: the model: No such file or directory"

@@ -1,21 +1,21 @@
 """No secret of a tracking address is printed, written or sent, and none is lost to a run that is resumed."""
 
 import io
+import json
 import re
 import shlex
 import zipfile
 
 import pytest
-from commands import finish, refused, summary
+from commands import finish
 from hypothesis import given
 from hypothesis import strategies as st
-from tracked import client, free_port, mlflow_server, tracker
+from tracked import PYTHONPATH, client, free_port, mlflow_server, write_run
 
-from cluster.commands.cli import evolve_main
 from cluster.redaction import one_line, redacted
 from cluster.tracking.address import TrackingError, check_uri
-
-TINY = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--generations", "2", "--workers", "0")
+from cluster.tracking.description import read_run
+from cluster.tracking.sync import Tracking, saved_uri, sync
 
 
 @pytest.mark.parametrize(
@@ -85,18 +85,26 @@ def test_a_database_on_a_unix_socket_is_not_looked_for_on_a_port():
     assert check_uri(uri) == uri
 
 
-def test_what_a_run_prints_at_its_end_is_quoted_and_has_no_password():
-    where = tracker("postgresql://u:secret@db/ml flow").where("mlflow")
-    assert where == (
+def test_what_a_run_prints_at_its_end_is_quoted_and_has_no_password(tmp_path):
+    def where(uri):
+        return Tracking(tmp_path, uri, "", read_run).where("mlflow")
+
+    assert where("postgresql://u:secret@db/ml flow") == (
         "MLFLOW_DISABLE_TELEMETRY=true mlflow ui --backend-store-uri 'postgresql://db/ml flow'"
         " (add its user and password, which are not shown)"
     )
-    assert shlex.split(tracker("sqlite:////a b/it's/mlflow.db").where("mlflow"))[-1] == "sqlite:////a b/it's/mlflow.db"
+    assert shlex.split(where("sqlite:////a b/it's/mlflow.db"))[-1] == "sqlite:////a b/it's/mlflow.db"
 
 
-def test_files_hold_no_secret_and_a_resumed_run_finds_it_again(tmp_path, monkeypatch):
-    whole = "postgresql://u:se/cr@et@h/db?sslkey=/my/secret&sslmode=require"
-    saved = redacted(whole)
+def test_the_folder_holds_no_secret_and_a_resumed_run_finds_it_again(tmp_path, monkeypatch):
+    whole = "postgresql://u:se/cr@et@127.0.0.1:1/db?sslkey=/my/secret&sslmode=require"
+    run = Tracking(write_run(tmp_path / "a", 1), whole, "", read_run)
+    run.start()
+    said = run.close("KILLED")
+    saved = saved_uri(tmp_path / "a")
+    assert saved == redacted(whole) == "postgresql://127.0.0.1:1/db?sslmode=require"
+    assert said.startswith(f"not logged to MLflow at {saved}: 1 row (step 0), the status KILLED: ")
+    assert not re.search("cret|se/", said + (tmp_path / "a/mlflow.json").read_text())
     assert check_uri(begun_with=saved) == saved
     monkeypatch.setenv("MLFLOW_TRACKING_URI", whole)
     assert check_uri(begun_with=saved) == whole
@@ -108,11 +116,13 @@ def test_files_hold_no_secret_and_a_resumed_run_finds_it_again(tmp_path, monkeyp
      "u:cret@127.0.0.1/db", "ftp://u:cret@h", "sqlite://u:cret@/x.db", "sqlite:////no/folder/x.db?key=cret",
      "http://127.0.0.1:1/?token=cret"],
 )  # fmt: skip
-def test_an_address_that_is_refused_is_shown_without_its_secret(uri, tmp_path, monkeypatch, capsys):
+def test_an_address_that_is_refused_is_shown_without_its_secret(uri, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    said = "\n".join(refused(evolve_main, monkeypatch, capsys, "--tracking-uri", uri))
-    assert "cret" not in said.replace("secret", "")
-    assert "se/" not in said
+    with pytest.raises(TrackingError) as caught:
+        check_uri(uri)
+    _, lacking = sync(write_run(tmp_path / "a", 1), uri, "", read_run)
+    assert lacking == f"could not upload to MLflow: {caught.value}"
+    assert not re.search("cret|se/|\n", lacking.replace("secret", ""))
 
 
 def everything(folder):
@@ -125,22 +135,31 @@ def everything(folder):
                     yield from ((f"{path}:{name}", archive.read(name)) for name in archive.namelist())
 
 
+RUN = """
+import sys
+from pathlib import Path
+from cluster.tracking.address import check_uri
+from tracked import read_run, send, tracking, write_run
+run = tracking(write_run(Path("a"), 2), check_uri())
+print(run.wait_id(60))
+write_run(Path("a"), 3, success_rate=0.5)
+print(run.close("FINISHED"), run.where("mlflow"), run.error)
+(Path("a") / "trajectory.png").write_bytes(b"png")
+print(send(Path("a"), ""))
+"""
+
+
 @pytest.mark.e2e
-def test_a_secret_is_in_nothing_that_a_run_prints_writes_or_sends(tmp_path):
+def test_a_secret_is_in_nothing_that_is_printed_written_or_sent(tmp_path):
     secret, port = "hunter2", free_port()
     address = f"http://someone:p%40{secret}@127.0.0.1:{port}"
     with mlflow_server(tmp_path, port):
-        done = finish("gridsim-evolve", *TINY, "--name", "a", cwd=tmp_path, MLFLOW_TRACKING_URI=address)
-        again = finish("gridsim-evolve", "--resume", "runs/a", cwd=tmp_path, MLFLOW_TRACKING_URI=address)
-        compared = ("--scenarios", "curved", "--learners", "evolution", "--seeds", "1", "--budget", "10k")
-        more = finish(
-            "gridsim-compare", *compared, "--workers", "0", "--population", "16", "--generations", "1", "--traffic",
-            "0", "--name", "c", "--tracking-uri", address, cwd=tmp_path,
-        )  # fmt: skip
-        run = client(f"http://127.0.0.1:{port}").get_run(summary(tmp_path / "runs/a")["mlflow_run_id"])
-        assert run.info.status == "FINISHED"
-        assert f"http://127.0.0.1:{port}/#/experiments/" in done.stdout
-    assert secret not in done.stdout + done.stderr + again.stdout + again.stderr + more.stdout + more.stderr
+        done = finish("python", "-c", RUN, cwd=tmp_path, MLFLOW_TRACKING_URI=address, PYTHONPATH=PYTHONPATH)
+        run_id = json.loads((tmp_path / "a/mlflow.json").read_text())["run_id"]
+        assert client(f"http://127.0.0.1:{port}").get_run(run_id).info.status == "FINISHED"
+    assert f"None http://127.0.0.1:{port}/#/experiments/" in done.stdout
+    assert "('1 file', " in done.stdout
+    assert secret not in done.stdout + done.stderr
     checked = list(everything(tmp_path))  # the server's database and artifacts, too
-    assert len([name for name, _ in checked if "served/" in str(name)]) > 30
+    assert len([name for name, _ in checked if "served/" in str(name)]) > 10
     assert [name for name, content in checked if secret.encode() in content] == []

@@ -1,31 +1,27 @@
-"""Whole runs on an MLflow server that is killed under them: none is lost, slowed or doubled, and all of it gets there.
-
-Two runs of one seed. `during` goes on while the server is away, and has it back before its end; `after` ends without
-it, and is sent later.
-"""
+"""Runs on an MLflow server that goes away before, while and after they train: all of each gets there, once."""
 
 import contextlib
-import json
-import os
-import re
 import shutil
-import signal
 import sqlite3
-from types import SimpleNamespace
 
 import pytest
-from commands import finish, rows, running, summary, wait_until
-from tracked import client, free_port, mlflow_server
+from commands import wait_until
+from tracked import HELD_OUT, MODEL, NAMES, client, free_port, mlflow_server, row, send, steps, tracking, write_run
 
-from cluster.run import send_missing
-from cluster.store.folder import open_run
+from cluster.tracking.description import read_run
+from cluster.tracking.sync import sync
 
 pytestmark = pytest.mark.e2e
 
-GENERATIONS = 12
-SMALL = ["--scenario", "curved", "--traffic", "2", "--population", "48", "--generations", str(GENERATIONS),
-         "--seed", "5", "--until", "2"]  # fmt: skip
-COMMAND = "gridsim-evolve"
+TABLES = ("runs", "metrics", "tags", "params", "model_versions", "registered_model_aliases")
+
+
+@pytest.fixture
+def served(tmp_path, empty_database):
+    """A server's address, and what starts it."""
+    shutil.copy(empty_database, tmp_path / "served.db")
+    port = free_port()
+    return f"http://127.0.0.1:{port}", lambda *flags: mlflow_server(tmp_path, port, *flags)
 
 
 def query(database, text, *arguments):
@@ -33,117 +29,101 @@ def query(database, text, *arguments):
         return connection.execute(text, arguments).fetchall()
 
 
-@pytest.fixture(scope="module")
-def served(tmp_path_factory, empty_database):
-    cwd = tmp_path_factory.mktemp("served")
-    shutil.copy(empty_database, cwd / "served.db")
-    port = free_port()
-    uri = f"http://127.0.0.1:{port}"
-    runs, said = {}, {}
-    begun = "SELECT count(DISTINCT name) FROM metrics JOIN runs USING (run_uuid)"
-    with contextlib.ExitStack() as stack:
-        with mlflow_server(cwd, port):
-            for name in ("during", "after"):
-                asked = (*SMALL, "--workers", "0", "--name", name, "--tracking-uri", uri)
-                runs[name] = stack.enter_context(running(COMMAND, *asked, cwd=cwd))
-            wait_until(lambda: query(cwd / "served.db", begun) == [(2,)], 300)
-        seen = len(rows(cwd / "runs/during"))  # and the server is dead
-        wait_until(lambda: len(rows(cwd / "runs/during")) >= min(seen + 3, GENERATIONS), 300)
-        os.kill(runs["during"].pid, signal.SIGSTOP)
-        said["after"] = runs["after"].communicate(timeout=600)
-        with mlflow_server(cwd, port):
-            os.kill(runs["during"].pid, signal.SIGCONT)
-            said["during"] = runs["during"].communicate(timeout=600)
-            yield SimpleNamespace(cwd=cwd, uri=uri, database=cwd / "served.db", said=said, runs=runs)
-
-
-def check_complete(served, name):
-    """Everything of a run is in MLflow, once."""
-    folder = served.cwd / "runs" / name
-    found = summary(folder)
-    run_id = found["mlflow_run_id"]
-    run = client(served.uri).get_run(run_id)
+def check_complete(uri, folder, count, run_id):
+    """Everything of a finished run of so many steps is in MLflow, once."""
+    run, root = client(uri).get_run(run_id), folder.parent
     assert run.info.status == "FINISHED"
-    assert query(served.database, "SELECT count(*) FROM runs WHERE name LIKE ?", f"{name}%") == [(1,)]
+    assert query(root / "served.db", "SELECT count(*) FROM runs WHERE name = ?", folder.name) == [(1,)]
     doubled = "SELECT key, step FROM metrics WHERE run_uuid = ? GROUP BY key, step HAVING count(*) > 1"
-    assert query(served.database, doubled, run_id) == []
-
-    history = rows(folder)
-    assert len(history) == GENERATIONS
-    for column in set(history[0]) - {"generation", "target_m"}:
-        wanted = {int(row["generation"]): float(row[column]) for row in history}
-        if column == "validation/success_rate":
-            wanted[GENERATIONS] = found["validation_success_rate"]  # with the last candidate, tried after the last step
-        logged = client(served.uri).get_metric_history(run_id, column)
-        assert {metric.step: metric.value for metric in logged} == pytest.approx(wanted)
-        times = {metric.step: metric.timestamp - run.info.start_time for metric in logged if metric.step < GENERATIONS}
-        assert times == pytest.approx({k: 1000.0 * float(row["wall_s"]) for k, row in enumerate(history)}, abs=2.0)
-    assert run.data.metrics["held_out/distance_m"] == found["held_out"]["distance_m"]
-    assert f"**{found['held_out']['success_rate']:.1%}**" in run.data.tags["mlflow.note.content"]
+    assert query(root / "served.db", doubled, run_id) == []
+    assert steps(uri, run_id) == list(range(count))
+    times = {
+        each.step: each.timestamp - run.info.start_time for each in client(uri).get_metric_history(run_id, NAMES[0])
+    }
+    assert times == {step: 1000 * row(step)["wall_s"] for step in range(count)}
+    assert run.data.metrics["held_out/distance_m"] == HELD_OUT["distance_m"]
+    assert "**50.0%**" in run.data.tags["mlflow.note.content"]
     assert f'"runs:/{run_id}/model"' in run.data.tags["mlflow.note.content"]
-
-    stored = served.cwd / "served" / run.info.experiment_id / run_id / "artifacts"
-    files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
-    assert {"drive.html", "curves.png", "trajectory.png", "model/MLmodel"} <= {path.as_posix() for path in files}
-    for path in files:
-        assert (stored / path).read_bytes() == (folder / path).read_bytes()
-    versions = client(served.uri).search_model_versions(f"run_id = '{run_id}'")
-    assert [each.tags["champion_sha256"] for each in versions] == [found["champion_sha256"]]
-    return run
+    stored = root / "served" / run.info.experiment_id / run_id / "artifacts"
+    for path in read_run(folder).files:
+        assert (stored / path.name).read_bytes() == path.read_bytes()
+    assert (stored / "model/model.onnx").read_bytes() == (folder / "champion.onnx").read_bytes()
+    assert [each.run_id for each in client(uri).search_model_versions(f"name = '{MODEL}'")] == [run_id]
 
 
-def away(served):
-    """What a run says while its server is away, if it gets to it."""
-    return rf"{COMMAND}: warning: MLflow at {served.uri} cannot be used: [^\n]* and sends its rows later\n"
+def test_a_server_that_is_away_before_while_and_after_a_run(served, tmp_path, impatient):
+    uri, server = served
+    folder = write_run(tmp_path / "a", 2)
+    run = tracking(folder, uri)
+    wait_until(lambda: run.error == "Connection refused")  # before
+    with server():
+        wait_until(lambda: run.sent["row"] == 2 and run.error is None)
+    write_run(folder, 5)
+    wait_until(lambda: run.error == "Connection refused")  # while it trains
+    with server():
+        wait_until(lambda: run.sent["row"] == 5 and run.error is None)
+    write_run(folder, 7, success_rate=0.5)
+    lacking = "3 rows (step 5 to 7), 6 files, the model, the status FINISHED"
+    assert run.close("FINISHED") == f"not logged to MLflow at {uri}: {lacking}: Connection refused"  # as it ends
+    with server():
+        assert send(folder, "", "") == ("3 rows, 6 files, 1 model", run.run_id)  # and later
+        check_complete(uri, folder, 7, run.run_id)
+        before = [query(tmp_path / "served.db", f"SELECT * FROM {table}") for table in TABLES]
+        assert send(folder, uri) == ("", run.run_id)
+        assert before == [query(tmp_path / "served.db", f"SELECT * FROM {table}") for table in TABLES]
 
 
-def test_a_run_outlives_an_outage_and_loses_nothing(served):
-    _out, err = served.said["during"]
-    assert served.runs["during"].returncode == 0
-    assert re.fullmatch(rf"({away(served)}[^\n]* is back, and has all rows\n)?", err)
-    check_complete(served, "during")
-    assert len({summary(served.cwd / "runs" / name)["champion_sha256"] for name in ("during", "after")}) == 1
+def test_a_run_that_ended_without_its_server(served, tmp_path, impatient):
+    uri, server = served
+    folder = write_run(tmp_path / "a", 3, success_rate=0.5)
+    run = tracking(folder, uri)
+    assert run.close("FINISHED").endswith("the status FINISHED: Connection refused")
+    assert sync(folder, "", "", read_run)[1].endswith(": Connection refused")
+    with server():
+        sent, run_id = send(folder, "", "")
+        assert sent == "4 rows, 6 files, 1 model"
+        check_complete(uri, folder, 3, run_id)
 
 
-def test_a_run_that_ended_without_its_server_is_sent_later_and_once(served):
-    _out, err = served.said["after"]
-    assert served.runs["after"].returncode == 0
-    assert re.fullmatch(
-        rf"({away(served)})?"
-        rf"{COMMAND}: warning: not logged to MLflow at {served.uri}: \d+ rows? \(step [\d to]*{GENERATIONS}\), "
-        rf"\d+ files, the model, the status FINISHED: [^\n]*; send it later with: \S*{COMMAND} --resume runs/after\n",
-        err,
-    )
-    folder = served.cwd / "runs/after"
-    ended = (folder / "summary.json").stat().st_mtime
-    done = finish(COMMAND, "--resume", "runs/after", cwd=served.cwd)
-    assert done.stderr == ""
-    sent = r"is finished: \d+ generations; sent to MLflow: \d+ rows?, \d+ files, 1 model\. To go on"
-    assert re.search(sent, done.stdout)
-    run = check_complete(served, "after")
-    assert run.info.end_time <= 1000.0 * ended + 2.0  # not when it was sent
-    assert run.info.end_time - run.info.start_time == pytest.approx(1000.0 * summary(folder)["wall_s"], abs=2.0)
+def test_a_server_that_is_killed_again_and_again_while_it_is_sent_to(served, tmp_path, monkeypatch, impatient):
+    """Between any two requests of a run's end."""
+    uri, server = served
+    folder, lacking, kills = write_run(tmp_path / "a", 4, success_rate=0.5), "all", 0
+    import requests
 
-    tables = ("runs", "metrics", "tags", "model_versions")
-    before = [query(served.database, f"SELECT * FROM {table}") for table in tables]
-    assert send_missing(open_run(folder), "", "gridsim") == ("", None)
-    assert before == [query(served.database, f"SELECT * FROM {table}") for table in tables]
+    real = requests.Session.request
+    left = 0
 
+    def request(self, method, url, **options):
+        nonlocal left
+        left -= 1
+        if left < 0 and url.startswith(uri):
+            raise requests.ConnectionError("[Errno 111] Connection refused")
+        return real(self, method, url, **options)
 
-def test_an_edited_run_is_finished_all_the_same_and_nothing_of_it_is_sent(served, tmp_path):
-    folder = shutil.copytree(served.cwd / "runs/during", tmp_path / "edited")
-    (folder / "summary.json").write_text(json.dumps(summary(folder) | {"wall_s": None}))
-    before = query(served.database, "SELECT * FROM metrics")
-    sent, lost = send_missing(open_run(folder), "", "gridsim")
-    assert sent == ""
-    assert re.fullmatch("what MLflow lacks is not sent: .*", str(lost))
-    assert query(served.database, "SELECT * FROM metrics") == before
+    with server():
+        monkeypatch.setattr(requests.Session, "request", request)
+        while lacking:
+            left, kills = 8 + kills, kills + 1
+            lacking = sync(folder, uri, "driving", read_run)[1]
+        left = 1000
+        assert kills > 2
+        check_complete(uri, folder, 4, send(folder, uri)[1])
 
 
-def test_a_server_that_is_away_is_no_reason_to_fail(served):
-    uri = f"http://127.0.0.1:{free_port()}"
-    done = finish(COMMAND, "--resume", "runs/during", "--tracking-uri", uri, cwd=served.cwd)
-    finished = f"is finished: {GENERATIONS} generations; nothing to do."
-    assert f"{finished} To go on beyond its end, resume it with a greater --generations." in done.stdout
-    not_sent = rf"{COMMAND}: warning: what MLflow lacks is not sent: no MLflow server at {uri}: [^\n]*\n"
-    assert re.fullmatch(not_sent, done.stderr)
+def test_files_of_a_server_that_does_not_serve_them(served, tmp_path, impatient):
+    uri, server = served
+    folder, root = write_run(tmp_path / "a", 2, success_rate=0.5), tmp_path / "srv/files"
+    with server("--no-serve-artifacts", "--default-artifact-root", str(root)):
+        sent, lacking = sync(folder, uri, "driving", read_run)
+        assert sent == "3 rows"
+        place = next(path for path in (root / "2", root / "1") if str(path) in lacking)
+        assert lacking == (
+            f"not logged to MLflow at {uri}: 6 files, the model: the experiment keeps its files in {place}, which is "
+            "not on this machine: create it if they belong here, else start the server with --serve-artifacts and use "
+            "a new --experiment"
+        )
+        assert not root.parent.exists()
+        root.mkdir(parents=True)  # the server is on this machine, or shares the folder
+        _, run_id = send(folder, uri)
+        assert (place / run_id / "artifacts/curves.png").read_bytes() == b"png"

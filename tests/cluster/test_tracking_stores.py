@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-import shlex
+import re
 import sqlite3
 import threading
 import time
@@ -10,15 +10,13 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from commands import all_in_mlflow, finish, start, summary
-from tracked import begin, client, free_port, mlflow_server, runs, steps, tracker
+from commands import finish, start
+from tracked import MODEL, PYTHONPATH, QUIET, client, free_port, runs, send, steps, tracking, write_run
 
-from cluster.commands.common import WorkFlags
-from cluster.tracking import mlflow_run
 from cluster.tracking.address import TrackingError, check_uri, reach_loopback_directly, sqlite_path, sqlite_uri
-from cluster.tracking.mlflow_run import run_tables
-
-TINY = ("--scenario", "curved", "--traffic", "0", "--population", "16", "--generations", "2", "--workers", "0")
+from cluster.tracking.database import create_database, run_tables, silence_mlflow
+from cluster.tracking.description import read_run
+from cluster.tracking.sync import Tracking
 
 
 @pytest.mark.parametrize(
@@ -38,38 +36,25 @@ def test_the_address_of_a_database_in_an_odd_folder(tmp_path, monkeypatch, name)
     assert make_url(uri).database == str(path)
 
 
-@pytest.mark.e2e
-def test_a_run_in_a_folder_with_an_odd_name(tmp_path):
+def test_a_run_in_a_folder_with_an_odd_name(tmp_path, monkeypatch):
     folder, elsewhere = tmp_path / "what now? #1 100%41;a&b'\" ü [c]", tmp_path / "elsewhere"
     folder.mkdir()
     elsewhere.mkdir()
-    done = finish("gridsim-evolve", *TINY, "--name", "a", cwd=folder)
-    assert done.stderr == ""
+    monkeypatch.chdir(folder)
+    _, run_id = send(write_run(folder / "runs/a", 2, success_rate=0.5), "")
     assert sorted(os.listdir(folder)) == ["mlartifacts", "mlflow.db", "runs"]
     assert sorted(os.listdir(tmp_path)) == ["elsewhere", folder.name]
-    again = finish("gridsim-evolve", "--resume", str(folder / "runs/a"), "--generations", "3", cwd=elsewhere)
-    assert again.stderr == ""
+    monkeypatch.chdir(elsewhere)
+    assert send(folder / "runs/a", "") == ("", run_id)
     assert os.listdir(elsewhere) == []
     uri = check_uri(sqlite_uri(folder / "mlflow.db"))
-    run_id = summary(folder / "runs/a")["mlflow_run_id"]
-    assert [run.info.run_id for run in runs(uri)] == [run_id]
-    assert sorted(each.step for each in client(uri).get_metric_history(run_id, "car_steps"))[:3] == [0, 1, 2]
     assert (folder / "mlartifacts" / run_id / "artifacts/model/MLmodel").is_file()
-    assert list(run_tables(uri, "http://127.0.0.1:5000")) == ["gridsim"]
-    (command,) = [line for line in done.stdout.splitlines() if line.startswith("compare: make ui, or ")]
-    words = shlex.split(command.removesuffix("; then open"))
-    assert words[words.index("--backend-store-uri") + 1] == uri
-
-
-def test_an_experiment_is_taken_from_mlflows_own_variable(monkeypatch):
-    assert WorkFlags().experiment == "gridsim"
-    monkeypatch.setenv("MLFLOW_EXPERIMENT_NAME", "theirs")
-    assert WorkFlags().experiment == "theirs"
+    assert list(run_tables(uri, "http://127.0.0.1:5000")) == ["driving"]
 
 
 def older(path):
     """A database of MLflow's at the revision before the newest that made a table."""
-    mlflow_run.quiet()
+    silence_mlflow()
     from alembic import command
     from mlflow.store.db import utils
     from mlflow.store.tracking.dbmodels.initial_models import Base
@@ -94,55 +79,32 @@ def test_a_database_of_an_older_mlflow_is_refused_before_it_is_migrated(tmp_path
         f"{uri} was made by an older MLflow, which cannot open it once it is upgraded; copy it, then run "
         f"mlflow db upgrade {uri}, or use another --tracking-uri"
     )
-    for program, *flags in (["gridsim-evolve", *TINY], ["gridsim-compare", "--quick", "--workers", "0"]):
-        done = finish(program, *flags, cwd=tmp_path, code=2)
-        assert done.stderr == f"{program}: error: {said}\n"
+    with pytest.raises(TrackingError, match=f"^{re.escape(said)}$"):
+        check_uri()
     done = finish("python", "-m", "cluster.commands.ui", str(free_port()), cwd=tmp_path, code=1)
     assert done.stderr == f"make ui: {said}\n"
-    refused = tracker(uri, 1)  # as the tracker says of a database server
-    with pytest.raises(TrackingError, match="was made by an older MLflow"):
-        refused.wait_ready()
+    refused = tracking(write_run(tmp_path / "a", 1), uri)  # as tracking says of a database server
+    assert refused.wait_id(30) == ""
+    assert refused.error == said
     refused.close("KILLED")
     assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["mlflow.db"]
+    assert sorted(os.listdir(tmp_path)) == ["a", "mlflow.db"]
     finish("mlflow", "db", "upgrade", uri, cwd=tmp_path)  # as it says
     assert check_uri() == uri
 
 
-def test_a_run_is_looked_for_by_its_id_then_in_its_experiment_alone(uri, monkeypatch):
-    from mlflow.tracking import MlflowClient
-
-    run_id = begin(uri, 2)
-    asked = []
-    real = MlflowClient.search_runs
-
-    def search_runs(self, experiment_ids, *arguments, **options):
-        asked.append(experiment_ids)
-        return real(self, experiment_ids, *arguments, **options)
-
-    monkeypatch.setattr(MlflowClient, "search_runs", search_runs)
-    monkeypatch.setattr(MlflowClient, "search_experiments", lambda *_, **__: pytest.fail("scans all experiments"))
-    assert begin(uri, 4, experiment="other", run_id=run_id) == run_id
-    assert asked == []
-    assert begin(uri, 5) == run_id  # killed before its id was saved
-    assert len(asked) == len(asked[0]) == 1
-    assert begin(uri, 5, run_id="0" * 32) == run_id  # an id of another store
-    assert begin(uri, 1, run_id=run_id, key="of another run") != run_id
-    assert steps(uri, run_id) == list(range(5))
-
-
 @pytest.mark.e2e
-def test_a_database_that_is_locked_for_ten_seconds_as_a_run_starts(uri):
+def test_a_database_that_is_locked_for_eight_seconds_as_a_run_starts(uri, tmp_path):
     with contextlib.closing(sqlite3.connect(uri.removeprefix("sqlite:///"), isolation_level=None)) as database:
         database.execute("BEGIN EXCLUSIVE")
         started = time.perf_counter()
         assert check_uri(uri) == uri
         assert time.perf_counter() - started < 1.0
-        logged = tracker(uri, 3)
+        run = tracking(write_run(tmp_path / "a", 3), uri)
         time.sleep(8.0)
         database.execute("ROLLBACK")
-    assert logged.close("FINISHED") is None
-    assert steps(uri, logged.run_id) == [0, 1, 2]
+    assert run.close("FINISHED") is None
+    assert steps(uri, run.run_id) == [0, 1, 2]
 
 
 PLUGIN = """
@@ -170,64 +132,35 @@ def test_a_run_in_the_store_of_a_plug_in(tmp_path):
         "[mlflow.tracking_store]\nfiletest = filetest:tracking\n"
         "[mlflow.model_registry_store]\nfiletest = filetest:registry\n"
     )
-    flags = (*TINY, "--name", "a", "--tracking-uri", f"filetest://{hosted}")
-    refused = finish("gridsim-evolve", *flags, cwd=cwd, code=2)
-    assert f"filetest://{hosted}: not a tracking address" in refused.stderr
-    done = finish("gridsim-evolve", *flags, cwd=cwd, PYTHONPATH=str(plugin))
-    assert done.stderr == ""
-    assert f"compare: filetest://{hosted}\n" in done.stdout
-    assert os.listdir(cwd) == ["runs"]
-    run_id = summary(cwd / "runs/a")["mlflow_run_id"]
-    run = client(f"sqlite:///{hosted}/hosted.db").get_run(run_id)
+    uri = f"filetest://{hosted}"
+    with pytest.raises(TrackingError, match=f"^{uri}: not a tracking address"):
+        check_uri(uri)
+    script = [*("python", "-c", QUIET, uri, str(tmp_path / "a")), "good"]
+    finish(*script, cwd=cwd, PYTHONPATH=f"{PYTHONPATH}{os.pathsep}{plugin}")
+    assert os.listdir(cwd) == []
+    (run,) = runs(f"sqlite:///{hosted}/hosted.db")
     assert run.info.status == "FINISHED"
     assert run.info.artifact_uri.startswith(f"{hosted}/files/")
     assert Path(run.info.artifact_uri, "model/MLmodel").is_file()
-    again = finish("gridsim-evolve", "--resume", "runs/a", cwd=cwd, PYTHONPATH=str(plugin))
-    assert "nothing to do" in again.stdout
 
 
 @pytest.mark.parametrize("uri", ["databricks", "databricks://profile"])
-def test_hosted_stores_are_left_to_mlflow(uri):
+def test_hosted_stores_are_left_to_mlflow(uri, tmp_path):
     assert check_uri(uri) == check_uri(begun_with=uri) == uri
-    assert tracker(uri).where("mlflow") == uri
-
-
-@pytest.mark.e2e
-def test_files_of_a_server_that_does_not_serve_them(tmp_path, impatient):
-    root, port = tmp_path / "srv" / "files", free_port()
-    picture = tmp_path / "a.png"
-    picture.write_bytes(b"png")
-    with mlflow_server(tmp_path, port, "--no-serve-artifacts", "--default-artifact-root", str(root)):
-        uri = check_uri(f"http://127.0.0.1:{port}")
-        logged = tracker(uri, 2)
-        logged.log_files([picture])
-        assert logged.close("FINISHED") == (
-            f"not logged to MLflow at {uri}: 1 file: the experiment keeps its files in {root}/1, which is not on this "
-            "machine: create it if they belong here, else start the server with --serve-artifacts and use a new "
-            "--experiment"
-        )
-        assert not root.exists()
-        assert not root.parent.exists()
-        assert steps(uri, logged.run_id) == [0, 1]
-        root.mkdir(parents=True)  # the server is on this machine, or shares the folder
-        again = tracker(uri, 2)
-        again.log_files([picture])
-        assert again.close("FINISHED") is None
-        assert (root / "1" / again.run_id / "artifacts/a.png").read_bytes() == b"png"
+    assert Tracking(tmp_path, uri, "", read_run).where("mlflow") == uri
 
 
 @pytest.mark.e2e
 def test_several_first_runs_at_once_in_an_empty_folder(tmp_path):
-    names = [str(number) for number in range(4)]
-    started = [start("gridsim-evolve", *TINY, "--seed", name, "--name", name, cwd=tmp_path) for name in names]
+    uri = f"sqlite:///{tmp_path}/mlflow.db"
+    script = ("python", "-c", QUIET, uri)
+    started = [start(*script, str(tmp_path / "runs" / n), "good", cwd=tmp_path, PYTHONPATH=PYTHONPATH) for n in "abcd"]
     for process in started:
-        out, err = process.communicate(timeout=600)
-        assert (process.returncode, err) == (0, ""), out
-    for name in names:
-        assert all_in_mlflow(tmp_path / "runs" / name)
-        assert client(f"sqlite:///{tmp_path}/mlflow.db").search_model_versions(
-            f"run_id = '{summary(tmp_path / 'runs' / name)['mlflow_run_id']}'"
-        )
+        assert (*process.communicate(timeout=600), process.returncode) == ("", "", 0)
+    assert {run.info.run_name: steps(uri, run.info.run_id) for run in runs(uri)} == {
+        name: [*range(20)] for name in "abcd"
+    }
+    assert len(client(uri).search_model_versions(f"name = '{MODEL}'")) == 4
     assert sorted(os.listdir(tmp_path)) == ["mlartifacts", "mlflow.db", "runs"]
 
 
@@ -243,7 +176,7 @@ def test_only_one_process_builds_a_database(tmp_path, monkeypatch):
         real(engine)
 
     monkeypatch.setattr(utils, "_upgrade_db", upgrade)
-    threads = [threading.Thread(target=mlflow_run._create_database, args=(tmp_path / "mlflow.db",)) for _ in range(4)]
+    threads = [threading.Thread(target=create_database, args=(tmp_path / "mlflow.db",)) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -14,41 +14,44 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 from browser import Browser, needs_chromium
 from commands import finish
-from tracked import free_port, row, tracker
+from tracked import free_port, row, tracking
 
-from cluster.tracking.mlflow_run import run_tables
+from cluster.tracking.content import Content
+from cluster.tracking.database import run_tables
 
 
-def logged(uri, name, success_rate):
-    """A run with three rows and a champion; returns what its command says of MLflow in the end."""
-    begun = tracker(uri, experiment="gridsim", name=name, key=name)
-    for step in range(3):
-        begun.log_row(step, row(step) | {"validation/success_rate": 0.25 * step})
-    begun.log_row(2, {"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5}, 83.0)
+def logged(uri, folder, name, success_rate):
+    """A run with three rows, of 83 s; returns what its command says of MLflow in the end."""
+    rows = [(step, row(step) | {"validation/success_rate": 0.25 * step}, float(step)) for step in range(3)]
+    rows.append((2, {"held_out/success_rate": success_rate, "held_out/speed_mps": 7.5}, 83.0))
+    (folder / name).mkdir()
+    begun = tracking(folder / name, uri, "gridsim", lambda _: Content(name, {}, {}, "", rows, wall_s=83.0))
     assert begun.close("FINISHED") is None
     return begun.where("bin/mlflow")
 
 
 def test_a_run_says_where_its_table_is(uri, tmp_path, monkeypatch):
-    said = logged(uri, "first", 0.875)
+    said = logged(uri, tmp_path, "first", 0.875)
     table = run_tables(uri, "http://127.0.0.1:5000")["gridsim"]
     assert said == f"MLFLOW_DISABLE_TELEMETRY=true bin/mlflow ui --backend-store-uri {uri}; then open\n{table}"
     monkeypatch.chdir(tmp_path / "store")
-    assert logged(uri, "second", 0.875) == f"make ui, or {said}"  # which shows the working directory's mlflow.db
+    assert (
+        logged(uri, tmp_path, "second", 0.875) == f"make ui, or {said}"
+    )  # which shows the working directory's mlflow.db
     assert re.fullmatch(
         r"http://127.0.0.1:5000/#/experiments/\d+/runs\?workflowType=machine_learning&viewStateShareKey=gridsim", table
     )
 
 
-def test_an_experiment_from_before_gets_the_view_and_keeps_one_that_was_changed(uri):
+def test_an_experiment_from_before_gets_the_view_and_keeps_one_that_was_changed(uri, tmp_path):
     from mlflow.tracking import MlflowClient
 
     client, tag = MlflowClient(tracking_uri=uri), "mlflow.sharedViewState.gridsim"
     experiment = client.create_experiment("gridsim")
-    logged(uri, "first", 0.875)
+    logged(uri, tmp_path, "first", 0.875)
     assert "held_out/success_rate" in client.get_experiment(experiment).tags[tag]
     client.set_experiment_tag(experiment, tag, "mine")
-    logged(uri, "second", 0.5)
+    logged(uri, tmp_path, "second", 0.5)
     assert client.get_experiment(experiment).tags[tag] == "mine"
 
 
@@ -73,8 +76,8 @@ def make_ui(root, folder, port):
 @needs_chromium
 def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
     folder = tmp_path / "store"
-    logged(uri, "first", 0.875)
-    logged(uri, "second", 0.625)
+    logged(uri, tmp_path, "first", 0.875)
+    logged(uri, tmp_path, "second", 0.625)
     with make_ui(root, folder, port := free_port()) as link:
         with Browser(link, tmp_path / "profile") as browser:
             for words in (
@@ -113,7 +116,7 @@ def test_a_signal_ends_it_within_seconds_also_behind_a_proxy(uri, root, tmp_path
         monkeypatch.setenv(name, "http://127.0.0.1:1")
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    logged(uri, "first", 0.875)
+    logged(uri, tmp_path, "first", 0.875)
     with make_ui(root, tmp_path / "store", port := free_port()) as link:
         assert link.startswith(f"http://127.0.0.1:{port}/#/experiments/")
         (made,) = [each for each in psutil.process_iter(["cmdline"]) if (each.info["cmdline"] or [])[:1] == ["make"]
