@@ -1,209 +1,142 @@
-"""How the service scales: python benchmarks/scaling.py [--json] [--quick] [--picture FILE] [--generations N] [--seed N]
+"""How work scales over threads and Ray workers: python benchmarks/scaling.py [--json] [--quick] [--generations N]
 
-On this machine: runs the default job to its end with 2 workers and keeps the state ten generations before the end; then
-evolves the last ten generations again, with 1 worker, with 2, and with 2 at population 512, saving and logging as
-always. Medians over them:
+On this machine: generations of `--traffic 6 --population 512` on `seamless`, around a trained driver (beside this
+file), by one and by two threads of this process in turns, and then by one and by two Ray workers. All drive the same.
 
-    speedup_2_workers               wall clock of all ten with 1 worker over that with 2
-    overhead_ms_per_generation      wall clock less the busiest worker's evaluation, 2 workers, population 512
-    bytes_per_child                 sent per member and generation, both ways, leader and validation included
-    broadcast_bytes_per_generation  put into the object store per generation: a few genomes, episodes
+    speedup_2_threads               wall clock of all generations with one thread over that with two
+    speedup_2_workers               the same of Ray workers
+    threads_over_workers            car-steps a second by two threads over that by two Ray workers
+    overhead_ms_per_generation      wall clock less the busiest worker's evaluation, 2 Ray workers; median
+    thread_overhead_ms              the same of 2 threads
+    bytes_per_child                 sent to Ray workers per member and generation, both ways
+    broadcast_bytes_per_generation  put into Ray's object store per generation: a few genomes, episodes, new maps
+    start_workers_s                 until a pool of 2 Ray workers is open
+    children_per_s                  members that the search asks for, the pool sends and collects, and the search
+                                    recombines, with Ray workers that answer at once: the coordinator's ceiling
 
-The coordinator's ceilings, with workers that answer at once (`coordinator.py`):
-
-    children_per_s                  recipes, dispatch, collection and recombination, mlp:6,7
-    coordinator_mib_100k            peak memory of its process at population 100,000, everything included
-    broadcast_bytes_100k            as above, at that population
-    chunk_us, look_us, ...          input of the simulation: the coordinator's own time
-
-On more machines: a simulation (`simulated_workers.py`) of a generation of 10,000 members on 1 to 10,000 workers, as a
-table and, with --picture, a picture; and its figures for 1 to 8 workers beside those of real Ray actors. These share
-this machine's cores, so they sleep instead of evaluating: this checks the dispatch, not the cores.
-
-    efficiency_1000_workers         1 s of evaluation a member, mlp:6,7; evaluation over what the workers had
-    real_efficiency_<n>, simulated_efficiency_<n>
-
---json prints one flat object of numbers and nothing else. --quick takes a minute, with figures that mean little.
+--json prints one flat object of numbers and nothing else. --quick takes some seconds, with figures that mean little.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import json
 import statistics
-import sys
-import tempfile
 import time
-from collections import deque
-from dataclasses import replace
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from coordinator import (  # beside this file
-    CHILDREN,
-    CHUNKS,
-    EPISODES,
-    InstantWorker,
-    Watched,
-    children_per_s,
-    chunk_costs,
-    gene_costs,
-    learn,
-    memory,
-    naps,
-    ray_costs,
-    session,
-    sleeping_efficiency,
-    step_s,
-)
-from coordinator import POLICY as MLP
-from simulated_workers import ROWS, TASK_BYTES, WORKERS, Call, Costs, Load, at, draw, table
 
-from cluster.learn.learning import Maps
-from cluster.settings import MAX_STEPS, EvolveSettings
-from cluster.workers.kernels import compile_kernels
+from cluster.settings import EvolveSettings
+from cluster.store.champion import load_champion
+from cluster.workers.kernels import compile_ahead
+from cluster.workers.pool import Chunk, Outcome, WorkerPool, open_pool
 from cluster.workers.ray_pool import RayPool
-from evolution.episodes.curriculum import HELD_OUT_SEEDS, VALIDATION_SEEDS
+from cluster.workers.threads import ThreadPool
+from cluster.workers.worker import Task, Worker
+from evolution.episodes.curriculum import Curriculum
+from evolution.episodes.rollout import EPISODE, RESULT
 from evolution.networks.policy import PolicySpec
+from evolution.search import fitness
+from evolution.search.base import SearchConfig
+from evolution.search.recombination import Recombination
+from gridsim.car.ego import End
 from gridsim.config import SimConfig
+from gridsim.maps import scenarios
+from gridsim.maps.map import Map
+from gridsim.traffic.world import FIELDS
 
-LAST = 10  # generations that are measured
-OVERHEAD = 512  # population that the coordinator's time is measured at
-CNN = "cnn:8,16,32@1"
-ACTORS = (1, 2, 4, 8)  # real ones, with which the simulation is checked
-NAPPING = 40  # members for each of them
-MEMBER_S = 1.0  # of evaluation, in the simulation
-
-
-State = tuple[dict[str, np.ndarray], dict[str, Any]]
+WARM = 2  # generations before the measured ones, in which kernels are loaded and maps sent
+CHILDREN = 100_000  # members that the coordinator alone is timed with
+DRIVER = Path(__file__).with_name("champion_traffic.npz")
 
 
-def default_run(folder: Path, settings: EvolveSettings, maps: Maps) -> State:
-    """The state of the default run LAST generations before its end."""
-    pool = RayPool(2, maps.build)
-    states: deque[State] = deque(maxlen=LAST + 1)
-    this = session(folder, "whole", settings, pool, maps)
-    compile_kernels(settings.policy, settings.traffic, settings.command)
-
-    def keep(generation: int, row: dict[str, float]) -> None:
-        arrays, meta = this.learning.state()
-        states.append(({k: v.copy() for k, v in arrays.items()}, meta))
-        if sys.stderr.isatty():
-            print(f"\rdefault run: generation {generation} ", end="", file=sys.stderr, flush=True)
-
-    this.reporter.row = keep
-    learn(this)
-    for seed in (*this.learning.curriculum.map_seeds, *VALIDATION_SEEDS, *HELD_OUT_SEEDS):
-        maps.get(seed)  # a short run ends before all are built, and none is to be built during a measurement
-    return states[0]
+build = functools.cache(scenarios.build)
 
 
-def last_generations(
-    folder: Path, settings: EvolveSettings, maps: Maps, state: State, workers: int
-) -> tuple[dict[str, list[float]], Load]:
-    """Evolve LAST generations from a state. Returns: figures of each, and how the last one's episodes went."""
-    # Generations are counted here: neither a limit of the run nor its champion ends it.
-    settings = replace(settings, generations=0, car_steps=MAX_STEPS, until=2.0)
-    pool = Watched(workers, maps.build)
-    this = session(folder, f"last-{workers}-{settings.population}", settings, pool, maps)
-    learning, curriculum = this.learning, this.learning.curriculum
-    compile_kernels(settings.policy, settings.traffic, settings.command)
-    nobody = np.zeros((1, learning.spec.size), dtype=np.float32)
+class InstantWorker(Worker):
+    """Answers at once: most episodes succeed, the others end in a collision on the way."""
 
-    def restore() -> None:
-        learning.restore({k: v.copy() for k, v in state[0].items()}, {**state[1], "solved": False})
-
-    # Before the measurement MLflow's run is opened, and all workers are put to work and sent nearly all maps.
-    this.tracker.wait_ready()
-    restore()
-    coming = [curriculum.episodes(learning.steps + k) for k in range(LAST + 1)]
-    for episodes in (curriculum.validation(), *coming):
-        while len(learning.drive("warm", nobody, episodes).busy_s) < workers:
-            pass
-    restore()
-    figures: dict[str, list[float]] = {"wall": [], "overhead": [], "bytes": [], "broadcast": []}
-    begun = 0.0
-
-    def measure(generation: int, row: dict[str, float]) -> None:
-        nonlocal begun
-        end = time.perf_counter()
-        outcome = pool.outcome
-        figures["wall"].append(end - begun)
-        figures["overhead"].append(end - begun - max(outcome.busy_s.values()))
-        figures["bytes"].append((outcome.bytes_down + outcome.bytes_up) / settings.population)
-        figures["broadcast"].append(outcome.broadcast_bytes)
-        learning.solved = len(figures["wall"]) > LAST
-        begun = time.perf_counter()
-
-    this.reporter.row = measure
-    begun = time.perf_counter()
-    learn(this)
-    n, goals = settings.population, pool.outcome.task.episodes["target"].astype(np.float64)
-    seconds = pool.outcome.results["steps"] * curriculum.period  # driven; `at` scales them to evaluation
-    groups = [part for part in pool.outcome.asked if part.rows.stop <= n]
-    leader = next(part for part in pool.outcome.asked if part.rows.start == n)
-    load = Load(
-        goals[groups[0].columns], np.concatenate([seconds[part] for part in groups]),
-        goals[leader.columns], seconds[leader][0], learning.spec.size,
-    )  # fmt: skip
-    return {name: values[1:] for name, values in figures.items()}, load  # the first one only times metres
+    def evaluate(
+        self, task: Task, maps: Sequence[Map], recipes: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        results = np.zeros((len(recipes), len(task.episodes)), dtype=RESULT)
+        share = (recipes["seed"].astype(np.int64)[:, None] * 7919 + np.arange(len(task.episodes)) * 104_729) % 512 / 160
+        results["distance"] = results["paced"] = np.floor(np.minimum(share, 1.0) * task.episodes["target"])
+        results["steps"], results["end"] = 100, np.where(share >= 1.0, End.SUCCESS, End.COLLISION)
+        return results, np.zeros(0), np.zeros(0)
 
 
-def measured_costs(maps: Maps, quick: bool) -> tuple[Costs, dict[str, float]]:
-    """The input of the simulation, and the same as figures to print."""
-    pool = RayPool(2, maps.build, worker_factory=InstantWorker)
-    try:
-        children, child = children_per_s(pool, CHILDREN // 10 if quick else CHILDREN)
-        chunk, look = chunk_costs(pool, CHUNKS // 10 if quick else CHUNKS)
-        busy, byte = ray_costs()
-    finally:
-        pool.close()
-    breed_s, recombine_s = gene_costs()
-    of_genes = recombine_s * PolicySpec.parse(MLP).size
-    costs = Costs(max(child - of_genes, 0.0), recombine_s, chunk, look, busy, byte, breed_s)
-    figures = {
-        "children_per_s": children,
-        "child_us": 1e6 * child,
-        "chunk_us": 1e6 * chunk,
-        "look_us": 1e6 * look,
-        "look_us_per_worker": 1e6 * busy,
-        "sent_mib_per_s": 1.0 / max(byte, 1e-12) / 2**20,
-        "gene_ns": 1e9 * breed_s,
-        "recombined_gene_ns": 1e9 * recombine_s,
-    }
-    return costs, figures
+class Generations:
+    """The same generations for every pool that drives them; each pool has one of these."""
+
+    def __init__(self, settings: EvolveSettings, pool: WorkerPool):
+        champion = load_champion(DRIVER)
+        self._scenario, self._policy, self._pool = settings.scenario, champion.policy, pool
+        self._curriculum = Curriculum(
+            settings.curriculum(), settings.seed, partial(build, settings.scenario), settings.traffic
+        )
+        self._curriculum.target = self._curriculum.config.last_target
+        self._search = Recombination(PolicySpec.parse(champion.policy), settings.search_config(), settings.seed)
+        self._search.start_from(champion.genome)
+        self.driven: list[Outcome] = []
+
+    def next(self) -> None:
+        """Drive one."""
+        asked, episodes = self._search.ask(), self._curriculum.episodes(len(self.driven))
+        e = len(episodes.rows) // len(asked.groups)
+        parts = [Chunk(group, slice(g * e, (g + 1) * e)) for g, group in enumerate(asked.groups)]
+        names = tuple((self._scenario, seed) for seed in episodes.maps)
+        base = (self._policy, episodes.rows, episodes.worlds, names, SimConfig())
+        outcome = self._pool.evaluate(Task(*base, asked.parents, asked.key, asked.mutation), asked.recipes, parts)
+        results = np.concatenate([outcome.results[part] for part in parts])
+        self._search.tell(fitness.scalar(results, episodes.rows["target"][:e].astype(np.float64)))
+        self.driven.append(outcome)
+
+    def figures(self) -> dict[str, float]:
+        """Of all but the first ones."""
+        driven = self.driven[WARM:]
+        members = len(driven[0].recipes)
+        return {
+            "wall_s": sum(call.wall_s for call in driven),
+            "car_steps": sum(float(call.results["steps"].sum()) for call in driven),
+            "overhead_ms": 1e3 * statistics.median(call.wall_s - max(call.busy_s.values()) for call in driven),
+            "bytes": statistics.median((call.bytes_down + call.bytes_up) / members for call in driven),
+            "broadcast": statistics.median(call.broadcast_bytes for call in driven),
+        }
 
 
-def cases(load: Load) -> dict[str, Load]:
-    """What is simulated, by name."""
-    steps = load.drives.sum(axis=1).mean() / SimConfig().episode.control_period
-    own_s = {policy: float(steps * step_s(policy)) for policy in (MLP, CNN)}
-    found = {}
-    for policy, seconds, member in (
-        (MLP, MEMBER_S, f"{MEMBER_S:g} s a member"),
-        (CNN, MEMBER_S, f"{MEMBER_S:g} s a member"),
-        (MLP, own_s[MLP], f"{1e3 * own_s[MLP]:.1f} ms"),
-        (CNN, own_s[CNN], f"{1e3 * own_s[CNN]:.0f} ms"),
-    ):
-        genes = PolicySpec.parse(policy).size
-        found[f"{policy}, {member}"] = at(load, seconds, genes)
-        found[f"{policy}, {member}, genomes"] = at(load, seconds, genes, recipes=False)
-    return found
+def drive(settings: EvolveSettings, pools: list[WorkerPool], generations: int) -> list[dict[str, float]]:
+    """Figures of each pool; pools drive each generation in turns."""
+    drivers = [Generations(settings, pool) for pool in pools]
+    for _ in range(WARM + generations):
+        for driver in drivers:
+            driver.next()
+    return [driver.figures() for driver in drivers]
 
 
-def checked(costs: Costs, actors: tuple[int, ...]) -> dict[str, float]:
-    """Efficiency of real actors that sleep, and what the simulation says of them."""
-    figures = {}
-    for workers in actors:
-        members = NAPPING * workers
-        figures[f"real_efficiency_{workers}"] = sleeping_efficiency(workers, members)
-        drives = naps()[:members]
-        local = replace(costs, latency_s=0.0)
-        broadcast = TASK_BYTES + 4 * PolicySpec.parse(MLP).size * ROWS
-        call = Call(local, workers, drives, np.full(EPISODES, 150.0), broadcast)
-        figures[f"simulated_efficiency_{workers}"] = float(drives.sum() / (workers * call.run()))
-    return figures
+def children_per_s(children: int) -> float:
+    """Members per second with two Ray workers that answer at once."""
+    spec, config, groups = PolicySpec.parse("mlp:6,7"), SimConfig(), SearchConfig.groups
+    search = Recombination(spec, SearchConfig(population=children), 0)
+    episodes = np.zeros(2 * groups, EPISODE)
+    episodes["target"], episodes["steps"] = 150.0, 245
+    worlds, rates = np.zeros((len(episodes), 0, FIELDS), dtype=np.float32), []
+    with contextlib.closing(RayPool(2, build, worker_factory=InstantWorker)) as pool:
+        pool.open()
+        for _ in range(4):
+            begun = time.perf_counter()
+            asked = search.ask()
+            parts = [Chunk(group, slice(2 * g, 2 * g + 2)) for g, group in enumerate(asked.groups)]
+            task = Task(str(spec), episodes, worlds, (), config, asked.parents, asked.key, asked.mutation)
+            results = pool.evaluate(task, asked.recipes, parts).results
+            search.tell(fitness.scalar(np.concatenate([results[part] for part in parts]), 150.0))
+            rates.append(children / (time.perf_counter() - begun))
+    return statistics.median(rates[1:])
 
 
 def main() -> None:
@@ -211,54 +144,43 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one flat JSON object and nothing else")
     parser.add_argument("--quick", action="store_true", help="all of it, on a small scale")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the simulated efficiency")
-    parser.add_argument("--generations", type=int, default=0, help="of the default run, at most; 0: its own end")
-    parser.add_argument("--seed", type=int, default=0, help="of the default run")
+    parser.add_argument("--generations", type=int, default=10, help="that are measured")
     options = parser.parse_args()
-    if options.generations < 0:
-        parser.error("--generations must be 0 or more")
-    settings = EvolveSettings(generations=options.generations, seed=options.seed)
-    if options.quick:
-        settings = replace(settings, generations=3, population=64)
-    with tempfile.TemporaryDirectory() as folder:
-        maps = Maps(settings.scenario, SimConfig())
-        state = default_run(Path(folder), settings, maps)
-        one, _ = last_generations(Path(folder), settings, maps, state, 1)
-        two, load = last_generations(Path(folder), settings, maps, state, 2)
-        large, _ = last_generations(Path(folder), replace(settings, population=OVERHEAD), maps, state, 2)
-        costs, ceilings = measured_costs(maps, options.quick)
-        maps.close()
-    largest = memory(2_000 if options.quick else 100_000)
-    loads = cases(load)
-    workers = (1, 10, 1_000) if options.quick else WORKERS
-    efficiencies = table(costs, loads, workers)
-    median = statistics.median
+    settings = EvolveSettings(traffic=6, population=64 if options.quick else 512)
+    generations = 2 if options.quick else options.generations
+    compile_ahead(settings)
+    # First Ray, whose variables are to be set before there are threads.
+    rate = children_per_s(CHILDREN // 10 if options.quick else CHILDREN)
+    of_workers = {}
+    for workers in (1, 2):
+        begun = time.perf_counter()
+        with contextlib.closing(open_pool(workers, None, 0.0, build)) as pool:
+            start_s = time.perf_counter() - begun
+            (of_workers[workers],) = drive(settings, [pool], generations)
+    threads = [ThreadPool(build, 1), ThreadPool(build, 2)]
+    one, two = drive(settings, threads, generations)
+    for pool in threads:
+        pool.close()
+    pair = of_workers[2]
+    assert pair["car_steps"] == of_workers[1]["car_steps"] == one["car_steps"] == two["car_steps"]
     figures = {
-        "speedup_2_workers": sum(one["wall"]) / sum(two["wall"]),
-        "overhead_ms_per_generation": 1e3 * median(large["overhead"]),
-        "bytes_per_child": median(two["bytes"]),
-        "broadcast_bytes_per_generation": median(two["broadcast"]),
-        "generation_ms_1_worker": 1e3 * median(one["wall"]),
-        "generation_ms_2_workers": 1e3 * median(two["wall"]),
-        "generation_ms_512": 1e3 * median(large["wall"]),
-        **ceilings,
-        "coordinator_mib_100k": largest["coordinator_mib"],
-        "broadcast_bytes_100k": largest["broadcast_bytes"],
-        "generation_s_100k": largest["generation_s"],
-        "efficiency_1000_workers": next(iter(efficiencies.values()))[workers.index(1_000)],
-        **checked(costs, ACTORS[:2] if options.quick else ACTORS),
+        "speedup_2_workers": of_workers[1]["wall_s"] / pair["wall_s"],
+        "speedup_2_threads": one["wall_s"] / two["wall_s"],
+        "threads_over_workers": pair["wall_s"] / two["wall_s"],
+        "overhead_ms_per_generation": pair["overhead_ms"],
+        "thread_overhead_ms": two["overhead_ms"],
+        "car_steps_per_s_2_workers": pair["car_steps"] / pair["wall_s"],
+        "car_steps_per_s_2_threads": two["car_steps"] / two["wall_s"],
+        "bytes_per_child": pair["bytes"],
+        "broadcast_bytes_per_generation": pair["broadcast"],
+        "start_workers_s": start_s,
+        "children_per_s": rate,
     }
-    if options.picture:
-        draw(efficiencies, options.picture, workers)
     if options.json:
         print(json.dumps({name: round(value, 3) for name, value in figures.items()}))
         return
     for name, value in figures.items():
         print(f"{name:32} {value:14,.2f}")
-    print("\nSimulated efficiency of a generation of 10,000 members\n")
-    print(f"{'workers':34}" + "".join(f"{w:>7}" for w in workers))
-    for name, values in efficiencies.items():
-        print(f"{name:34}" + "".join(f"{value:7.2f}" for value in values))
 
 
 if __name__ == "__main__":

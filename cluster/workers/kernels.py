@@ -33,7 +33,8 @@ from gridsim.maps.scenarios import REGISTRY, build, default_traffic, is_map_file
 from gridsim.simulator import views
 from gridsim.traffic.world import spawn
 
-LOOK_S = 0.1
+PARTS = ("kernels", "roads")  # compiled side by side: what drives, and what builds maps and shows drives
+LOOK_S = 0.1  # between two looks at the processes that compile
 
 
 def _marker(settings: RunSettings) -> Path:
@@ -109,13 +110,13 @@ def compile_drive(policy: str, traffic: int) -> None:
     clearances(road.road, freeze(cars[:, :2]))
 
 
-PARTS = {
-    "kernels": lambda scenario, policy, traffic, command: compile_kernels(policy, traffic, command),
-    "roads": lambda scenario, policy, traffic, command: (
-        compile_roads(scenario, traffic),
-        compile_drive(policy, traffic),
-    ),
-}
+def compile_part(part: str, scenario: str, policy: str, traffic: int, command: str) -> None:
+    """Compile one of PARTS in this process."""
+    if part == "kernels":
+        compile_kernels(policy, traffic, command)
+    else:
+        compile_roads(scenario, traffic)
+        compile_drive(policy, traffic)
 
 
 def everything_by_default() -> list[RunSettings]:
@@ -132,11 +133,11 @@ def everything_by_default() -> list[RunSettings]:
 def main(part: str, scenario: str = "", policy: str = "", cars: str = "0", command: str = "") -> None:
     """Compile one part, or everything, in this process."""
     if part != "everything":
-        PARTS[part](scenario, policy, int(cars), command)
+        compile_part(part, scenario, policy, int(cars), command)
         return
     for settings in everything_by_default():
-        for compile_part in PARTS.values():
-            compile_part(settings.scenario, settings.policy, settings.traffic, settings.command)
+        for each in PARTS:
+            compile_part(each, settings.scenario, settings.policy, settings.traffic, settings.command)
         _marker(settings).touch()
         print(_marker(settings).name, flush=True)
 
