@@ -44,16 +44,9 @@ def drive(env: GridSimVectorEnv, steps: int, seed: int) -> np.ndarray:
 # --- spaces
 
 
-def test_importing_gridsim_registers_in_milliseconds_and_loads_no_numba(root: Path) -> None:
-    """Beside Gymnasium, it takes the processor some milliseconds."""
-    code = "import sys, time, gymnasium; began = time.process_time(); import gridsim; end = time.process_time()"
-    code += "; print('GridSim/City-v0' in gymnasium.registry, 'numba' in sys.modules, end - began)"
-    took = []
-    for _ in range(5):
-        *found, seconds = finish("python", "-c", code, cwd=root).stdout.split()
-        assert found == ["True", "False"]
-        took.append(float(seconds))
-    assert np.median(took) < 0.05
+def test_importing_gridsim_registers_and_loads_no_numba(root: Path) -> None:
+    code = "import sys, gymnasium, gridsim; print('GridSim/City-v0' in gymnasium.registry, 'numba' in sys.modules)"
+    assert finish("python", "-c", code, cwd=root).stdout.split() == ["True", "False"]
 
 
 def test_type_checkers_see_the_names_that_are_there(root: Path) -> None:
