@@ -21,9 +21,9 @@ from tracked import free_port
 
 from cluster.commands import cli, common
 from cluster.settings import DqnSettings, EvolveSettings
+from cluster.workers.address import check_address
 from cluster.workers.kernels import everything_by_default
 from cluster.workers.pool import PoolError
-from cluster.workers.ray_session import check_address
 from gridsim.maps.scenarios import REGISTRY
 
 ROOT = Path(__file__).parents[1]

@@ -81,7 +81,7 @@ class EvolveFlags(RunFlags, WorkFlags, EvolveSettings):
     """
 
     groups: ClassVar[dict[str, type]] = {"learning": EvolveSettings, "work": WorkFlags, "run": RunFlags}
-    example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1 --workers 2"
+    example: ClassVar[str] = "gridsim-evolve --scenario city --traffic 6 --seed 1"
     #: Flags of version 0.1, and what replaces them.
     removed: ClassVar[dict[str, str]] = {
         "--islands": "a run has one population; use --recombination all, the default, which needs no islands",
@@ -103,7 +103,7 @@ class DqnFlags(RunFlags, WorkFlags, DqnSettings):
     """
 
     groups: ClassVar[dict[str, type]] = {"learning": DqnSettings, "work": WorkFlags, "run": RunFlags}
-    example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1 --workers 2"
+    example: ClassVar[str] = "gridsim-dqn --scenario curved --seed 1"
     #: Flags of version 0.2, and why they were removed.
     removed: ClassVar[dict[str, str]] = {
         **dict.fromkeys(("--prioritised", "--no-prioritised"), "transitions are drawn uniformly, which does as well"),

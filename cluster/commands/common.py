@@ -78,8 +78,8 @@ def _whole_number(field: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructo
 class WorkFlags:
     """Where runs are computed, kept and logged."""
 
-    workers: int = 0
-    """Ray workers; 0 evaluates in this process, on all its cores, or with --address on all free CPUs of the cluster."""
+    workers: Annotated[int, IN_WORDS] = 0
+    """Ray workers. By default none: this process evaluates on all its cores; with --address one for each free CPU."""
     output: str = "runs"
     """Folder in which the run's folder is created."""
     address: Annotated[str, IN_WORDS] = ""

@@ -34,6 +34,7 @@ def listening():
     def start_it(seconds):
         process = subprocess.Popen([sys.executable, "-c", LISTEN, str(seconds)], stdout=-1, stderr=-1, text=True)
         begun.append(process)
+        assert process.stdout
         assert process.stdout.readline() == "begun\n"
         return process
 

@@ -12,6 +12,7 @@ from learners import Untracked
 from cluster import run as module
 from cluster import stopping
 from cluster.commands.cli import evolve_main
+from cluster.learn.learning import Event
 from cluster.run import Place, Session, train
 from cluster.settings import EvolveSettings
 from cluster.store.folder import new_run, open_run, read_config
@@ -44,6 +45,12 @@ def told(monkeypatch):
     return Told
 
 
+def saved_generations(folder):
+    saved = open_run(folder).saved
+    assert saved is not None
+    return saved[1]["generation"]
+
+
 def end(error):
     def finish(session):
         if error:
@@ -62,13 +69,16 @@ def end(error):
 )
 def test_mlflow_and_the_caller_are_told_how_a_run_ended(told, tmp_path, monkeypatch, error, raised, status, said):
     monkeypatch.setattr(Session, "finish", end(error))
-    run, events, steps = new_run(tmp_path, "r", SETTINGS), [], []
+    monkeypatch.setattr(module.kernels, "is_compiled", lambda settings: True)
+    run = new_run(tmp_path, "r", SETTINGS)
+    events: list[Event] = []
+    steps: list[int] = []
     with pytest.raises(raised) if raised else nullcontext():
         train(run, Place(), events.append, lambda done, row: steps.append(done))
     assert (told.ends, steps) == ([status], [1, 2])
     assert [event.text for event in events if not event.total] == said
     assert read_config(run.path / "config.json")[0] == SETTINGS
-    assert open_run(run.path).saved[1]["generation"] == 2
+    assert saved_generations(run.path) == 2
 
 
 def test_an_outage_of_mlflow_is_told_of_once_and_its_end(told, tmp_path, monkeypatch):
@@ -92,9 +102,9 @@ def test_a_limit_of_wall_time_counts_what_was_before(tmp_path, monkeypatch):
     run = new_run(tmp_path, "r", dataclasses.replace(SETTINGS, generations=50))
     train(run, Place(wall_limit_s=0.01))
     run = open_run(run.path)
-    assert run.saved[1]["generation"] == 1
+    assert saved_generations(run.path) == 1
     seconds = train(run, Place(wall_limit_s=0.01)).wall_s()
-    assert open_run(run.path).saved[1]["generation"] == 1
+    assert saved_generations(run.path) == 1
     session = train(open_run(run.path), Place(wall_limit_s=seconds + 1.0))
     assert 1 < session.learning.steps < 50 or session.wall_s() < seconds + 1.0
 

@@ -100,7 +100,7 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     told: list[np.ndarray] = []
     driven: list[Outcome] = []
     evolution.search.tell, start = told.append, evolution.pool.start
-    evolution.pool.start = lambda call: driven.append(call) or start(call)
+    evolution.pool.start = lambda call: (driven.append(call), start(call))[1]
     curriculum, config, leader = evolution.curriculum, evolution.curriculum.config, evolution.search.leader()
     episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
     row = step(evolution)

@@ -128,8 +128,8 @@ def wait_until(condition, timeout=120.0, pause=0.02):
 
 def answers(address: str) -> bool:
     """Whether a Ray cluster is there, if only to say that it wants its token."""
+    from cluster.workers.address import check_address
     from cluster.workers.pool import PoolError
-    from cluster.workers.ray_session import check_address
 
     try:
         return bool(check_address(address))

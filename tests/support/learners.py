@@ -1,6 +1,7 @@
 """Runs of the learners in this process, without commands and without MLflow."""
 
 import dataclasses
+from typing import Any
 
 from cluster import run as module
 from cluster.learn.learning import finish
@@ -10,7 +11,8 @@ from cluster.workers.open import open_pool
 class Untracked:
     """A run that MLflow knows nothing of."""
 
-    uri, error, run_id = "http://me:secret@host", None, ""
+    uri, run_id = "http://me:secret@host", ""
+    error: Any = None
 
     def start(self):
         pass
@@ -30,8 +32,9 @@ def session(run, maps, on_event=lambda event: None, on_row=lambda steps, row: No
     """A run in its folder, with a short validation, and changes of its curriculum."""
     run.path.mkdir(parents=True, exist_ok=True)
     run.write_config()
+    untracked: Any = Untracked()
     made = module.Session(
-        run, pool_of(maps), maps, Untracked(), on_event, on_row, module.perf_counter(), float("inf"), None
+        run, pool_of(maps), maps, untracked, on_event, on_row, module.perf_counter(), float("inf"), None
     )
     config = made.learning.curriculum.config
     made.learning.curriculum.config = dataclasses.replace(config, validation=8, **curriculum)
