@@ -140,7 +140,6 @@ class Session:
         self._state: State | None = None  # after the last step, if it is not saved yet
         self._saved_at = -math.inf
         self._away = self._tracked = False  # whether an outage of MLflow was reported; whether it is sent anything
-        learning.deadline = self.started + self.wall_limit_s
         self.maps.ahead([*learning.curriculum.map_seeds[:3], *VALIDATION_SEEDS])
 
     def wall_s(self) -> float:
@@ -150,6 +149,9 @@ class Session:
     def learn(self) -> None:
         """Learn to the end, saving once a second and at the end."""
         learning = self.learning
+        if math.isfinite(self.wall_limit_s):  # of learning: a learner that takes longer to start gets as much
+            self.started = perf_counter() - (learning.history[-1]["wall_s"] if learning.history else 0.0)
+        learning.deadline = self.started + self.wall_limit_s
         if not learning.done():
             (self.run.path / SUMMARY).unlink(missing_ok=True)  # of a run that is extended
         try:

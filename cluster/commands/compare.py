@@ -25,7 +25,7 @@ from cluster.commands import common
 from cluster.commands.common import WorkFlags, command_path, fail, short_path
 from cluster.commands.progress import clock, progress_in_words, row_in_words
 from cluster.compare import report, tables
-from cluster.compare.plan import ComparisonFolder, Plan, PlannedRun, limits, open_comparison, read_runs
+from cluster.compare.plan import MAX_WALL_S, ComparisonFolder, Plan, PlannedRun, limits, open_comparison, read_runs
 from cluster.compare.processes import Processes, RunProcess
 from cluster.compare.report import read_comparison
 from cluster.compare.results import Run, measured, read_run
@@ -93,7 +93,8 @@ def _compare() -> int:
         _warn("runs at once share the cores, so that each learns less in the same time; use a --budget of car-steps")
     common.warn_of_many_workers(PROG, flags.jobs * max(flags.workers, 1), address)
     shared = {
-        "workers": flags.workers, "address": address or "local", "patience": flags.patience, "wall-time": wall_s,
+        "workers": flags.workers, "address": address or "local", "patience": flags.patience,
+        "wall-time": wall_s or MAX_WALL_S,  # with a limit, the time of a run counts from its first step
         "tracking-uri": redacted(uri), "experiment": flags.experiment,
     }  # fmt: skip
     stopping.listen()
