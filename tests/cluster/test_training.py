@@ -99,8 +99,13 @@ def test_each_group_meets_its_own_episodes_and_its_members_results_are_theirs(ma
     candidate = evolution.candidate()
     told: list[np.ndarray] = []
     driven: list[Outcome] = []
-    evolution.search.tell, start = told.append, evolution.pool.start
-    evolution.pool.start = lambda call: (driven.append(call), start(call))[1]
+    begin_call = evolution.pool.start
+
+    def start(call):
+        driven.append(call)
+        return begin_call(call)
+
+    evolution.search.tell, evolution.pool.start = told.append, start
     curriculum, config, leader = evolution.curriculum, evolution.curriculum.config, evolution.search.leader()
     episodes, followed = curriculum.episodes(after), curriculum.leader_episodes(after)
     row = step(evolution)
