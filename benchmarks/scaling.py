@@ -50,6 +50,7 @@ from gridsim.maps import scenarios
 from gridsim.maps.map import Map
 from gridsim.traffic.world import FIELDS
 
+SIGMA = 0.1  # step size, so that most members drive as well as at the end of a run
 WARM = 2  # generations before the measured ones, in which kernels are loaded and maps sent
 CHILDREN = 100_000  # members that the coordinator alone is timed with
 DRIVER = Path(__file__).with_name("champion_traffic.npz")
@@ -83,6 +84,7 @@ class Generations:
         self._curriculum.target = self._curriculum.config.last_target
         self._search = Recombination(PolicySpec.parse(champion.policy), settings.search_config(), settings.seed)
         self._search.start_from(champion.genome)
+        self._search.sigma = SIGMA
         self.driven: list[Outcome] = []
 
     def next(self) -> None:

@@ -20,6 +20,7 @@ import cluster
 import evolution
 import gridsim
 from cluster import stopping
+from cluster.workers.address import check_address, cluster_address  # noqa: F401 - for those who call this file
 from cluster.workers.child import Child
 from cluster.workers.pool import LOOK_S, PoolError, last_line
 from gridsim.jit import CACHE_FOLDER
@@ -178,4 +179,5 @@ def leave() -> None:
 def reason(error: BaseException) -> str:
     """What one of Ray's long messages means, in one line."""
     text = f"{type(error).__name__}: {error} {error.__cause__}"
-    return next((meaning for sign, meaning in MEANINGS.items() if sign in text), last_line(error)[:300])
+    last = (str(error) or type(error).__name__).strip().rpartition("\n")[2].strip()[:300]
+    return next((meaning for sign, meaning in MEANINGS.items() if sign in text), last)

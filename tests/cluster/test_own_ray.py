@@ -8,29 +8,13 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import psutil  # type: ignore[import-untyped]
 import pytest
-import ray  # before a Ray of our own is started, as in a notebook that uses Ray itself
 import tracked
-from commands import (
-    BIN,
-    command_line,
-    descendants,
-    finish,
-    ray_workers,
-    refused,
-    rows,
-    running,
-    same_run,
-    wait_until,
-)
+from commands import BIN, command_line, descendants, finish, ray_workers, rows, running, same_run, wait_until
 from test_pool import Answering, make_recipes, make_task, never_built
 
-from cluster.commands.cli import evolve_main
-from cluster.commands.compare import compare_main
-from cluster.workers import ray_session
 from cluster.workers.pool import PoolError
 from cluster.workers.ray_pool import RayPool
 
@@ -41,73 +25,110 @@ ON_LOOPBACK = {"127.0.0.1", "::1", "::ffff:127.0.0.1"}
 
 
 @pytest.fixture
-def short() -> Iterator[Path]:
-    """A folder with a path that is short enough for Ray's sockets."""
+def short(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for Ray, with a path that is short enough for its sockets."""
     with tempfile.TemporaryDirectory(prefix="t-", dir="/tmp") as folder:
+        monkeypatch.setenv("RAY_TMPDIR", folder)
         yield Path(folder)
 
 
 @pytest.mark.e2e
 @pytest.mark.usefixtures("stand_ins")
-def test_it_is_private_on_loopback_and_removes_nothing_of_others(short: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    others = short / "ray/session_of_another_user"
-    others.mkdir(parents=True)
-    os.mkfifo(others / "tickets")
-    (others / "logs").mkdir()
-    monkeypatch.setenv("RAY_TMPDIR", str(short))
+def test_it_is_private_on_loopback_and_leaves_nothing_behind(short: Path) -> None:
+    before = dict(os.environ)
     with contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool:
-        pool.evaluate(make_task(), make_recipes(8))
-        (own,) = set(short.iterdir()) - {short / "ray"}
+        pool.open()
+        (own,) = short.iterdir()
         assert own.stat().st_mode & 0o777 == 0o700
         ours = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = [each for process in ours for each in process.net_connections("tcp") if each.status == "LISTEN"]
         assert listening
         assert {each.laddr.ip for each in listening} <= ON_LOOPBACK
-        assert [psutil.Process(pid).nice() for pid in pool.pids()] == [os.nice(0)], "busy programs would starve it"
-    assert [path.name for path in short.iterdir()] == ["ray"]
-    assert sorted(path.name for path in others.iterdir()) == ["logs", "tickets"]
+        assert os.environ["RAY_AUTH_TOKEN"] not in " ".join(command_line(process.pid) for process in ours)
+    assert list(short.iterdir()) == []
+    assert os.environ == before, "other programs would use the token"
 
 
-IN_THE_WAY = """
-import contextlib
+SCRIPT = """
+import sys, time
 from test_pool import Answering, make_recipes, make_task, never_built
 from cluster.workers.ray_pool import RayPool
 
-with contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool:
-    print(pool.evaluate(make_task(), make_recipes(8)).done)
+pool = RayPool(1, never_built, worker_factory=Answering)
+pool.open()
+print(pool.evaluate(make_task(), make_recipes(8)).done, flush=True)
+time.sleep(float(sys.argv[1]))
+pool.close()
 """
 
 
 @pytest.mark.e2e
 @pytest.mark.usefixtures("stand_ins")
-def test_workers_import_what_the_coordinator_imported(tmp_path: Path) -> None:
+def test_workers_import_what_the_coordinator_imported_and_long_temporary_folders_are_no_matter(tmp_path: Path) -> None:
     (tmp_path / "script").mkdir()
-    (tmp_path / "script/evaluate.py").write_text(IN_THE_WAY)
+    (tmp_path / "script/evaluate.py").write_text(SCRIPT)
     for name in ("cluster", "evolution", "gridsim"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a file of the user')")
-    assert finish("python", "script/evaluate.py", cwd=tmp_path).stdout == "16\n"
+    folder = tmp_path / ("long" * 25)  # as Slurm makes one for each job
+    folder.mkdir()
+    assert finish("python", "script/evaluate.py", "0", cwd=tmp_path, TMPDIR=str(folder)).stdout == "16\n"
 
 
 @pytest.mark.e2e
-@pytest.mark.usefixtures("database")
-def test_a_long_temporary_folder_is_no_matter(tmp_path: Path) -> None:
-    """As Slurm makes one for each job. Unix sockets need paths of 107 bytes at most."""
-    folder = tmp_path / ("long" * 25)
-    folder.mkdir()
-    finish("gridsim-evolve", *TINY, "--workers", "1", "--name", "r", cwd=tmp_path, TMPDIR=str(folder))
-    assert list(folder.glob("gs-*")) == []
+@pytest.mark.usefixtures("stand_ins")
+def test_it_ends_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    with running("python", "-c", SCRIPT, "600", cwd=tmp_path) as process:
+        assert process.stdout.readline() == "16\n"
+        ours = psutil.Process(process.pid).children(recursive=True)
+        assert len(ours) > 4
+        process.kill()
+    assert psutil.wait_procs(ours, timeout=30.0)[1] == [], "some are still there"
 
 
-@pytest.mark.parametrize(("folder", "why"), [("long" * 25, "is too long for its sockets"), ("none", "No such file")])
+@pytest.mark.parametrize(("folder", "why"), [("long" * 25, "cannot exceed 107 bytes"), ("none", "No such file")])
 def test_a_folder_that_ray_cannot_use_is_named_with_the_variable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, why: str
 ) -> None:
     if folder != "none":
         (tmp_path / folder).mkdir()
     monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / folder))
-    with pytest.raises(PoolError, match=rf"^Ray cannot be started: .*{folder}.*{why}.*; set RAY_TMPDIR to a folder "):
-        ray_session.own_folder()
+    with (
+        contextlib.closing(RayPool(1, never_built)) as pool,
+        pytest.raises(PoolError, match=rf"^Ray cannot be started: .*{why}.*; set RAY_TMPDIR to a folder with room"),
+    ):
+        pool.open()
     assert list(tmp_path.glob("*/gs-*")) == []
+
+
+@pytest.mark.e2e
+@pytest.mark.usefixtures("stand_ins")
+@pytest.mark.parametrize("lost", ["raylet", "gcs_server"])
+def test_a_ray_that_is_killed_is_noticed_and_its_logs_are_kept(lost: str, short: Path) -> None:
+    with contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool:
+        pool.open()
+        (victim,) = [pid for pid in descendants(os.getpid()) if f"/{lost}" in command_line(pid).partition(" ")[0]]
+        os.kill(victim, signal.SIGKILL)
+        with pytest.raises(
+            PoolError, match=r"^a process of Ray's on this machine was killed or has .*\(logs: "
+        ) as said:
+            while True:
+                pool.evaluate(make_task(), make_recipes(8))
+        begun = time.monotonic()
+    assert time.monotonic() - begun < 20
+    assert Path(str(said.value).partition("(logs: ")[2].rstrip(")")).is_dir()
+
+
+@pytest.mark.e2e
+def test_a_ray_that_was_imported_too_early_for_a_token_is_refused(tmp_path: Path) -> None:
+    text = "import ray; from cluster.workers.pool import open_pool; open_pool(1, None, 0.0, None)"
+    done = finish("python", "-c", text, cwd=tmp_path, code=1)
+    assert done.stderr.splitlines()[-1].endswith(
+        "Ray was imported before it could be given a token: open the pool before that, or evaluate in this process "
+        "(workers=0)"
+    )
+
+
+# --- Whole commands ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.e2e
@@ -125,7 +146,9 @@ def test_a_run_that_has_lost_its_ray_ends_in_one_line_and_can_be_resumed(
         _, err = process.communicate(timeout=60)
     assert process.returncode == 1
     said, hint = err.splitlines()
-    assert said.startswith(f"gridsim-evolve: error: Ray's {lost} on this machine was killed or has crashed (logs: ")
+    assert said.startswith(
+        "gridsim-evolve: error: a process of Ray's on this machine was killed or has crashed (logs: "
+    )
     assert hint == f"continue with: {BIN}/gridsim-evolve --resume runs/r"
     (logged,) = (each.info for each in tracked.runs(f"sqlite:///{tmp_path}/mlflow.db") if each.info.run_name == "r")
     assert logged.status == "FAILED"
@@ -160,50 +183,3 @@ def test_a_network_that_goes_away_is_no_matter(tmp_path: Path) -> None:
         wait_until(lambda: len(rows(tmp_path / "runs/r")) > done, 30)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
-
-
-@pytest.mark.e2e
-@pytest.mark.usefixtures("database")
-def test_memory_that_is_full_costs_no_member_and_is_said_once(reference: Path, tmp_path: Path) -> None:
-    """Ray ends every worker at once, as where another program has filled the memory."""
-    full = {"RAY_memory_usage_threshold": "0.001", "RAY_memory_monitor_refresh_ms": "100"}
-    done = finish("gridsim-evolve", *SMALL, "--workers", "1", "--name", "r", cwd=tmp_path, **full)
-    (said,) = [line for line in done.stderr.splitlines() if "memory is full" in line]
-    assert "so Ray ends workers" in said
-    assert "give fewer --workers" in said
-    assert same_run(tmp_path / "runs/r", reference)
-
-
-def test_a_ray_that_is_in_use_in_this_process_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray, "is_initialized", lambda: True)
-    with (
-        contextlib.closing(RayPool(1, never_built, worker_factory=Answering)) as pool,
-        pytest.raises(PoolError, match=r"call ray\.shutdown\(\) first, or evaluate in this process \(workers=0\)$"),
-    ):
-        pool.evaluate(make_task(), make_recipes(8))
-
-
-# --- RAY_ADDRESS, as Ray's guide sets it ------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("main", [evolve_main, compare_main])
-@pytest.mark.parametrize("address", ["ray://u:secret@127.0.0.1:10001", "127.0.0.1:1"])
-def test_an_address_from_the_environment_is_refused_with_the_variables_name(
-    main: Any, address: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RAY_ADDRESS", address)
-    (line,) = refused(main, monkeypatch, capsys, "--workers", "1")
-    assert line.endswith(" (RAY_ADDRESS says so; unset it, or give --address local)")
-    assert address.rpartition("@")[2] in line
-    assert "secret" not in line
-
-
-def test_the_address_of_rays_jobs_is_left_out_and_local_means_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", "http://u:secret@127.0.0.1:8265")
-    with pytest.warns(UserWarning, match=r"^RAY_ADDRESS=http://127.0.0.1:8265 is where Ray takes jobs, so this run"):
-        assert ray_session.cluster_address("") is None
-    assert ray_session.cluster_address("local") is None
-    monkeypatch.setenv("RAY_ADDRESS", "local")
-    assert ray_session.cluster_address("") is None
-    assert ray_session.cluster_address("auto") is None

@@ -1,31 +1,30 @@
-"""SerialPool, an actor, and what all pools share: chunks, one-line errors, the same result from any worker."""
+"""What all pools share: the same bits from threads and from Ray's workers, one-line errors, and how work is cut."""
 
+import contextlib
 import dataclasses
-import pickle
-import re
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from driving import to_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cluster.workers.actor import Actor, Shared
+from cluster import stopping
 from cluster.workers.pool import (
-    METRE_S,
-    PARCEL_S,
-    WORTH_SENDING_S,
     Chunk,
     Collected,
     Outcome,
     PoolError,
-    SerialPool,
+    WorkerPool,
     cut,
     last_line,
     metres,
+    open_pool,
     rectangle,
 )
+from cluster.workers.threads import ThreadPool
 from cluster.workers.worker import CollectTask, Task, Worker
 from evolution.dqn.experience import Experience
 from evolution.episodes.rollout import EPISODE, RESULT, _rollout
@@ -58,45 +57,32 @@ class Answering(Worker):
         results["steps"] = keys % 5
         row = np.repeat(keys, results["steps"] + 1)
         observations = np.repeat(row[:, None], PolicySpec.parse(task.policy).inputs, axis=1).astype(np.int16)
-        experience = Experience(observations, row.astype(np.uint8), row.astype(np.float32), row.astype(np.uint8))
-        return experience, results
-
-
-class Failing(Answering):
-    def answer(self, task, maps, recipes, first, stop):
-        if 300 in (task.keys[first:stop] if isinstance(task, CollectTask) else recipes["seed"]):
-            raise ValueError("300 is\nnot to be had")
-        return super().answer(task, maps, recipes, first, stop)
+        return Experience(observations, row.astype(np.uint8), row.astype(np.float32), row.astype(np.uint8)), results
 
 
 def make_task(maps: tuple[tuple[str, int], ...] = (), episodes: np.ndarray | None = None) -> Task:
     parents = np.random.default_rng(0).standard_normal((8, 311)).astype(np.float32)
     if episodes is None:
-        episodes = np.zeros(len(maps) or 2, dtype=EPISODE)
-        episodes["start"][:, 4] = np.arange(len(episodes))  # each has a mark of its own, which `Answering` returns
-        episodes["target"], episodes["steps"] = 150.0, 300
+        episodes = goals(*[150.0] * (len(maps) or 2))
     worlds = np.zeros((len(episodes), 0, FIELDS), dtype=np.float32)
     return Task("mlp:6,7", episodes, worlds, maps, SimConfig(), parents, 12345, Mutation())
 
 
 def make_collect_task(n: int) -> CollectTask:
     """Episodes that `Answering` marks by their numbers."""
-    policy, keys = "mlp:6,7", np.arange(n, dtype=np.uint64)
-    weights, epsilons = np.zeros(PolicySpec.parse(policy).size, dtype=np.float32), np.zeros(n, dtype=np.float32)
-    episodes = np.zeros(n, dtype=EPISODE)
-    episodes["target"], episodes["steps"] = 150.0, 300
-    worlds = np.zeros((n, 0, FIELDS), dtype=np.float32)
-    return CollectTask(policy, episodes, worlds, (), SimConfig(), weights, epsilons, keys)
+    weights, epsilons = np.zeros(PolicySpec.parse("mlp:6,7").size, dtype=np.float32), np.zeros(n, dtype=np.float32)
+    worlds, keys = np.zeros((n, 0, FIELDS), dtype=np.float32), np.arange(n, dtype=np.uint64)
+    return CollectTask("mlp:6,7", goals(*[150.0] * n), worlds, (), SimConfig(), weights, epsilons, keys)
 
 
-def collect_drive_task(n: int) -> tuple[CollectTask, list[Map]]:
-    """A small real task on two maps, and the maps."""
-    maps, rng = [build(*name) for name in MAPS], np.random.default_rng(1)
-    episodes, worlds = lane_starts(maps, np.arange(n) % 2, rng, 2)
+def collect_drive_task(n: int) -> CollectTask:
+    """A small real task on two maps."""
+    rng = np.random.default_rng(1)
+    episodes, worlds = lane_starts([build(*name) for name in MAPS], np.arange(n) % 2, rng, 2)
     episodes["target"], episodes["steps"] = 150.0, 300
     weights = (rng.standard_normal(311) * 0.4).astype(np.float32)
     keys, epsilons = rng.integers(1 << 63, size=n, dtype=np.uint64), np.full(n, 0.2, dtype=np.float32)
-    return CollectTask("mlp:6,7", episodes, worlds, MAPS, SimConfig(), weights, epsilons, keys), maps
+    return CollectTask("mlp:6,7", episodes, worlds, MAPS, SimConfig(), weights, epsilons, keys)
 
 
 def make_recipes(n: int) -> np.ndarray:
@@ -115,7 +101,7 @@ def never_built(name: str, seed: int) -> Map:
 
 
 def drive_task() -> tuple[Task, list[Map]]:
-    """A small real task on two maps, and the maps."""
+    """A small real task on two maps, with states to go back to, and the maps."""
     maps = [build(*name) for name in MAPS]
     episodes, _ = lane_starts(maps, np.array([0, 1, 1]), np.random.default_rng(1))
     episodes["target"], episodes["steps"] = 150.0, 300
@@ -123,10 +109,109 @@ def drive_task() -> tuple[Task, list[Map]]:
 
 
 def goals(*metres: float) -> np.ndarray:
-    """Episodes with these targets (m)."""
+    """Episodes with these targets (m), each with a mark of its own, which `Answering` returns."""
     episodes = np.zeros(len(metres), dtype=EPISODE)
-    episodes["target"] = metres
+    episodes["target"], episodes["steps"] = metres, np.maximum(metres, 1)
+    episodes["start"][:, 4] = np.arange(len(metres))
     return episodes
+
+
+# --- Every pool -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        (1, 0),
+        (2, 0),
+        (3, 0),
+        pytest.param((0, 1), marks=pytest.mark.e2e),
+        pytest.param((0, 2), marks=pytest.mark.e2e),
+    ],
+    ids=["1 thread", "2 threads", "3 threads", "1 worker", "2 workers"],
+)
+def pool(request: pytest.FixtureRequest) -> Iterator[WorkerPool]:
+    threads, workers = request.param
+    with contextlib.closing(ThreadPool(build, threads) if threads else open_pool(workers, None, 0.0, build)) as pool:
+        yield pool
+
+
+def test_every_pool_returns_the_same_bits(pool: WorkerPool) -> None:
+    """As the worker itself does, all at once; `wait` says when all is there."""
+    (task, maps), recipes, collecting = drive_task(), make_recipes(200), collect_drive_task(60)
+    episodes = task.episodes.copy()
+    episodes["rewind"][1] = 8
+    alone = dataclasses.replace(task, episodes=episodes)
+    whole, _, _ = Worker().evaluate(task, maps, recipes)
+    _, back, _ = Worker().evaluate(alone, maps, recipes[:1])
+    experience, results = Worker().collect(collecting, maps)
+    for _ in range(2):
+        call, seen = pool.start(Outcome(task, recipes)), [0]
+        while pool.wait(call, 5.0):
+            seen.append(call.progress()[0])
+        assert call.results.tobytes() == whole.tobytes()
+        assert call.progress() == (200, 200)
+        assert seen == sorted(seen)
+        assert 0 < max(call.busy_s.values()) <= call.wall_s
+        assert (call.retries, call.warnings) == (0, [])
+        assert pool.evaluate(alone, recipes[:1]).rewound[1].tobytes() == back[0, 0].tobytes()
+        collected = pool.collect(collecting)
+        assert to_bytes(collected.experience) == to_bytes(experience)
+        assert collected.results[:, 0].tobytes() == results.tobytes()
+    assert call.broadcast_bytes < 2000 + task.parents.nbytes, "maps are sent once"
+    assert pool.evaluate(task, make_recipes(0)).results.shape == (0, 3)
+
+
+def test_what_is_asked_for_is_driven_and_nothing_else(pool: WorkerPool) -> None:
+    task, maps = drive_task()
+    recipes, asked = make_recipes(40), [Chunk(slice(0, 10), slice(1, 3)), Chunk(slice(10, 40), slice(0, 1))]
+    whole, _, _ = Worker().evaluate(task, maps, recipes)
+    wanted = np.zeros_like(whole)
+    for part in asked:
+        wanted[part] = whole[part]
+    assert pool.evaluate(task, recipes, asked).results.tobytes() == wanted.tobytes()
+
+
+def test_a_failure_ends_in_one_line_and_the_pool_can_be_used_again(pool: WorkerPool) -> None:
+    (task, maps), collecting = drive_task(), collect_drive_task(10)
+    bad = task.episodes.copy()
+    bad["steps"][1] = 0
+    with pytest.raises(
+        PoolError, match=r"^a worker failed on members \d+ to \d+: ValueError: an episode has 1 to \S+ steps, not 0\Z"
+    ):
+        pool.evaluate(dataclasses.replace(task, episodes=bad), make_recipes(30))
+    bad = np.zeros_like(collecting.episodes)
+    with pytest.raises(PoolError, match=r"^a worker failed on episodes \d+ to \d+: ValueError: an episode has "):
+        pool.collect(dataclasses.replace(collecting, episodes=bad))
+    whole, _, _ = Worker().evaluate(task, maps, make_recipes(30))
+    assert pool.evaluate(task, make_recipes(30)).results.tobytes() == whole.tobytes()
+
+
+def test_a_call_that_is_stopped_or_replaced_leaves_no_trace(pool: WorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    task, maps = drive_task()
+    first = pool.start(Outcome(task, make_recipes(300)))
+    with monkeypatch.context() as patch:
+        patch.setattr(stopping, "_asked_at", 0.0)
+        with pytest.raises(stopping.Stopped):
+            pool.wait(first, 1.0)
+    second = pool.run(Outcome(task, make_recipes(50)))
+    assert second.results.tobytes() == Worker().evaluate(task, maps, make_recipes(50))[0].tobytes()
+    with pytest.raises(PoolError, match="another call has taken this one's place"):
+        pool.run(first) if first.done == first.total else pool.wait(first, 1.0)
+
+
+# --- Without processes ------------------------------------------------------------------------------------------------
+
+
+def test_threads_end_within_one_piece_and_leave_the_rest() -> None:
+    pool = ThreadPool(never_built, 2, Answering)
+    call = pool.start(Outcome(make_task(episodes=goals(*[400.0] * 16)), make_recipes(20_000)))
+    for _ in range(2):
+        pool.close()
+    assert call.done == 0
+    assert pool._answers.qsize() < 1000, "of 6,400"
+    with pytest.raises(PoolError, match="or the pool of workers is closed"):
+        pool.wait(call, 1.0)
 
 
 @given(st.integers(0, 900), st.lists(st.floats(1.0, 2000.0), min_size=1, max_size=60), st.integers(1, 64))
@@ -138,11 +223,9 @@ def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[flo
         wanted, seen = np.zeros((n, e), dtype=int), np.zeros((n, e), dtype=int)
         for part in asked:
             wanted[part] += 1
-        for parcel in cut(make_task(episodes=goals(*targets)), asked, workers):
-            assert parcel
-            for part in parcel:
-                assert seen[part].size
-                seen[part] += 1
+        for part in cut(make_task(episodes=goals(*targets)), asked, workers, 5e3, 2e4):
+            assert seen[part].size
+            seen[part] += 1
         assert np.array_equal(seen, wanted)
 
 
@@ -150,117 +233,44 @@ def test_cut_covers_every_episode_of_every_member_once(n: int, targets: list[flo
 @pytest.mark.parametrize(
     ("n", "episodes", "target"), [(512, 12, 400.0), (24, 16, 1000.0), (4, 48, 2000.0), (1, 208, 2000.0)]
 )
-def test_chunks_let_no_worker_wait_for_the_slowest(workers: int, n: int, episodes: int, target: float) -> None:
-    """Simulated with equal metres: from the first worker that runs out to the last, one small chunk passes."""
-    task, metre_s = make_task(episodes=goals(*[target] * episodes)), 1e-6
-    parts = cut(task, rectangle(n, episodes), workers, [metre_s])
+def test_pieces_let_no_worker_wait_for_the_slowest(workers: int, n: int, episodes: int, target: float) -> None:
+    """Simulated with equal metres: from the first worker that runs out to the last, one small piece passes."""
+    task = make_task(episodes=goals(*[target] * episodes))
+    pieces = cut(task, rectangle(n, episodes), workers, 5e3, 2e4)
     busy = [0.0] * workers
-    for parcel in parts:
-        busy[busy.index(min(busy))] += sum(metres(task, part) for part in parcel)
-    assert max(busy) - min(busy) <= max(WORTH_SENDING_S / metre_s, PARCEL_S * workers / metre_s, target) + 1e-6
-    assert len(parts) <= 16 * workers, "as few as that needs"
+    for piece in pieces:
+        busy[busy.index(min(busy))] += metres(task, piece)
+    assert max(busy) - min(busy) <= max(5e3, target * episodes if n > 1 else target) + 1e-6
+    assert max(metres(task, piece) for piece in pieces) <= 2e4 + target, "so that it is stopped soon"
+    assert sum(busy) / len(pieces) >= min(4e3, sum(busy) / (3 * workers)), "as few as that needs"
 
 
-def test_one_long_evaluation_beside_many_short_ones_is_shared_among_the_workers() -> None:
-    """Validation drives its 2,000 m; most members crash early, so a metre of theirs takes less time."""
-    task = make_task(episodes=goals(*[2000.0] * 256, 400.0, 400.0))
-    asked, metre_s = [Chunk(slice(0, 1), slice(0, 256)), Chunk(slice(1, 511), slice(256, 258))], [1e-6, 2e-7]
-    busy = [0.0, 0.0]
-    for parcel in cut(task, asked, 2, metre_s):
-        busy[busy.index(min(busy))] += sum(metre_s[part.columns.start // 256] * metres(task, part) for part in parcel)
-    assert abs(busy[0] - busy[1]) <= WORTH_SENDING_S
+def test_large_pieces_come_first() -> None:
+    task = make_task(episodes=goals(*[400.0] * 2))
+    sizes = [metres(task, piece) for piece in cut(task, rectangle(512, 2), 2, 5e3, 1e6)]
+    assert all(before >= 0.75 * after for before, after in pairwise(sizes))
+    assert sizes[0] > 4 * sizes[-1]
 
 
-def test_a_parcel_holds_members_of_several_groups() -> None:
-    """So that the number of parcels does not grow with the number of groups."""
-    task = make_task(episodes=goals(*[400.0] * 16))
-    assert len(cut(task, GROUPS, 2, [1e-6] * 8)) == len(cut(task, rectangle(512, 2), 2, [1e-6])) < 16
-
-
-def test_what_is_asked_for_is_driven_and_nothing_else_and_progress_is_reported() -> None:
-    pool, recipes = SerialPool(never_built, Answering), make_recipes(512)
-    progress, wanted = [(0, 0)], np.zeros((512, 16))
-    for group in GROUPS:
-        wanted[group] = recipes["seed"][group.rows, None] * 16.0
-    task = make_task(episodes=goals(*[400.0] * 16))
-    outcome = pool.evaluate(task, recipes, lambda *done: progress.append(done), GROUPS)
-    assert np.array_equal(outcome.results["distance"], wanted)
-    assert progress == sorted(progress)
-    assert progress[-1] == (512, 512)
-    assert len(progress) > 5
-    assert (outcome.retries, outcome.bytes_down, outcome.bytes_up, outcome.broadcast_bytes) == (0, 0, 0, 0)
-    assert 0 < sum(outcome.busy_s.values()) <= outcome.wall_s
-    assert pool.evaluate(make_task(), make_recipes(0)).results.shape == (0, 2)
-    for _ in range(2):
-        pool.close()
-
-
-def test_a_first_chunk_takes_no_worker_longer_than_patience_lasts() -> None:
-    """Of a large network, 1 ms a metre, before any of it is measured."""
-    task = make_task(episodes=goals(100.0, 100.0))
-    assert max(metres(task, part) for (part,) in cut(task, rectangle(10_000, 2), 2, [METRE_S])) * 1e-3 < 20
-    assert len(cut(task, rectangle(512, 2), 2, [METRE_S])) < 40, "as few as a small network needs"
-
-
-def test_what_is_to_be_done_meanwhile_is_done_to_its_end() -> None:
-    """By both calls, also where there is nothing else to do."""
-    pool, left = SerialPool(never_built, Answering), list(range(8))
-    pool.evaluate(make_task(), make_recipes(0), meanwhile=lambda: left.pop() > 4)
-    assert left == [0, 1, 2, 3]
-    pool.collect(make_collect_task(40), meanwhile=lambda: bool(left.pop()))
-    assert left == []
-
-
-@pytest.mark.parametrize("parcels", [0, 1, 5, 1000])
-def test_a_call_that_is_stopped_returns_all_that_is_still_to_be_done(parcels: int) -> None:
-    pool = SerialPool(never_built, Answering)
-    task, recipes = make_task(episodes=goals(*[400.0] * 16)), make_recipes(512)
-    whole, begun, stops = pool.evaluate(task, recipes, asked=GROUPS), Outcome(task, recipes, GROUPS), [False] * parcels
-    left = pool.work_until(lambda: not stops or stops.pop(), begun, None, None)
-    rest = pool.evaluate(task, recipes, asked=left)
-    assert begun.done + rest.done == whole.done
-    assert (begun.done > 0) == (parcels > 0)
-    assert (rest.done > 0) == (parcels < 1000)
-    for name in ("distance", "paced"):
-        assert (begun.results[name] + rest.results[name] == whole.results[name]).all()
-
-
-def test_a_lost_member_has_no_results_and_experience_is_in_order() -> None:
-    """A member whose first episode came back and whose second kills; an episode of a batch whose end came first."""
-    outcome = Outcome(make_task(), make_recipes(3), rectangle(3, 2))
-    for rows, columns in ((slice(0, 2), slice(0, 2)), (slice(2, 3), slice(0, 1))):
-        outcome.add(0, Chunk(rows, columns), np.ones((), dtype=RESULT), np.zeros(0), np.zeros(0), 0.1)
-    assert outcome.done < outcome.total
-    outcome.lose(Chunk(slice(2, 3), slice(1, 2)))
-    assert outcome.done == outcome.total
-    assert outcome.lost.tolist() == [False, False, True]
-    assert (outcome.results["distance"] == [[1, 1], [1, 1], [0, 0]]).all()
-
+def test_experience_is_in_order_and_what_is_asked_for_has_a_name() -> None:
     task = make_collect_task(10)
     collected = Collected(task)
-    for first, stop in ((4, 10), (0, 3)):
+    for first, stop in ((4, 10), (0, 4)):
         answer = Answering().answer(task, [], make_recipes(0), first, stop)
         collected.add(0, Chunk(slice(first, stop), slice(0, 1)), *answer)
-    collected.lose(Chunk(slice(3, 4), slice(0, 1)))
-    assert collected.done == collected.total
-    assert list(dict.fromkeys(collected.experience.rewards)) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
-
-
-@pytest.mark.parametrize("what", ["members", "episodes"])
-def test_a_failing_worker_ends_in_one_line_that_names_the_chunk(what: str) -> None:
-    pool = SerialPool(never_built, Failing)
-    with pytest.raises(PoolError) as caught:
-        pool.evaluate(make_task(), make_recipes(512)) if what == "members" else pool.collect(make_collect_task(512))
-    line = rf"^a worker failed on parcel \d+ \({what} (\d+) to (\d+)\): ValueError: not to be had\Z"
-    ((first, last),) = re.findall(line, str(caught.value))
-    assert int(first) <= 300 <= int(last)
-    assert isinstance(caught.value.__cause__, ValueError)
+    assert collected.progress() == (10, 10)
+    assert list(dict.fromkeys(collected.experience.rewards)) == list(range(10))
+    assert collected.identify(3) == "episode 3 (key 0x3, exploration 0)"
+    outcome = Outcome(make_task(), make_recipes(9))
+    assert outcome.identify(5) == "member 5 (cross of rows 5 and 7, seed 5, key 0x3039)"
+    assert outcome.rows_of(Chunk(slice(2, 5), slice(0, 2))) == "members 2 to 4"
     assert last_line(MemoryError()) == "MemoryError"
+    assert last_line(ValueError("300 is\nnot to be had")) == "ValueError: not to be had"
 
 
 @pytest.mark.parametrize("policy", ["mlp:6,7", "cnn:8,8,8@2"])
-def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
-    """All at once, in the pool's chunks, and one member and episode at a time: the same bits, rewound ones, too."""
+def test_pieces_change_nothing_for_the_real_worker(policy: str) -> None:
+    """All at once, and one member and episode at a time, from arrays that may be read only: the same bits."""
     task, maps = drive_task()
     parents = np.random.default_rng(0).standard_normal((8, PolicySpec.parse(policy).size)).astype(np.float32)
     episodes, recipes = task.episodes.copy(), make_recipes(40)
@@ -268,73 +278,13 @@ def test_chunks_change_nothing_for_the_real_worker(policy: str) -> None:
     task = dataclasses.replace(task, policy=policy, parents=parents, episodes=episodes)
     for first, kind in ((20, Kind.NEW), (25, Kind.STEP), (30, Kind.MIRRORED), (35, Kind.COPY)):
         recipes["kind"][first : first + 5] = kind
-    outcome = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes)
     whole, rewound, _ = Worker().evaluate(task, maps, recipes)
-    assert outcome.results.tobytes() == whole.tobytes()
+    compiled = [len(kernel.signatures) for kernel in (_breed, _rollout)]
+    for array in (task.parents, task.episodes, task.worlds, recipes):
+        array.setflags(write=False)  # as they are where Ray has brought them
     for i, e in np.ndindex(whole.shape):
         alone, back, _, seconds = Worker().answer(task, maps, recipes[i : i + 1], e, e + 1)
         assert (alone.tobytes(), back.tobytes()) == (whole[i, e].tobytes(), rewound[i, e].tobytes())
         assert seconds > 0
     assert whole["distance"].max() > 0
-
-
-# --- Both ends of what is sent to an actor, joined without Ray --------------------------------------------------------
-
-
-class Megabyte:
-    nbytes = 1 << 20
-
-
-def store() -> Shared:
-    """One of maps of a megabyte each, in which references are what they refer to."""
-    return Shared(lambda value: value, lambda *_: Megabyte())  # type: ignore[arg-type]
-
-
-def of(scenario: str, seeds: list[int]) -> Task:
-    return make_task(tuple((scenario, seed) for seed in seeds))
-
-
-def test_the_store_keeps_one_scenarios_maps_and_a_worker_gets_each_once() -> None:
-    shared, known = store(), set[tuple[str, int]]()
-    for scenario, seeds, new, gone in (
-        ("seamless", [0, 1, 2], [0, 1, 2], []),
-        ("seamless", [3, 1], [3], []),
-        ("city", [3], [3], [0, 1, 2, 3]),
-        ("seamless", [0], [0], [3]),  # it was forgotten
-    ):
-        assert shared.put(of(scenario, seeds)) >> 20 == len(new)
-        lacking, forgotten, *refs = shared.update(known)
-        assert [seed for _, seed in lacking] == new
-        assert sorted(seed for _, seed in forgotten) == gone
-        assert len(refs) == 1 + len(new)
-    shared.put_maps([("seamless", 0), ("seamless", 7)])  # ahead of the task that needs them
-    assert shared.put(of("seamless", [7])) >> 20 == 1
-    assert shared.update(known)[0] == [("seamless", 7)]
-
-
-def test_the_store_forgets_the_maps_that_were_not_used_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cluster.workers.actor.MOST_MAPS", 4)
-    shared, known = store(), set[tuple[str, int]]()
-    for seeds, gone in (([0, 1, 2, 3], []), ([0, 4], [1]), ([0, 1, 2], [3]), ([5, 6, 7], [0, 1, 4])):
-        shared.put(of("city", seeds))
-        assert {seed for _, seed in shared.update(known)[1]} == set(gone)
-
-
-def test_an_actor_answers_as_the_serial_pool_does_and_keeps_its_maps_until_they_are_gone() -> None:
-    task, maps = drive_task()
-    recipes = make_recipes(20)
-    wanted = SerialPool(lambda *name: maps[MAPS.index(name)]).evaluate(task, recipes).results
-    compiled = [len(kernel.signatures) for kernel in (_breed, _rollout)]
-    for array in (task.parents, task.episodes, task.worlds):
-        array.setflags(write=False)
-    actor = Actor(Worker)
-
-    def run(rows: slice, *update: Any) -> np.ndarray:
-        return pickle.loads(actor.run([(recipes[rows].tobytes(), 0, len(task.episodes))], *update))[0][0]
-
-    first = run(slice(0, 8), MAPS, (), pickle.dumps(task, protocol=5), *pickle.loads(pickle.dumps(maps)))
-    assert np.concatenate([first, run(slice(8, 20))]).tobytes() == wanted.tobytes()
-    assert run(slice(0, 20), (), (), pickle.dumps(task)).tobytes() == wanted.tobytes()
-    assert [len(kernel.signatures) for kernel in (_breed, _rollout)] == compiled, "nor for read-only arrays once more"
-    with pytest.raises(KeyError):  # it forgets maps when it is to
-        run(slice(0, 20), (), MAPS, pickle.dumps(task))
+    assert [len(kernel.signatures) for kernel in (_breed, _rollout)] == compiled
