@@ -138,11 +138,11 @@ def test_resume_logs_what_is_missing_and_notes_what_is_different(uri, tmp_path):
 def test_files_of_an_extended_run_are_sent_again_though_they_have_the_same_size(uri, tmp_path):
     folder = write_run(tmp_path / "a", 2, success_rate=0.5, seed=1)
     _, run_id = send(folder, uri)
-    longer = tracking(write_run(folder, 2, seed=2), uri)
+    longer = tracking(write_run(folder, 3, seed=2), uri)
     assert longer.wait_id(30) == run_id
-    write_run(folder, 2, success_rate=0.5, seed=2)
-    assert longer.close("FINISHED") is None
-    assert longer.sent["file"] == 6
+    assert longer.close("KILLED") is None
+    write_run(folder, 3, success_rate=0.5, seed=2)  # it ended while MLflow was away
+    assert send(folder, uri) == ("2 rows, 6 files, 1 model", run_id)
     stored = tmp_path / "store/mlartifacts" / run_id / "artifacts/champion.npz"
     assert stored.read_bytes() == (folder / "champion.npz").read_bytes()
 
