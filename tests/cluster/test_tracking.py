@@ -9,7 +9,7 @@ import time
 
 import pytest
 from commands import finish, start, wait_until
-from tracked import MODEL, NAMES, PYTHONPATH, QUIET, client, read_run, row, runs, send, steps, tracking, write_run
+from tracked import MODEL, PYTHONPATH, QUIET, client, read_run, row, runs, send, steps, tracking, write_run
 
 import cluster.tracking.commit
 from cluster.tracking import logged, sync
@@ -266,8 +266,3 @@ def test_git_commit(tmp_path):
     assert told(PATH="/nowhere") == told("repository/.venv/site-packages") == "unknown"
     (tmp_path / "repository/cluster/__init__.py").write_text("changed = True\n")
     assert told() == f"{commit}-dirty"
-
-
-def test_rows_are_named_as_in_the_history(tmp_path):
-    content = read_run(write_run(tmp_path / "a", 2))
-    assert content.rows == [(step, {name: row(step)[name] for name in NAMES}, row(step)["wall_s"]) for step in (0, 1)]
