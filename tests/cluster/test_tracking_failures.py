@@ -44,13 +44,31 @@ def test_files_that_cannot_be_stored_hold_up_nothing_else(uri, tmp_path, impatie
     assert send(folder, uri)[0] == "6 files, 1 model"
 
 
-@pytest.mark.parametrize("mode", ["IMMEDIATE", "EXCLUSIVE"])  # others write; or nobody can even read
-def test_a_locked_database_is_waited_for(uri, tmp_path, impatient, mode):
+@pytest.mark.parametrize(("error", "tries"), [("database is locked", 6), ("anything else", 2)])
+def test_a_run_that_is_closed_waits_for_a_locked_database_alone(uri, tmp_path, impatient, monkeypatch, error, tries):
+    run, failed = tracking(write_run(tmp_path / "a", 1), uri), 0
+    run.wait_id(30)
+    real = LoggedRun.send
+
+    def send(self, content, status):
+        nonlocal failed
+        if status and failed < 5:
+            failed += 1
+            return error
+        return real(self, content, status)
+
+    monkeypatch.setattr(LoggedRun, "send", send)
+    said = run.close("KILLED")
+    assert said == (None if tries == 6 else f"not logged to MLflow at {uri}: the status KILLED: {error}")
+    assert failed == min(tries, 5)
+
+
+def test_a_locked_database_is_waited_for(uri, tmp_path, impatient):
     folder = write_run(tmp_path / "a", 1)
     run = tracking(folder, f"{uri}?timeout=0.1")
     run.wait_id(30)
     with contextlib.closing(sqlite3.connect(uri.removeprefix("sqlite:///"), isolation_level=None)) as database:
-        database.execute(f"BEGIN {mode}")
+        database.execute("BEGIN EXCLUSIVE")
         write_run(folder, 3)
         assert check_uri(uri) == uri
         closed: list[str | None] = []

@@ -1,17 +1,14 @@
 """MLflow's stores as people have them: hosted, of another MLflow, locked, in odd folders, with files elsewhere."""
 
-import contextlib
 import os
 import re
-import sqlite3
 import threading
-import time
 import urllib.request
 from pathlib import Path
 
 import pytest
-from commands import finish, start
-from tracked import MODEL, PYTHONPATH, QUIET, client, free_port, runs, send, steps, tracking, write_run
+from commands import finish
+from tracked import PYTHONPATH, QUIET, free_port, runs, send, tracking, write_run
 
 from cluster.tracking.address import TrackingError, check_uri, reach_loopback_directly, sqlite_path, sqlite_uri
 from cluster.tracking.database import create_database, run_tables, silence_mlflow
@@ -93,20 +90,6 @@ def test_a_database_of_an_older_mlflow_is_refused_before_it_is_migrated(tmp_path
     assert check_uri() == uri
 
 
-@pytest.mark.e2e
-def test_a_database_that_is_locked_for_eight_seconds_as_a_run_starts(uri, tmp_path):
-    with contextlib.closing(sqlite3.connect(uri.removeprefix("sqlite:///"), isolation_level=None)) as database:
-        database.execute("BEGIN EXCLUSIVE")
-        started = time.perf_counter()
-        assert check_uri(uri) == uri
-        assert time.perf_counter() - started < 1.0
-        run = tracking(write_run(tmp_path / "a", 3), uri)
-        time.sleep(8.0)
-        database.execute("ROLLBACK")
-    assert run.close("FINISHED") is None
-    assert steps(uri, run.run_id) == [0, 1, 2]
-
-
 PLUGIN = """
 def tracking(store_uri, artifact_uri):
     from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
@@ -148,20 +131,6 @@ def test_a_run_in_the_store_of_a_plug_in(tmp_path):
 def test_hosted_stores_are_left_to_mlflow(uri, tmp_path):
     assert check_uri(uri) == check_uri(begun_with=uri) == uri
     assert Tracking(tmp_path, uri, "", read_run).where("mlflow") == uri
-
-
-@pytest.mark.e2e
-def test_several_first_runs_at_once_in_an_empty_folder(tmp_path):
-    uri = f"sqlite:///{tmp_path}/mlflow.db"
-    script = ("python", "-c", QUIET, uri)
-    started = [start(*script, str(tmp_path / "runs" / n), "good", cwd=tmp_path, PYTHONPATH=PYTHONPATH) for n in "abcd"]
-    for process in started:
-        assert (*process.communicate(timeout=600), process.returncode) == ("", "", 0)
-    assert {run.info.run_name: steps(uri, run.info.run_id) for run in runs(uri)} == {
-        name: [*range(20)] for name in "abcd"
-    }
-    assert len(client(uri).search_model_versions(f"name = '{MODEL}'")) == 4
-    assert sorted(os.listdir(tmp_path)) == ["mlartifacts", "mlflow.db", "runs"]
 
 
 @pytest.mark.filterwarnings("ignore")  # of SQLAlchemy's, about MLflow

@@ -14,7 +14,7 @@ import psutil  # type: ignore[import-untyped]
 import pytest
 from browser import Browser, needs_chromium
 from commands import finish
-from tracked import free_port, row, tracking
+from tracked import MODEL, free_port, row, send, tracking, write_run
 
 from cluster.tracking.content import Content
 from cluster.tracking.database import run_tables
@@ -78,6 +78,7 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
     folder = tmp_path / "store"
     logged(uri, tmp_path, "first", 0.875)
     logged(uri, tmp_path, "second", 0.625)
+    send(write_run(tmp_path / "third", 1, success_rate=0.5), uri, "other")
     with make_ui(root, folder, port := free_port()) as link:
         with Browser(link, tmp_path / "profile") as browser:
             for words in (
@@ -95,6 +96,10 @@ def test_the_link_leads_to_the_run_table_and_its_curves(uri, root, tmp_path):
             browser.wait_for(f"{curves} == 2")
             browser.run("document.querySelector('.is-visibility-toggle-checkbox').click()")  # the eye in front of a run
             browser.wait_for(f"{curves} == 1")
+        page = f"http://127.0.0.1:{port}/#/models/{MODEL}/versions/1?workflowType=machine_learning"
+        with Browser(page, tmp_path / "another profile") as browser:
+            for words in ("champion_sha256", "Inputs (1)", "Outputs (1)", "@ best", "50.0% of the held-out drives"):
+                browser.wait_for_text(words)
         address = f"http://127.0.0.1:{port}/ajax-api/3.0/mlflow/ui-telemetry"
         events = urllib.request.Request(address, b'{"records": []}', {"Content-Type": "application/json"})
         with urllib.request.urlopen(events, timeout=20) as answer:
