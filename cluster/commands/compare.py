@@ -26,7 +26,7 @@ from cluster.commands.common import WorkFlags, command_path, fail, short_path
 from cluster.commands.progress import clock, progress_in_words, row_in_words
 from cluster.compare import report, tables
 from cluster.compare.plan import MAX_WALL_S, ComparisonFolder, Plan, PlannedRun, limits, open_comparison, read_runs
-from cluster.compare.processes import Processes, RunProcess
+from cluster.compare.processes import Processes, RunProcess, is_sent
 from cluster.compare.report import read_comparison
 from cluster.compare.results import Run, measured, read_run
 from cluster.redaction import redacted
@@ -86,7 +86,7 @@ def _compare() -> int:
         raise GridSimError(f"--jobs must be 1 to {MAX_JOBS}, not {flags.jobs}")
     folder, flags = _prepare(arguments, flags)
     uri, wall_s = check_uri(flags.tracking_uri, saved_uri(folder.path)), limits(flags.budget)[1]
-    left = [run for run in folder.planned() if not run.finished()]
+    left = [run for run in folder.planned() if not (run.finished() and is_sent(run))]
     address = cluster_address(flags.address) if left else None
     lock(folder.path)
     if flags.jobs > 1 and wall_s:

@@ -34,8 +34,7 @@ class RunProcess:
     """A process that trains one run; what it prints is in its log."""
 
     def __init__(self, run: PlannedRun, flags: Sequence[str], environment: Mapping[str, str]):
-        self.run, self.began = run, time.perf_counter()
-        self.log = run.path.parent / LOGS / f"{run.name}.log"
+        self.run, self.began, self.log = run, time.perf_counter(), log_of(run)
         self.log.parent.mkdir(exist_ok=True)
         command = [str(_script(run.settings.command)), *run.flags(), "--resume-if-exists", *flags]
         if sys.platform == "linux":
@@ -48,8 +47,7 @@ class RunProcess:
 
     def said(self, kind: str) -> list[str]:
         """Its messages of one kind, error or warning."""
-        text = self.log.read_text(encoding="utf-8", errors="replace")
-        return re.findall(rf"^gridsim-\w+: {kind}: (.*)$", text, re.MULTILINE)
+        return _said(self.log, kind)
 
     def newest_row(self) -> dict[str, float]:
         """The last row of its run's history.csv, by column; empty before there is one."""
@@ -89,6 +87,21 @@ class Processes:
             each.process.terminate()
         for each in self.running:
             each.process.wait()
+
+
+def log_of(run: PlannedRun) -> Path:
+    """What the latest process of a run has printed."""
+    return run.path.parent / LOGS / f"{run.name}.log"
+
+
+def is_sent(run: PlannedRun) -> bool:
+    """Whether MLflow has all of a finished run, as far as its process knew; if not, its command sends the rest."""
+    log = log_of(run)
+    return not log.is_file() or not any("not logged to MLflow" in text for text in _said(log, "warning"))
+
+
+def _said(log: Path, kind: str) -> list[str]:
+    return re.findall(rf"^gridsim-\w+: {kind}: (.*)$", log.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
 
 
 def _script(command: str) -> Path | str:

@@ -36,7 +36,8 @@ echo "$name $* $MLFLOW_TRACKING_URI $MLFLOW_RUN_CONTEXT" >> asked
 echo "gridsim-evolve: warning: MLflow is slow" >&2
 if [ -e "broken-$name" ]; then echo "gridsim-evolve: error: the workers are gone" >&2; exit 1; fi
 if [ -e "killed-$name" ]; then kill -9 $$; fi
-cp -r "made/$name" "$output/$name"
+if [ -e "away-$name" ]; then echo "gridsim-evolve: warning: not logged to MLflow at h: 4 rows: no answer" >&2; fi
+[ -e "$output/$name" ] || cp -r "made/$name" "$output/$name"
 """
 
 
@@ -134,6 +135,16 @@ def test_a_run_gets_the_password_and_the_parent_of_its_mlflow_run_in_its_environ
     made.tracking.wait_id.return_value = ""
     made.run(*budget, "--name", "d")
     assert (tmp_path / "asked").read_text().endswith(" {}\n")
+
+
+def test_what_mlflow_lacks_of_a_finished_run_is_sent_as_the_comparison_is_resumed(tmp_path, made):
+    names = [planned.name for planned in PLAN.planned(tmp_path)][:4]
+    (tmp_path / f"away-{names[1]}").touch()
+    assert made.run(*ASKED, "--name", "c", "--seeds", 1)[0] == 0
+    (tmp_path / f"away-{names[1]}").unlink()
+    for _ in range(2):
+        assert made.run("--resume", "runs/c")[0] == 0
+        assert asked(tmp_path) == [*names, names[1]]
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])

@@ -118,6 +118,7 @@ def test_budget_is_looked_at_often_enough(budget, every):
         Plan(budget="90s"),
         Plan(budget="200k", traffic=3, population=64, generations=5, seeds=2),
         Plan(observation="grid", learners=("evolution", "dqn"), grid=("policy=cnn:8,16,32@1,cnn:8,16,32@2",)),
+        Plan(("city",), ("evolution",), grid=("policy=mlp:64+steering",)),  # a default, but not in traffic
         Plan(("curved",), ("two-parents",), grid=("mutation-rate=0.03,0.5", "elites=0,8")),
     ],
 )
