@@ -34,7 +34,8 @@ import numpy as np
 from cluster.settings import EvolveSettings
 from cluster.store.champion import load_champion
 from cluster.workers.kernels import compile_ahead
-from cluster.workers.pool import Chunk, Outcome, WorkerPool, open_pool
+from cluster.workers.open import open_pool
+from cluster.workers.pool import Chunk, Outcome, WorkerPool
 from cluster.workers.ray_pool import RayPool
 from cluster.workers.threads import ThreadPool
 from cluster.workers.worker import Task, Worker
@@ -44,11 +45,11 @@ from evolution.networks.policy import PolicySpec
 from evolution.search import fitness
 from evolution.search.base import SearchConfig
 from evolution.search.recombination import Recombination
-from gridsim.car.ego import End
 from gridsim.config import SimConfig
 from gridsim.maps import scenarios
 from gridsim.maps.map import Map
-from gridsim.traffic.world import FIELDS
+from gridsim.state import TRAFFIC_FIELDS as FIELDS
+from gridsim.state import End
 
 SIGMA = 0.1  # step size, so that most members drive as well as at the end of a run
 WARM = 2  # generations before the measured ones, in which kernels are loaded and maps sent

@@ -18,7 +18,7 @@ def held_out_table(title: str, figures: Mapping[str, float]) -> Table:
 
 
 def errors_table(title: str, figures: Mapping[str, float]) -> Table:
-    """Velocity and steering errors, as from `gridsim.reference.errors`."""
+    """Velocity and steering errors, as from `gridsim.reference`."""
     numbers = Column("mean", justify="right"), Column("max", justify="right")
     table = Table("", *numbers, title=title, title_justify="left")
     for head, mean, largest, digits in (

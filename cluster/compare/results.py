@@ -37,7 +37,7 @@ ERROR_FIGURES = {
     "steering_error_max_deg": "steering_max_deg",
     "compared_m": "metres",
 }
-"""A champion's errors against the reference, by their names in `gridsim.reference.errors`."""
+"""A champion's errors against the reference, by their names in `gridsim.reference`."""
 RUN_FIGURES = (
     "success_rate", "distance_m", "speed_mps", "collision_rate", "car_steps", "wall_s", "training_s", "best_car_steps",
     "best_wall_s",

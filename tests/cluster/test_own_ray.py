@@ -120,7 +120,7 @@ def test_a_ray_that_is_killed_is_noticed_and_its_logs_are_kept(lost: str, short:
 
 @pytest.mark.e2e
 def test_a_ray_that_was_imported_too_early_for_a_token_is_refused(tmp_path: Path) -> None:
-    text = "import ray; from cluster.workers.pool import open_pool; open_pool(1, None, 0.0, None)"
+    text = "import ray; from cluster.workers.open import open_pool; open_pool(1, None, 0.0, None)"
     done = finish("python", "-c", text, cwd=tmp_path, code=1)
     assert done.stderr.splitlines()[-1].endswith(
         "Ray was imported before it could be given a token: open the pool before that, or evaluate in this process "

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cluster import stopping
+from cluster.workers.open import open_pool
 from cluster.workers.pool import (
     Chunk,
     Collected,
@@ -21,7 +22,6 @@ from cluster.workers.pool import (
     cut,
     last_line,
     metres,
-    open_pool,
     rectangle,
 )
 from cluster.workers.threads import ThreadPool
