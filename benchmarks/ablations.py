@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from cluster.learn.evolution import Evolution
-from cluster.learn.learning import Maps
+from cluster.learn.learning import finish
+from cluster.learn.maps import Maps
 from cluster.settings import EvolveSettings
-from cluster.workers.pool import SerialPool
+from cluster.workers.open import open_pool
 from evolution.episodes import curriculum
 from evolution.episodes.curriculum import Curriculum, success_rate
 from evolution.search import recombination
@@ -111,7 +112,7 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
         setattr(curriculum if hasattr(curriculum, constant) else recombination, constant, value)
     settings = EvolveSettings(scenario=scenario, traffic=traffic, seed=seed, **variant.settings)
     maps = Maps(scenario, SimConfig())
-    learner = Evolution(settings, SerialPool(maps.build), maps)
+    learner = Evolution(settings, open_pool(0, None, 0.0, maps.build), maps)
     config = dataclasses.replace(settings.curriculum(), promising=2.0, **variant.curriculum)  # so nothing is validated
     learner.curriculum = Curriculum(config, seed, maps.get, settings.traffic)
     search = dataclasses.replace(settings.search_config(), groups=config.groups)
@@ -119,10 +120,10 @@ def learn(name: str, seed: int, scenario: str, traffic: int, budgets: list[float
     found = []
     for budget in budgets:
         while learner.car_steps < 1e6 * budget:
-            learner.step()
+            finish(learner.step())
         taken, leader = learner.car_steps, learner.candidate()
         assert leader is not None
-        driven = learner.drive("validate", leader[None], learner.curriculum.validation())
+        driven = finish(learner.drive("validate", leader[None], learner.curriculum.validation()))
         learner.car_steps = taken
         found.append(float(success_rate(driven.results)[0]))
     return found

@@ -27,6 +27,7 @@ from cluster.store.champion import Champion
 from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY
 from cluster.store.folder import ONNX, RunError, RunFolder, lock, write_summary
 from cluster.store.steps import Steps, write_elites
+from cluster.text import as_argument
 from cluster.tracking.description import read_run
 from cluster.tracking.sync import Status, Tracking
 from cluster.workers import kernels
@@ -94,7 +95,8 @@ def train(
             pool.close()
         maps.close()
         if unsent := tracking.close(status):
-            on_event(Event(unsent, warning=True))
+            again = f"; send it later with: {settings.command} --resume {as_argument(run.path)}"
+            on_event(Event(unsent + (again if status == "FINISHED" else ""), warning=True))
 
 
 def new_learning(settings: RunSettings, pool: WorkerPool, maps: Maps, initial: np.ndarray | None = None) -> Learning:

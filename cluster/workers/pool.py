@@ -256,6 +256,3 @@ def last_line(error: BaseException) -> str:
     """An exception as one line of text, its type first, whatever its message looks like."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return f"{type(error).__name__}: {lines[-1]}" if lines else type(error).__name__
-
-
-Meanwhile = SerialPool = Any  # until the merge, for those who import them and are being rewritten
