@@ -23,7 +23,7 @@ def test_mlflow_loads_the_champion(uri, tmp_path, policy, monkeypatch):
     spec = PolicySpec.parse(policy)
     folder = write_run(tmp_path / "a", 1, success_rate=0.5, policy=policy, observation=spec.observation)
     _, run_id = send(folder, uri)
-    mlflow.set_tracking_uri(uri)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     champion, shown = load_champion(folder), example(spec, SimConfig())
     for address in (f"models:/{MODEL}@best", f"runs:/{run_id}/model"):
         loaded = mlflow.pyfunc.load_model(address)
