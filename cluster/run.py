@@ -28,6 +28,7 @@ from cluster.store.checkpoint import CHAMPION, CHECKPOINT, SUMMARY
 from cluster.store.folder import ONNX, RunError, RunFolder, lock, write_summary
 from cluster.store.steps import Steps, write_elites
 from cluster.text import as_argument
+from cluster.tracking.database import silence_mlflow
 from cluster.tracking.description import read_run
 from cluster.tracking.sync import Status, Tracking
 from cluster.workers import kernels
@@ -48,7 +49,7 @@ class Place:
     address: str | None = None  # of a Ray cluster, host:port
     patience_s: float = 0.0  # without any worker, after which a run stops; 0: the usual
     uri: str = ""  # MLflow's
-    experiment: str = "gridsim"
+    experiment: str = ""
     wall_limit_s: float = math.inf  # wall-clock budget, including time before a resume; at least one step is done
 
 
@@ -68,6 +69,7 @@ def train(
     Raises: GridSimError, Stopped, and whatever else ends a run; the last whole step is saved.
     """
     started, settings = perf_counter() if started is None else started, run.settings
+    silence_mlflow()  # before there are threads, as it sets variables
     maps, tracking = Maps(settings.scenario, SimConfig()), Tracking(run.path, place.uri, place.experiment, read_run)
     pool: WorkerPool | None = None
     status: Status = "KILLED"

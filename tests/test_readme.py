@@ -8,15 +8,16 @@ from pathlib import Path
 import pytest
 from commands import BIN, finish
 
-SMALL = "--scenario curved --traffic 0 --workers 0 --population 16 --car-steps 3000"
-COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --workers 0 --output"
+SMALL = "--scenario curved --traffic 0 --population 16 --car-steps 3000"
+COMPARISON = "--scenarios curved --learners evolution --seeds 1 --budget 20k --population 16 --output"
 
 # What is run here, in this order, and what is added to make it small; the last of equal flags counts.
 HERE = {
     "make evolve": f"{SMALL} --name first",
-    'make dqn ARGS="--workers 2 --seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --workers 0 --name other",
+    'make dqn ARGS="--seed 1"': "--scenario curved --traffic 0 --car-steps 1000 --name other",
     ".venv/bin/gridsim-evolve --resume runs/<name>": "",
     ".venv/bin/gridsim-evolve --resume runs/<name> --car-steps 6e7": "--car-steps 100000",
+    ".venv/bin/gridsim-evolve --name X --resume-if-exists": SMALL,
     ".venv/bin/gridsim-evolve --config runs/<name>/config.json": "--name again",
     ".venv/bin/gridsim-evolve --init runs/<name>": f"{SMALL} --name next",
     ".venv/bin/gridsim-evaluate runs/<name> --scenario city --episodes 500": "--episodes 4",

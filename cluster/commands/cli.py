@@ -262,8 +262,7 @@ def _send_missing(console: Console, run: RunFolder, flags: Flags) -> int:
     settings, saved = run.settings, run.saved
     assert saved is not None
     meta = saved[1]
-    uri = check_uri(flags.tracking_uri, saved_uri(run.path))
-    sent, unsent = sync(run.path, uri, flags.experiment, read_run)
+    sent, unsent = sync(run.path, flags.tracking_uri, flags.experiment, read_run)
     sent = f"sent to MLflow: {sent}" if sent else "nothing to do"
     limits = [as_flag(name) for name in settings.extendable if getattr(settings, name)]
     more = f" To go on beyond its end, resume it with a greater {' or '.join(limits)}." if limits else ""

@@ -15,7 +15,7 @@ import sys
 import textwrap
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -89,8 +89,8 @@ class WorkFlags:
     is replaced. By default 300, and 60 for an answer on this machine."""
     tracking_uri: Annotated[str, IN_WORDS] = ""
     """Where MLflow keeps runs. By default MLFLOW_TRACKING_URI, else sqlite:///mlflow.db."""
-    experiment: str = field(default_factory=lambda: os.environ.get("MLFLOW_EXPERIMENT_NAME") or "gridsim")
-    """MLflow's experiment; by default MLFLOW_EXPERIMENT_NAME, else gridsim."""
+    experiment: Annotated[str, IN_WORDS] = ""
+    """MLflow's experiment; by default that of a run that is continued, else MLFLOW_EXPERIMENT_NAME, else gridsim."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 Status = Literal["FINISHED", "KILLED", "FAILED"]
 
 LINK = "mlflow.json"  # file of a folder that says which run of MLflow's it is
-EXPERIMENT = "gridsim"  # used if none is given
 KEY_TAG = "gridsim.key"  # by which a run is found again
 NOTE_TAG, OWN_NOTE_TAG = "mlflow.note.content", "mlflow.note.gridsim"
 """MLflow's tag for the description, and ours for the digest of the one written here; the UI lists neither."""
@@ -97,7 +96,7 @@ class LoggedRun:
         """Write and return mlflow.json, by which a run is found again that was killed, or had no server."""
         link = read_link(self._folder)
         if link.get("uri") != redacted(self._uri):
-            link |= {"uri": redacted(self._uri), "experiment": self._experiment or EXPERIMENT, "run_id": ""}
+            link |= {"uri": redacted(self._uri), "experiment": self._experiment or usual_experiment(), "run_id": ""}
         link.setdefault("key", uuid.uuid4().hex)
         link.setdefault("started", time.time() - content.wall_s)
         _write_link(self._folder, link)
@@ -318,6 +317,11 @@ class LoggedRun:
         if status and status != self._status:
             self._client.set_terminated(self.run_id, status, self._started_ms + round(1000.0 * content.wall_s))
             self._status = status
+
+
+def usual_experiment() -> str:
+    """The experiment of runs that are not given another."""
+    return os.environ.get("MLFLOW_EXPERIMENT_NAME") or "gridsim"
 
 
 def read_link(folder: Path) -> dict[str, Any]:
