@@ -118,8 +118,8 @@ class OwnRay:
         return address
 
     def check(self) -> None:
-        """Raise PoolError if one of its processes has ended: calls to Ray may then hang, and end us a minute later."""
-        if self._head and self._head.exit_code() is not None:
+        """Raise PoolError if one of its processes has ended: calls to Ray would then hang, or end this process."""
+        if self._head and not self._head.is_whole():
             logs, self._folder = f"{self._folder}/r/session_latest/logs", ""  # which are kept
             raise PoolError(f"a process of Ray's on this machine was killed or has crashed (logs: {logs})")
 
